@@ -6,7 +6,6 @@ Recorded text comes from elsewhere: control characters in it never reach the ter
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
@@ -116,7 +115,7 @@ def _table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
     if len(_all_keys(flattened)) > _MAX_COLUMNS:
         flattened = [{**row} for row in rows]
     keys = _all_keys(flattened)
-    columns = [_Column.of(key, [row.get(key) for row in flattened]) for key in keys]
+    columns = [_Column(key, [row.get(key) for row in flattened]) for key in keys]
     if sum(each.min_width + _COLUMN_GAP for each in columns) > width:
         return None
     is_narrow = sum(each.width + _COLUMN_GAP for each in columns) > width
@@ -135,30 +134,24 @@ def _table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
     return table
 
 
-@dataclass(frozen=True, slots=True)
 class _Column:
-    """A column's content, and the characters that it takes: `width`, or at least `min_width`."""
+    """A column's content, and the characters that it takes: `width`, or at least `min_width`.
 
-    key: str
-    is_numeric: bool
-    has_times: bool
-    width: int
-    min_width: int
+    A time may break between its date and its time of day.
+    """
 
-    @classmethod
-    def of(cls, key: str, values: Sequence[JsonValue]) -> _Column:
-        """Returns the column of these values; a time may break between its date and its time."""
-        has_times = any(_is_time(each) for each in values)
-        is_numeric = all(
+    def __init__(self, key: str, values: Sequence[JsonValue]) -> None:
+        self.key = key
+        self.has_times = any(_is_time(each) for each in values)
+        self.is_numeric = all(
             isinstance(each, int | float) and not isinstance(each, bool) and not _is_time(each)
             for each in values
             if each is not None
         )
-        width = max(len(key), *(len(_format_for_key(key, each)) for each in values))
-        if has_times:
-            return cls(key, is_numeric, has_times, width, _TIME_OF_DAY_WIDTH)
-        least = width if is_numeric else min(width, _MIN_TEXT_WIDTH)
-        return cls(key, is_numeric, has_times, width, least)
+        self.width = max(len(key), *(len(_format_for_key(key, each)) for each in values))
+        self.min_width = self.width if self.is_numeric else min(self.width, _MIN_TEXT_WIDTH)
+        if self.has_times:
+            self.min_width = _TIME_OF_DAY_WIDTH
 
 
 def _all_keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
