@@ -407,8 +407,7 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
         return
     missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching)
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
-    is_live = heartbeat is not None and heartbeat.is_live(now)
-    unoffered = heartbeat.missing if is_live and heartbeat is not None else ()
+    unoffered = heartbeat.missing if heartbeat and heartbeat.is_live(now) else ()
     entries = counted(len(selection.entries), "entry", "entries")
     if not snapshot.bags:
         yield _ok("topics", f"{file} lists {entries}; nothing is recorded yet")
@@ -467,9 +466,9 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
         seen = "server.metrics=true with server.transport=stdio, which has no /metrics"
         do = "choose server.transport=sse, or set server.metrics to false"
         yield _error("extras", seen, do)
-    seen = "is not installed: pip install 'ros2-memory[parquet]' adds it"
-    seen = "is installed" if _is_installed("pyarrow") else seen
-    yield _ok("extras", f"export --parquet {seen}")
+    otherwise = "is not installed: pip install 'ros2-memory[parquet]' adds it"
+    state = "is installed" if _is_installed("pyarrow") else otherwise
+    yield _ok("extras", f"export --parquet {state}")
 
 
 def _is_installed(module: str) -> bool:

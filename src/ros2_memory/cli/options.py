@@ -104,8 +104,7 @@ def open_memory(settings: Settings, *, verbose: bool = False) -> "Memory":
 
 def present(memory: "Memory") -> Ns:
     """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
-    latest = memory.index.snapshot().dating.latest
-    return memory.clock.now() if memory.limits.now == "wall" or latest is None else latest
+    return memory.now(memory.clock.now(), memory.index.snapshot().dating.latest)
 
 
 def parse_window(
