@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -89,9 +90,9 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
         return None
     last = max(each.last for each in stated)
     intervals, duration = 0, 0
-    for _, part in snapshot.timeline.with_topic(
-        topic, TimeWindow(last - _RATE_WINDOW_NS, last + 1)
-    ):
+    window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
+    bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
+    for part in chain.from_iterable(bag.summary.of(topic) for bag in bags):
         intervals += part.count - 1
         duration += part.last - part.first
     return round(intervals / unix_from_ns(duration), 2) if intervals and duration else None

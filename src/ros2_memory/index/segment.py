@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import BagFile, TimeWindow, TopicSummary
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.index.split_order import Series, SplitRange
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -37,8 +37,6 @@ _FEW_MESSAGES: Final = 5
 _CACHED_SEGMENTS: Final = 64
 """Two days of splits."""
 
-TopicInBag: TypeAlias = "tuple[BagFile, TopicSummary]"
-"""A bag, and what it holds of one topic under one type."""
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
@@ -217,19 +215,11 @@ class Segment:
             spans[folder] = wider(spans.get(folder), (first, last))
         return spans
 
-    def with_topic(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicInBag]:
+    def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""
         column = _columns(self).of(topic, window)
         if column is not None:
-            for row, position in zip(column.bags.tolist(), column.topics.tolist(), strict=True):
-                bag = self.bags[row]
-                yield bag, bag.summary.at(position)
-
-    def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
-        """Yields what `with_topic` yields, but only the first and last times; that is faster."""
-        column = _columns(self).of(topic, window)
-        if column is not None:
-            rows = zip(*(each.tolist() for each in column[:3]), strict=True)
+            rows = zip(*(each.tolist() for each in column), strict=True)
             for row, first, last in rows:
                 yield TopicExtent(self.bags[row], first, last)
 
@@ -265,8 +255,9 @@ class Segment:
         if len(self.folders) > 1:
             totals = [
                 TopicTotals(summary.first, summary.last, summary.count)
-                for bag, summary in self.with_topic(topic)
+                for bag in self.bags
                 if bag.recording == recording
+                for summary in bag.summary.of(topic)
             ]
         return reduce(TopicTotals.__or__, totals) if totals else None
 
@@ -316,13 +307,12 @@ class _SchemaGroup(NamedTuple):
 class _Column(NamedTuple):
     """What the bags of a segment hold of one topic, in bag order, a row for each of its types.
 
-    `bags` are positions in the segment, `topics` positions in the schema of the bag's summary.
+    `bags` are positions in the segment.
     """
 
     bags: NDArray[np.intp]
     firsts: NDArray[np.int64]
     lasts: NDArray[np.int64]
-    topics: NDArray[np.intp]
 
 
 class _Columns:
@@ -347,19 +337,14 @@ class _Columns:
 
     def _merged(self, topic: str) -> _Column | None:
         columns = [
-            _Column(
-                bags,
-                numbers[:, position, 1],
-                numbers[:, position, 2],
-                np.broadcast_to(np.intp(position), bags.shape),
-            )
+            _Column(bags, numbers[:, position, 1], numbers[:, position, 2])
             for schema, bags, numbers in self.groups
             for position in schema.positions.get(topic, ())
         ]
         if len(columns) < 2:
             return columns[0] if columns else None
         merged = _Column(*map(np.concatenate, zip(*columns, strict=True)))
-        order = np.lexsort((merged.topics, merged.bags))
+        order = np.argsort(merged.bags, kind="stable")
         return _Column(*(each[order] for each in merged))
 
 

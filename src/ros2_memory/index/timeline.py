@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.segment import Span, TopicExtent, TopicInBag
+    from ros2_memory.index.segment import Span, TopicExtent
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
@@ -224,33 +224,27 @@ class Timeline:
     def _faulty_segments(self) -> list[Segment]:
         return [segment for segment in self.segments if segment.faulty]
 
-    def with_topic(self, topic: str, window: TimeWindow | None = None) -> tuple[TopicInBag, ...]:
-        """Returns the bags that hold the topic (in a window), in order, once for each type."""
-        return tuple(
-            chain.from_iterable(
-                segment.with_topic(topic, window) for segment in self._with_topic(topic, window)
-            )
-        )
-
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
-        """Returns what `with_topic` returns, but only the first and last times; that is faster."""
-        return chain.from_iterable(
-            segment.extents(topic, window) for segment in self._with_topic(topic, window)
-        )
+        """Yields the bags that hold the topic (in a window), in order, once for each type.
 
-    def _with_topic(self, topic: str, window: TimeWindow | None) -> Iterator[Segment]:
-        """Yields the segments that can contain messages of the topic (in a window), in order."""
-        if window is not None and window.empty:
+        Those are the bags that can contain some of its messages in the window, by its first and
+        last time in each bag.
+        """
+        if window.empty:
             return
-        for segment in self.segments if window is None else self._segments_in(window):
+        for segment in self._segments_in(window):
             span = segment.spans.get(topic)
-            if span is not None and (window is None or window.overlaps(*span)):
-                yield segment
+            if span is not None and window.overlaps(*span):
+                yield from segment.extents(topic, window)
 
     def first_with(self, topic: str, type_name: str) -> BagFile:
         """Returns the first bag that holds the topic under a type; there must be one."""
         segment = next(each for each in self.segments if type_name in each.types.get(topic, ()))
-        return next(bag for bag, held in segment.with_topic(topic) if held.type == type_name)
+        return next(
+            bag
+            for bag in segment.bags
+            if any(held.type == type_name for held in bag.summary.of(topic))
+        )
 
 
 def _lost_until(bag: BagFile) -> Ns:

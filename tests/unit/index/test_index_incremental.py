@@ -207,7 +207,10 @@ def _views(snapshot: Snapshot) -> tuple[object, ...]:
         snapshot.earliest,
         snapshot.latest,
         snapshot.timeline.topics(),
-        [snapshot.timeline.with_topic(topic) for topic in snapshot.timeline.topics()],
+        [
+            [*snapshot.timeline.extents(topic, TimeWindow.everything())]
+            for topic in snapshot.timeline.topics()
+        ],
         [snapshot.timeline.types_of(topic) for topic in snapshot.timeline.topics()],
         [snapshot.timeline.is_transient_local(topic) for topic in snapshot.timeline.topics()],
         snapshot.timeline.overlapping(TimeWindow(20, 60)),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import Ns
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from ros2_memory.storage.mcap_reader import McapReader
@@ -46,10 +46,9 @@ def _states(snapshot: Snapshot) -> list[tuple[str, BagState]]:
 def test_the_splits_of_a_real_recording_are_found_in_order() -> None:
     snapshot = _scan(RECORDED / "session_mcap", McapReader())
     assert _states(snapshot) == [(f"session_mcap_{n}.mcap", BagState.CLOSED) for n in range(7)]
-    assert sum(held.count for _, held in snapshot.timeline.with_topic("/odom")) == 1300
-    assert [bag.path.name for bag, _ in snapshot.timeline.with_topic("/tf_static")] == [
-        "session_mcap_0.mcap"
-    ]
+    assert snapshot.timeline.totals("/odom")["nav_msgs/msg/Odometry"].messages == 1300
+    extents = snapshot.timeline.extents("/tf_static", TimeWindow.everything())
+    assert [bag.path.name for bag, *_ in extents] == ["session_mcap_0.mcap"]
     assert snapshot.timeline.is_transient_local("/tf_static")
     assert not snapshot.timeline.is_transient_local("/tf")
 

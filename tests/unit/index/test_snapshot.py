@@ -51,7 +51,7 @@ def test_ties_are_broken_by_end_and_then_by_path() -> None:
 def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
     empty = Snapshot()
     assert (empty.earliest, empty.latest, empty.timeline.topics()) == (None, None, ())
-    assert empty.timeline.with_topic("/odom") == ()
+    assert [*empty.timeline.extents("/odom", TimeWindow.everything())] == []
     assert empty.timeline.overlapping(TimeWindow.everything()) == ()
 
 
@@ -79,15 +79,15 @@ def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:
 
 def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> None:
     both = _bag("b", ("/x", 10, 19), ("/odom", 10, 19))
-    second = replace(both.summary.topics[0], type="std_msgs/msg/String")
+    second = replace(both.summary.topics[0], type="std_msgs/msg/String", first=12, last=17)
     both = both._replace(summary=BagSummary((*both.summary.topics, second)))
     first = _bag("a", ("/x", 0, 9))
     snapshot = Snapshot(Timeline.of((first, both)))
-    assert snapshot.timeline.with_topic("/x") == (
-        (first, first.summary.topics[0]),
-        (both, both.summary.topics[0]),
-        (both, second),
-    )
+    assert [*snapshot.timeline.extents("/x", TimeWindow.everything())] == [
+        (first, 0, 9),
+        (both, 10, 19),
+        (both, 12, 17),
+    ]
     assert snapshot.timeline.types_of("/x") == (ODOM, "std_msgs/msg/String")
     assert snapshot.timeline.types_of("/nothing") == ()
 
@@ -124,14 +124,14 @@ def test_a_window_overlaps_the_bags_that_have_a_moment_in_it(
 ) -> None:
     snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 9)), _bag("b", ("/odom", 10, 19)))))
     assert [bag.path.name for bag in snapshot.timeline.overlapping(TimeWindow(*window))] == names
-    held = snapshot.timeline.with_topic("/odom", TimeWindow(*window))
-    assert [bag.path.name for bag, _ in held] == names
+    held = snapshot.timeline.extents("/odom", TimeWindow(*window))
+    assert [bag.path.name for bag, *_ in held] == names
 
 
 def test_a_window_counts_for_a_topic_by_the_times_of_that_topic_alone() -> None:
     snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 99), ("/tf_static", 3, 3)),)))
-    assert len(snapshot.timeline.with_topic("/tf_static", TimeWindow(3, 4))) == 1
-    assert snapshot.timeline.with_topic("/tf_static", TimeWindow(4, 99)) == ()
+    assert len([*snapshot.timeline.extents("/tf_static", TimeWindow(3, 4))]) == 1
+    assert [*snapshot.timeline.extents("/tf_static", TimeWindow(4, 99))] == []
 
 
 def test_removing_a_bag_that_is_not_there_is_refused() -> None:
@@ -151,7 +151,7 @@ def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
     present = set(chance.sample(range(len(pool)), chance.choice([0, 1, 40, 2 * SEGMENT_BAGS])))
     timeline = Timeline.of(pool[number] for number in present)
     for _ in range(rounds):
-        timeline.with_topic("/odom")
+        assert all(timeline.extents("/odom", TimeWindow.everything()))
         chosen = set(chance.sample(range(len(pool)), chance.choice([0, 1, 5, 2 * SEGMENT_BAGS])))
         removed, added = present & chosen, chosen - present
         present = (present - removed) | added
@@ -185,21 +185,23 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
         for name in names
     }
     for name in (*names, "/nothing"):
-        assert timeline.with_topic(name) == tuple(each for each in held if each[1].topic == name)
+        assert [*timeline.extents(name, TimeWindow.everything())] == [
+            (bag, topic.first, topic.last) for bag, topic in held if topic.topic == name
+        ]
     for start, length in windows:
         window = TimeWindow(start, start + length)
         overlaps = ordered if length else []
         assert timeline.overlapping(window) == tuple(
             bag for bag in overlaps if bag.start < window.stop and bag.end >= start
         )
-        assert timeline.with_topic("/odom", window) == tuple(
-            (bag, topic)
+        assert [*timeline.extents("/odom", window)] == [
+            (bag, topic.first, topic.last)
             for bag, topic in held
             if topic.topic == "/odom"
             and length
             and topic.first < window.stop
             and topic.last >= start
-        )
+        ]
 
 
 def test_a_timeline_to_which_nothing_happens_stays_itself() -> None:

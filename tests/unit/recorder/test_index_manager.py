@@ -92,7 +92,7 @@ def test_several_recordings_are_indexed_in_the_order_of_their_times(yard: Yard) 
         "rec_b_10.mcap",
         "rec_b_11.mcap",
     ]
-    assert len(snapshot.timeline.with_topic("/odom")) == 13
+    assert len([*snapshot.timeline.extents("/odom", TimeWindow.everything())]) == 13
     assert (snapshot.problem, snapshot.scanned_at) == (None, NOW)
 
 
@@ -426,7 +426,7 @@ def test_nothing_is_written_into_the_bag_directory(yard: Yard) -> None:
     yard.age()
     before = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
     for _ in range(3):
-        yard.scan_after(5).timeline.with_topic("/odom")
+        list(yard.scan_after(5).timeline.extents("/odom", TimeWindow.everything()))
     after = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
     assert {path: (stat.st_size, stat.st_mtime_ns) for path, stat in after.items()} == {
         path: (stat.st_size, stat.st_mtime_ns) for path, stat in before.items()
