@@ -103,18 +103,6 @@ def append_lines(descriptor: int, text: str) -> None:
         raise
 
 
-def make_folder(folder: Path) -> None:
-    """Makes a folder of this program where there is none, but none above it.
-
-    Raises:
-        OSError: the folder cannot be made, or is a symbolic link.
-    """
-    folder.mkdir(exist_ok=True)
-    if folder.is_symlink():
-        reason = f"{folder.name} is a symbolic link, which is not followed"
-        raise OSError(errno.ELOOP, reason, str(folder))
-
-
 def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
     """Opens a regular file for reading; never waits, and follows no link.
 

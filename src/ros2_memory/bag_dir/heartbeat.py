@@ -17,9 +17,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import is_integer, strings
+from ros2_memory.bag_dir.json_fields import integer, strings
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -171,27 +171,20 @@ def _parse(text: str) -> Heartbeat:
     if state not in list(RecorderState):
         raise ValueError(f"state must be one of {', '.join(RecorderState)}")
     return Heartbeat(
-        pid=_integer(fields, "pid", least=1),
-        updated=_integer(fields, "updated"),
+        pid=integer(fields, "pid", least=1),
+        updated=integer(fields, "updated"),
         state=RecorderState(str(state)),
         recordings=strings(fields, "recordings"),
-        since=_integer(fields, "since"),
-        bytes_written=_integer(fields, "bytes_written", least=0),
+        since=integer(fields, "since"),
+        bytes_written=integer(fields, "bytes_written", least=0),
         subscribed=strings(fields, "subscribed"),
         silent=strings(fields, "silent"),
         last_error=_text_or_null(fields, "last_error"),
         interval_s=_interval(fields["interval_s"]),
-        restarts=_integer(fields, "restarts", least=0),
+        restarts=integer(fields, "restarts", least=0),
         missing=strings(fields, "missing"),
         age_held=_text_or_null(fields, "age_held"),
     )
-
-
-def _integer(fields: Mapping[object, object], key: str, *, least: int = MIN_NS) -> int:
-    value = fields[key]
-    if not is_integer(value, least):
-        raise ValueError(f"{key} must be an integer from {least} to {MAX_NS}")
-    return value
 
 
 def _text_or_null(fields: Mapping[object, object], key: str) -> str | None:

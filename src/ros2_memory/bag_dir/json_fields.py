@@ -15,6 +15,25 @@ def is_integer(value: object, least: int = MIN_NS, most: int = MAX_NS) -> TypeGu
     return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
 
 
+def integer(
+    fields: Mapping[object, object],
+    key: str,
+    least: int = MIN_NS,
+    most: int = MAX_NS,
+    *,
+    what: str | None = None,
+) -> int:
+    """Returns the integer under a key; `what` it must be is for the error, if not its range.
+
+    Raises:
+        ValueError: the value is not an integer in the range.
+    """
+    value = fields.get(key)
+    if not is_integer(value, least, most):
+        raise ValueError(f"{key} must be {what or f'an integer from {least} to {most}'}")
+    return value
+
+
 def strings(fields: Mapping[object, object], key: str) -> tuple[str, ...]:
     """Returns the strings under a key.
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import yaml
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.json_fields import integer
 from ros2_memory.bag_dir.layout import COMPRESSED, METADATA_FILE, bag_kind
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     info = _information(content)
     if info.get("storage_identifier") != "mcap" or info.get("compression_mode") == "FILE":
         raise ValueError("it is not of plain MCAP files")
-    version = _int(info, "version")
+    version = integer(info, "version")
     if version < _FIRST_OF_FILES:
         raise ValueError(f"it is of version {version}, which is older than MCAP files")
     paths = {bare_name(each): str(each) for each in _list(info, "relative_file_paths")}
@@ -280,14 +280,14 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     is_equal = True
     for each in deleted:
         counts = names[bare_name(each.get("path"))]
-        is_equal &= sum(counts.values()) == _int(each, "message_count")
+        is_equal &= sum(counts.values()) == integer(each, "message_count")
         lost.update(counts)
     topics = [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]
     for each in topics:
         name = _mapping(each.get("topic_metadata"), "topic_metadata").get("name")
-        each["message_count"] = _int(each, "message_count") - lost.pop(str(name), 0)
-    total = sum(_int(each, "message_count") for each in left)
-    if not is_equal or lost or total != sum(_int(each, "message_count") for each in topics):
+        each["message_count"] = integer(each, "message_count") - lost.pop(str(name), 0)
+    total = sum(integer(each, "message_count") for each in left)
+    if not is_equal or lost or total != sum(integer(each, "message_count") for each in topics):
         raise ValueError("its numbers are not those of the files")
     spans = [_span_of(each) for each in left]
     info["message_count"] = total
@@ -311,8 +311,8 @@ def _span(start: int, end: int) -> dict[str, object]:
 def _span_of(file: dict[object, object]) -> tuple[int, int]:
     start = _mapping(file.get("starting_time"), "starting_time")
     duration = _mapping(file.get("duration"), "duration")
-    first = _int(start, "nanoseconds_since_epoch")
-    return first, first + _int(duration, "nanoseconds")
+    first = integer(start, "nanoseconds_since_epoch")
+    return first, first + integer(duration, "nanoseconds")
 
 
 def _parse(text: str) -> object:
@@ -342,11 +342,4 @@ def _list(fields: dict[object, object], key: str) -> list[object]:
     value = fields.get(key)
     if not isinstance(value, list):
         raise ValueError(f"it has no list {key}")  # noqa: TRY004 - a value in a text
-    return value
-
-
-def _int(fields: dict[object, object], key: str) -> int:
-    value = fields.get(key)
-    if not is_integer(value):
-        raise ValueError(f"{key} is no whole number")
     return value

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.json_fields import integer
 from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -199,17 +199,13 @@ def save_request_from(fields: Mapping[object, object]) -> SaveRequest:
         raise ValueError("request must be 32 hexadecimal digits")
     if not isinstance(label, str) or fault_of_label(label):
         raise ValueError("label must be a text of one line")
-    start, end, asked = (_nanoseconds(fields, f"{key}_ns") for key in ("start", "end", "requested"))
+    start, end, asked = (
+        integer(fields, f"{key}_ns", MIN_NS + 1, MAX_NS - 1, what="nanoseconds")
+        for key in ("start", "end", "requested")
+    )
     if end < start:
         raise ValueError("end_ns must not be before start_ns")
     return SaveRequest(number, label, start, end, asked)
-
-
-def _nanoseconds(fields: Mapping[object, object], key: str) -> Ns:
-    value = fields.get(key)
-    if not is_integer(value, MIN_NS + 1, MAX_NS - 1):
-        raise ValueError(f"{key} must be nanoseconds")
-    return value
 
 
 def _bag_sizes(folder: Path) -> dict[int, int]:

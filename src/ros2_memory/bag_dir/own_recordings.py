@@ -43,7 +43,7 @@ from ros2_memory.bag_dir.durable_write import (
 )
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.json_fields import integer
 from ros2_memory.bag_dir.layout import LIST_FILE, bag_kind, has_own_name
 from ros2_memory.core.errors import RecorderError
 
@@ -123,10 +123,7 @@ class _List:
 
 
 def _number(fields: Mapping[object, object], key: str) -> int | None:
-    value = fields.get(key)
-    if value is None or is_integer(value):
-        return value
-    raise ValueError(f"{key} is no whole number")
+    return None if fields.get(key) is None else integer(fields, key)
 
 
 def _lines(entries: Mapping[str, _Entry]) -> str:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
-from ros2_memory.bag_dir.durable_write import make_folder, read_small_file, write_durably
+from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import FORMAT, SaveRequest, json_object, save_request_from
 from ros2_memory.core import directories
@@ -62,6 +62,7 @@ class PendingRequest:
     """One request and its answer, for the query server."""
 
     def __init__(self, bag_dir: Path, label: str, start: Ns, end: Ns, asked: Ns) -> None:
+        self._bag_dir = bag_dir
         self._folder = bag_dir / REQUESTS_FOLDER
         self.request = SaveRequest(uuid.uuid4().hex, label, start, end, asked)
 
@@ -71,7 +72,7 @@ class PendingRequest:
         Raises:
             OSError: it cannot be written.
         """
-        _make_folders(self._folder)
+        directories.make(self._bag_dir, self._folder)
         write_durably(self._path("json"), json.dumps(self.request.to_json()), mode=_READABLE)
 
     def outcome(self) -> Outcome | None:
@@ -116,7 +117,7 @@ class RequestQueue:
     def open(self) -> None:
         """Makes the folder, so that the server needs access to nothing else. Raises nothing."""
         with suppress(OSError):
-            _make_folders(self._folder)
+            directories.make(self._bag_dir, self._folder)
 
     def has_requests(self) -> bool:
         """Returns whether there are requests."""
@@ -190,12 +191,6 @@ class RequestQueue:
                     path = self._folder / name
                     if abs(now - path.lstat().st_mtime_ns) > _KEEP_ANSWER_NS:
                         path.unlink()
-
-
-def _make_folders(folder: Path) -> None:
-    """Makes the folder and its parent, but not the bag directory, whose disk may be unmounted."""
-    make_folder(folder.parent)
-    make_folder(folder)
 
 
 def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:

@@ -84,17 +84,18 @@ def opened(root: Path, path: Path) -> Iterator[int]:
 
 
 def make(root: Path, path: Path) -> None:
-    """Makes a directory below the root, and its parents.
+    """Makes a directory below the root, and its parents, but not the root, a disk of its own maybe.
 
     Raises:
-        OSError: it cannot be made; `LINK_NOT_FOLLOWED` where it would lie behind a link.
+        OSError: it cannot be made, or would lie behind a link.
     """
     parts = path.relative_to(root).parts
     for depth in range(1, len(parts) + 1):
         folder = root.joinpath(*parts[:depth])
         folder.mkdir(exist_ok=True)
         if folder.is_symlink():
-            raise OSError(errno.ELOOP, LINK_NOT_FOLLOWED, str(path))
+            reason = f"{folder.name} is a symbolic link, which is not followed"
+            raise OSError(errno.ELOOP, reason, str(path))
 
 
 def link_in(path: Path) -> Path | None:

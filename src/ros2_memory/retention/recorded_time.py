@@ -18,11 +18,11 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import (
     append_durably,
-    make_folder,
     open_plain,
     write_durably,
 )
 from ros2_memory.bag_dir.layout import OWN_FOLDER, RECORDED_FILE
+from ros2_memory.core import directories
 from ros2_memory.core.timebase import Ns, ns_from_unix
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class RecordedTime:
     def _save(self) -> None:
         names = sorted(self._unsaved)
         try:
-            make_folder(self._path.parent)
+            directories.make(self._bag_dir, self._path.parent)
             if self._lines + len(names) > _MOST_LINES:
                 write_durably(self._path, self._text(self._last_grew_s))
                 self._lines = len(self._last_grew_s)
