@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
@@ -21,14 +21,17 @@ from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.duplicates import BagSpan
     from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Channel, Record
+
+T = TypeVar("T")
 
 _DEADLINE_CHECK_INTERVAL: Final = 256
 """Messages between two looks at the deadline."""
@@ -107,6 +110,27 @@ class BagAccess:
         digests = self.digests_of(self.snapshot.timeline.segment_of(bag))
         number = None if digests is None else digests.numbers.get(bag.file)
         return None if digests is None or number is None else (digests, number)
+
+    def cached_answer(
+        self, question: str, bags: Sequence[BagSpan], parse: Callable[[str], T]
+    ) -> T | None:
+        """Returns what was computed from these bags before; None where the catalogue has none."""
+        cache, numbers = self.memory.recall, self._entry_numbers(bags)
+        if cache is None or numbers is None:
+            return None
+        return cache.cached_answer(question, numbers, parse)
+
+    def cache_answer(self, question: str, bags: Sequence[BagSpan], answer: str) -> None:
+        """Stores what was computed from these bags, unless something could not be read."""
+        cache, numbers = self.memory.recall, self._entry_numbers(bags)
+        if cache is not None and numbers is not None and self.notes.complete:
+            cache.catalogue.cache_answer(question, numbers, answer)
+
+    def _entry_numbers(self, bags: Sequence[BagSpan]) -> list[int] | None:
+        """Returns the numbers of the bags' entries; None where one has none."""
+        entries = [self.entry(each.bag) for each in bags]
+        numbers = [entry[1] for entry in entries if entry is not None]
+        return numbers if len(numbers) == len(entries) else None
 
     def track_sources(self, messages: Iterator[StoredMessage]) -> Iterator[StoredMessage]:
         """Yields the messages, and records what kind of bags they are from.

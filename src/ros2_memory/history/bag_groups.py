@@ -186,10 +186,7 @@ class StoredDigests(Generic[T]):
         if group.may_be_relatched:
             return None
         if len(group.bags) > 1:
-            cache, numbers = self._view.memory.recall, self._numbers(group)
-            if cache is None or numbers is None:
-                return None
-            return cache.cached_answer(self._question, numbers, self._decode)
+            return self._view.bags.cached_answer(self._question, group.bags, self._decode)
         [span] = group.bags
         number = None if self._segment is None else self._segment.numbers.get(span.bag.file)
         if number is None:
@@ -220,23 +217,13 @@ class StoredDigests(Generic[T]):
 
         The catalogue's own entries are of single bags.
         """
-        cache, numbers = self._view.memory.recall, self._numbers(group)
-        if cache is None or numbers is None or len(numbers) < 2 or not self._view.notes.complete:
-            return
-        if not group.may_be_relatched:
-            cache.catalogue.cache_answer(
-                self._question, numbers, json.dumps([self._kind.encode(digest), *span])
-            )
+        if len(group.bags) > 1 and not group.may_be_relatched:
+            answer = json.dumps([self._kind.encode(digest), *span])
+            self._view.bags.cache_answer(self._question, group.bags, answer)
 
     def _decode(self, answer: str) -> tuple[T, Span]:
         digest, first, last = json.loads(answer)
         return self._kind.decode(digest), (int(first), int(last))
-
-    def _numbers(self, group: Group) -> list[int] | None:
-        """Returns the numbers of the bags' entries; None where one has none."""
-        entries = [self._view.bags.entry(each.bag) for each in group.bags]
-        numbers = [entry[1] for entry in entries if entry is not None]
-        return numbers if len(numbers) == len(entries) else None
 
 
 @dataclass(frozen=True, slots=True)

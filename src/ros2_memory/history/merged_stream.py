@@ -182,8 +182,7 @@ class MergedStream:
         """Notes what cannot be read where a message may have been received before."""
         if _is_late(found) and self.may_be_relatched([found.record.channel.topic]):
             record = found.record
-            window = TimeWindow(record.publish_time, found.time)
-            self._find_first_copy(record.channel.topic, copy_key(record), window)
+            self._find_first_copies(record.channel.topic, _since_published(found), copy_key(record))
 
     def _is_relatched(self, found: StoredMessage) -> bool:
         record = found.record
@@ -193,31 +192,25 @@ class MergedStream:
         if key not in self._first_copies:
             self._searches[topic] += 1
             if self._searches[topic] > _MAX_SEARCHES:
-                self._find_all_first_copies(topic)
+                self._find_first_copies(topic, TimeWindow.everything())
             else:
-                self._find_first_copy(topic, key, TimeWindow(record.publish_time, found.time))
+                self._find_first_copies(topic, _since_published(found), key)
         first = self._first_copies.get(key, (found.time, found.bag.recording))
         return found.time > first[0] and found.bag.recording != first[1]
 
-    def _find_first_copy(self, topic: str, key: Copy, window: TimeWindow) -> None:
-        """Records where a message was received first, from its publish time on."""
-        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop + 1)
-        bags = self.overlapping_bags([topic], wider)
-        for each in self.merged(bags, [topic], wider, newest_first=False):
-            if copy_key(each.record) == key:
-                self._first_copies[key] = (each.time, each.bag.recording)
-                return
+    def _find_first_copies(self, topic: str, window: TimeWindow, only: Copy | None = None) -> None:
+        """Records where the messages in a window were received first; of `only` one if given.
 
-    def _find_all_first_copies(self, topic: str) -> None:
-        """Does the same for every message of a topic: one pass in place of one for each of many.
-
-        There are many where publish times mean nothing, such as those of a simulated clock.
+        One pass for all of a topic replaces one for each of many: where publish times mean nothing,
+        such as those of a simulated clock.
         """
-        everything = TimeWindow.everything()
-        bags = self.overlapping_bags([topic], everything)
-        for each in self.merged(bags, [topic], everything, newest_first=False):
-            first = (each.time, each.bag.recording)
-            self._first_copies.setdefault(copy_key(each.record), first)
+        bags = self.overlapping_bags([topic], window)
+        for each in self.merged(bags, [topic], window, newest_first=False):
+            key = copy_key(each.record)
+            if only is None or key == only:
+                self._first_copies.setdefault(key, (each.time, each.bag.recording))
+            if key == only:
+                return
 
     def merged(
         self,
@@ -267,6 +260,11 @@ class MergedStream:
 def _is_late(found: StoredMessage) -> bool:
     record = found.record
     return record.channel.latched and found.time - record.publish_time > RELATCHED_NS
+
+
+def _since_published(found: StoredMessage) -> TimeWindow:
+    """Returns the window in which a late message may have been received before."""
+    return _with_horizon(TimeWindow(found.record.publish_time, found.time + 1))
 
 
 def _with_horizon(window: TimeWindow) -> TimeWindow:

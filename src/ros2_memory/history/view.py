@@ -31,10 +31,10 @@ from ros2_memory.history.no_data import require_bags
 from ros2_memory.messages.downsample import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator
 
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Sessions
 
 
@@ -108,31 +108,21 @@ class View:
     def _overlap_census(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
         """Returns, by type, the messages stored in overlapping bags, and those that count."""
         bags = self.stream.overlapping_bags([topic], window)
-        entries = [self.bags.entry(each.bag) for each in bags]
-        numbers = [number for _, number in filter(None, entries)]
-        cache = self.memory.recall
-        if cache is None or len(numbers) < len(bags):
-            return self._count_overlap(topic, window, bags)
         question = json.dumps(["contest", topic, window.start, window.stop])
-        known = cache.cached_answer(question, numbers, _decode_overlap)
+        known = self.bags.cached_answer(question, bags, _decode_overlap)
         if known is not None:
             return known
-        counted = self._count_overlap(topic, window, bags)
-        if self.notes.complete:
-            answer = {
-                type_name: [astuple(stored), astuple(once)]
-                for type_name, (stored, once) in counted.items()
-            }
-            cache.catalogue.cache_answer(question, numbers, json.dumps(answer))
-        return counted
-
-    def _count_overlap(
-        self, topic: str, window: TimeWindow, bags: Sequence[BagSpan]
-    ) -> dict[str, tuple[Census, Census]]:
-        stored = _counted(self.stream.merged(bags, [topic], window, newest_first=False))
+        stored: dict[str, Census] = {}
         merged = self.stream.merged(bags, [topic], window, newest_first=False)
-        once = _counted(deduplicate_forward(merged, [(window.start, window.stop)]))
-        return {type_name: (stored[type_name], once[type_name]) for type_name in once}
+        everywhere = [(window.start, window.stop)]
+        once = _counted(deduplicate_forward(_tallied(merged, stored), everywhere))
+        counted = {type_name: (stored[type_name], once[type_name]) for type_name in once}
+        answer = {
+            type_name: [astuple(stored), astuple(once)]
+            for type_name, (stored, once) in counted.items()
+        }
+        self.bags.cache_answer(question, bags, json.dumps(answer))
+        return counted
 
 
 def _decode_overlap(answer: str) -> dict[str, tuple[Census, Census]]:
@@ -145,11 +135,20 @@ def _decode_overlap(answer: str) -> dict[str, tuple[Census, Census]]:
 def _counted(messages: Iterable[StoredMessage]) -> dict[str, Census]:
     """Returns a census by message type of an ascending stream."""
     counted: dict[str, Census] = {}
+    for _ in _tallied(messages, counted):
+        pass
+    return counted
+
+
+def _tallied(
+    messages: Iterable[StoredMessage], counted: dict[str, Census]
+) -> Iterator[StoredMessage]:
+    """Yields the messages of an ascending stream, and adds each to a census by message type."""
     for each in messages:
         type_name = each.record.channel.type
         known = counted.get(type_name, Census(each.time, each.time, 0))
         counted[type_name] = Census(known.first, each.time, known.count + 1)
-    return counted
+        yield each
 
 
 @dataclass(frozen=True, slots=True)
