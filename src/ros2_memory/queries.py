@@ -50,6 +50,7 @@ from ros2_memory.history.no_data import (
     resolve_pose_topic,
     resolve_topic,
     seconds,
+    with_notes,
 )
 from ros2_memory.history.reverse_search import ReverseSearch, not_covered
 from ros2_memory.history.robots import note_robots, note_robots_near
@@ -140,7 +141,9 @@ def topic_range(
         view.notes.add(TOO_MANY)
     elif fields:
         extremes = extremes_of(view, name, window, fields)
-    return results.TopicRange(name, types[-1], total, samples, view.notes.sentences(), extremes)
+    return results.TopicRange(
+        name, types[-1], total, samples, extremes, notes=view.notes.sentences()
+    )
 
 
 def position(
@@ -160,22 +163,21 @@ def position(
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
     message, type_name = decode(view, found), found.record.channel.type
-    pose = memory.extractor.pose(message, type_name)
+    pose, geodetic = memory.extractor.pose(message, type_name), None
     if pose is None:
-        place = memory.extractor.geodetic(message, type_name)
-        if place is None:
+        geodetic = memory.extractor.geodetic(message, type_name)
+        if geodetic is None:
             raise InvalidArgumentsError(describe_lack(view, "position", found))
-        if not (math.isfinite(place.latitude) and math.isfinite(place.longitude)):
-            view.notes.add("the recorded position is not a number")
-        nowhere = Pose((math.nan,) * 3, None, place.frame_id)
-        return results.Position(
-            name, found.time, nowhere, view.notes.sentences(), _age(found, now), geodetic=place
-        )
-    if not all(map(math.isfinite, pose.position)):
+        pose = Pose((math.nan,) * 3, None, geodetic.frame_id)
+        coordinates: tuple[float, ...] = (geodetic.latitude, geodetic.longitude)
+    else:
+        coordinates = pose.position
+    if not all(map(math.isfinite, coordinates)):
         view.notes.add("the recorded position is not a number")
-    if pose.orientation is None:
+    if geodetic is None and pose.orientation is None:
         view.notes.add("the recorded orientation is not a rotation")
-    return results.Position(name, found.time, pose, view.notes.sentences(), _age(found, now))
+    notes = view.notes.sentences()
+    return results.Position(name, found.time, pose, _age(found, now), geodetic, notes=notes)
 
 
 def velocity(
@@ -194,7 +196,7 @@ def velocity(
     twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
     if twist is None:
         raise InvalidArgumentsError(describe_lack(view, "velocity", found))
-    return results.Velocity(name, found.time, twist, view.notes.sentences(), _age(found, now))
+    return results.Velocity(name, found.time, twist, _age(found, now), notes=view.notes.sentences())
 
 
 def transform(
@@ -205,12 +207,11 @@ def transform(
     try:
         found = frame_history.transform_at(view, parent, child, at)
     except NoDataError as error:
-        note_unread(view, TimeWindow.around(at, TF_CACHE_NS), nothing=True)
-        raise NoDataError(error.reason, error.detail, view.notes.sentences()) from error
+        raise with_notes(view, TimeWindow.around(at, TF_CACHE_NS), error) from error
     note_unread(view, TimeWindow.around(at, found.reach))
     age = None if now is None else now - at
     return results.TransformAt(
-        parent, child, at, found.transform, found.clock, view.notes.sentences(), age
+        parent, child, at, found.transform, found.clock, age, notes=view.notes.sentences()
     )
 
 
@@ -219,7 +220,7 @@ def frames(memory: Memory, call: Call) -> results.Frames:
     view = open_view(memory, call, memory.clock.now())
     edges = frame_history.edges(view)
     note_unread(view, TimeWindow.everything(), nothing=True)
-    return results.Frames(edges, view.notes.sentences())
+    return results.Frames(edges, notes=view.notes.sentences())
 
 
 def find_last_match(
@@ -243,7 +244,7 @@ def find_last_match(
     until = _before(before_s)
     found = ReverseSearch(view, topic, condition).newest(until)
     if found is None:
-        return results.Match(None, not_covered(view, TimeWindow(MIN_NS, until)))
+        return results.Match(None, notes=not_covered(view, TimeWindow(MIN_NS, until)))
     note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
@@ -251,7 +252,7 @@ def find_last_match(
         after = seconds(found.time - counted_from)
         view.notes.add(f"dated {after} after now: when it was is unknown")
         counted_from = None
-    return results.Match(_value(view, found, fields, counted_from), view.notes.sentences())
+    return results.Match(_value(view, found, fields, counted_from), notes=view.notes.sentences())
 
 
 def value_when(
@@ -285,13 +286,13 @@ def value_when(
     note_unread(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
         view.notes.add(f"{name} held no message yet at {unix_text(found.time)}")
-        return results.ValueWhen(matched, None, view.notes.sentences())
+        return results.ValueWhen(matched, notes=view.notes.sentences())
     distance = found.time - held.time
     latched = memory.limits.latching.holds(view.snapshot, held)
     if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
         view.notes.add(f"the value is {seconds(distance)} older than the match")
     held_value = _held(view, _value(view, held, fields, None), held, found.time)
-    return results.ValueWhen(matched, held_value, view.notes.sentences())
+    return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
@@ -393,7 +394,12 @@ def trajectory_summary(
     note_unread(view, window)
     note_edges(view, window)
     return results.TrajectorySummary(
-        name, path.frames[0], path.first, path.last, path.trajectory, view.notes.sentences()
+        name,
+        path.frames[0],
+        path.first,
+        path.last,
+        path.trajectory,
+        notes=view.notes.sentences(),
     )
 
 
@@ -473,8 +479,8 @@ def _value(
         channel.topic,
         channel.type,
         Sample(found.time, shown.value),
-        (*view.notes.sentences(), *shown.notes),
         _age(found, now),
+        notes=(*view.notes.sentences(), *shown.notes),
     )
 
 
@@ -500,8 +506,8 @@ def _samples(
         for sentence in shown.notes:
             view.notes.add(sentence)
     if failures and not samples:
-        note_unread(view, window, nothing=True)
-        raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)), view.notes.sentences())
+        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
+        raise with_notes(view, window, undecodable)
     for detail, count in failures.items():
         view.notes.add(f"{count} samples left out: {detail}")
     return tuple(samples), list(types)

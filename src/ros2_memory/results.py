@@ -2,13 +2,12 @@
 
 Times are `Ns` of log time, lengths metres, angles radians, velocities m/s and rad/s. `age` is how
 long before "now" the answer's own moment lies, in nanoseconds; it is set for relative questions
-only. `now` is what ages count from. `notes` are sentences on what was downsampled, left out,
-clamped or could not be read.
+only. `now` is what ages count from.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
@@ -16,6 +15,16 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.transform_tree import FrameEdge
     from ros2_memory.core.model import Geodetic, Pose, Sample, SetAside, Transform, Twist, Vector3
     from ros2_memory.core.timebase import Ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerWithNotes:
+    """What most questions return.
+
+    `notes` are sentences on what was downsampled, left out, clamped or could not be read.
+    """
+
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +58,7 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
-class DataTimeRange:
+class DataTimeRange(AnswerWithNotes):
     """What the memory spans, and the files that do not answer; no times where it is empty."""
 
     earliest: Ns | None
@@ -62,13 +71,12 @@ class DataTimeRange:
     damaged: tuple[SetAside, ...]
     unread: tuple[SetAside, ...]
     silent_topics: int
-    notes: tuple[str, ...] = ()
     undecodable: tuple[Undecodable, ...] = ()
     clock_faults: tuple[SetAside, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class TopicValue:
+class TopicValue(AnswerWithNotes):
     """One message of one topic; with `latched` it holds, however old it is.
 
     `age` counts back from now for a relative question, else from the moment asked about.
@@ -77,7 +85,6 @@ class TopicValue:
     topic: str
     type: str
     sample: Sample
-    notes: tuple[str, ...] = ()
     age: Ns | None = None
     latched: bool = False
 
@@ -94,7 +101,7 @@ class Extremes:
 
 
 @dataclass(frozen=True, slots=True)
-class TopicRange:
+class TopicRange(AnswerWithNotes):
     """Samples of a window, evenly spaced over all `total` messages in it, with the first and last.
 
     `extremes` are those of all messages, for the requested fields that hold numbers.
@@ -104,12 +111,11 @@ class TopicRange:
     type: str
     total: int
     samples: tuple[Sample, ...]
-    notes: tuple[str, ...] = ()
     extremes: tuple[Extremes, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class Position(AnswerWithNotes):
     """Where the robot was, in the pose's own frame.
 
     `geodetic` is set for a satellite receiver; the pose's coordinates are NaN then.
@@ -118,24 +124,22 @@ class Position:
     topic: str
     time: Ns
     pose: Pose
-    notes: tuple[str, ...] = ()
     age: Ns | None = None
     geodetic: Geodetic | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Velocity:
+class Velocity(AnswerWithNotes):
     """How fast the robot moved, in the twist's own frame."""
 
     topic: str
     time: Ns
     twist: Twist
-    notes: tuple[str, ...] = ()
     age: Ns | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class TransformAt:
+class TransformAt(AnswerWithNotes):
     """The pose of `child` in `parent` at `time`.
 
     `clock` is what `time` is in: `stamp` (header stamps) or `log` (log time).
@@ -146,40 +150,36 @@ class TransformAt:
     time: Ns
     transform: Transform
     clock: str
-    notes: tuple[str, ...] = ()
     age: Ns | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class Frames(AnswerWithNotes):
     """The frame graph as it was recorded."""
 
     edges: tuple[FrameEdge, ...]
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
+class Match(AnswerWithNotes):
     """The newest message that met a condition; `found` is None after a search without a match.
 
     Where `found` is None and there are `notes`, the search was not complete.
     """
 
     found: TopicValue | None
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class ValueWhen:
+class ValueWhen(AnswerWithNotes):
     """A match on one topic and the value of another then; None where it had none yet."""
 
     matched: TopicValue | None
     value: TopicValue | None = None
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class TrajectorySummary:
+class TrajectorySummary(AnswerWithNotes):
     """The driven path in a window, from one pose topic in log-time order."""
 
     topic: str
@@ -187,7 +187,6 @@ class TrajectorySummary:
     start: Ns
     end: Ns
     trajectory: Trajectory
-    notes: tuple[str, ...] = field(default=())
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +222,7 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class Sightings(AnswerWithNotes):
     """Sightings in the order asked for; `more`: there are others. `start` and `end` were searched.
 
     `total` is how many there are; None where the search ended before it had counted all.
@@ -235,7 +234,6 @@ class Sightings:
     start: Ns | None
     end: Ns | None
     now: Ns
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +251,7 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Recap:
+class Recap(AnswerWithNotes):
     """What happened in a window.
 
     Attributes:
@@ -286,7 +284,6 @@ class Recap:
     events: tuple[Event, ...]
     throughout: tuple[str, ...]
     counts: tuple[tuple[str, int], ...] = ()
-    notes: tuple[str, ...] = ()
     path_sum_m: float | None = None
     gap_m: float | None = None
 
@@ -315,7 +312,7 @@ class Budget:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class Status(AnswerWithNotes):
     """How complete and how current the memory is.
 
     Attributes:
@@ -349,7 +346,6 @@ class Status:
     unread: int
     budget: Budget
     problems: tuple[str, ...]
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,7 +371,7 @@ class Visit:
 
 
 @dataclass(frozen=True, slots=True)
-class Visits:
+class Visits(AnswerWithNotes):
     """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
 
     `total` is how many were found; a note says so where there may be more.
@@ -389,17 +385,15 @@ class Visits:
     more: bool
     total: int
     now: Ns
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class TypeFields:
+class TypeFields(AnswerWithNotes):
     """The fields that replies show of a message type, and the topics recorded under it."""
 
     type: str
     topics: tuple[str, ...]
     fields: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -418,16 +412,10 @@ class RememberedMoment:
 
 
 @dataclass(frozen=True, slots=True)
-class ListedMoment:
+class ListedMoment(RememberedMoment):
     """A saved moment; `size` in bytes, `missing` names what of it could not be saved."""
 
-    moment: str
-    label: str
-    start: Ns
-    end: Ns
-    bags: int
     size: int
-    pending: bool
     missing: tuple[str, ...]
 
 
@@ -440,23 +428,4 @@ class MomentList:
     now: Ns
 
 
-Answer: TypeAlias = (
-    tuple[TopicRow, ...]
-    | DataTimeRange
-    | TopicValue
-    | TopicRange
-    | Position
-    | Velocity
-    | TransformAt
-    | Frames
-    | Match
-    | ValueWhen
-    | TrajectorySummary
-    | Sightings
-    | Recap
-    | Status
-    | Visits
-    | TypeFields
-    | RememberedMoment
-    | MomentList
-)
+Answer: TypeAlias = AnswerWithNotes | tuple[TopicRow, ...] | RememberedMoment | MomentList

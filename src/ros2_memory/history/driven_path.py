@@ -12,7 +12,7 @@ from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import counted
 from ros2_memory.history.bag_groups import DigestKind, Fold
-from ros2_memory.history.no_data import describe_lack, undecodable_in
+from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -81,7 +81,7 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
     if failures:
         error = failures[0]
         if span is None:
-            raise undecodable_in(view, window, error) from error
+            raise with_notes(view, window, undecodable(error)) from error
         view.notes.complete = False
         count = len(failures)
         view.notes.add(f"poses left out, since they cannot be decoded: {count} ({error.reason})")

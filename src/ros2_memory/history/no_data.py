@@ -160,8 +160,8 @@ def not_recorded(view: View, name: str) -> NoDataError:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
         close = [topic for topic in snapshot.timeline.topics() if stem and stem in topic][:5]
     hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
-    note_unread(view, TimeWindow.everything(), nothing=True)
-    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}", view.notes.sentences())
+    error = NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}")
+    return with_notes(view, TimeWindow.everything(), error)
 
 
 def no_data_at(
@@ -195,8 +195,7 @@ def no_data_at(
     if older and tolerance is not None:
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
-    note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(detail), view.notes.sentences())
+    return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
@@ -211,8 +210,13 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     reason = between(view, window) if older and newer else beyond(view, end)
     detail += _advice(view, reason)
+    return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:
+    """Returns the error with all notes, also on what of a window without an answer was not read."""
     note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(detail), view.notes.sentences())
+    return NoDataError(error.reason, error.detail, view.notes.sentences())
 
 
 def _neighbours(
@@ -250,13 +254,6 @@ def undecodable(error: UndecodableError) -> NoDataError:
         f"messages of {error.topic} ({error.type_name}) are recorded but cannot be decoded: "
         f"{error.reason}",
     )
-
-
-def undecodable_in(view: View, window: TimeWindow, error: UndecodableError) -> NoDataError:
-    """Returns the same for all messages of a window, with notes on what else was not read."""
-    note_unread(view, window, nothing=True)
-    failure = undecodable(error)
-    return NoDataError(failure.reason, failure.detail, view.notes.sentences())
 
 
 def decode(view: View, found: StoredMessage) -> object:

@@ -19,7 +19,7 @@ from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import is_covered, note_unread, unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import matching_topics, undecodable_in
+from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -102,7 +102,7 @@ class ReverseSearch:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
                 self.note_undecodable()
-            raise undecodable_in(self._view, window, failure)
+            raise with_notes(self._view, window, undecodable(failure))
         self.note_undecodable()
         if not found:
             self._require_testable()

@@ -85,8 +85,8 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
             each.moment.request.start,
             each.moment.request.end,
             len(each.files),
-            sum(each.files.values()),
             each.moment.pending,
+            sum(each.files.values()),
             each.moment.missing,
         )
         for each in stored[:MAX_LISTED]

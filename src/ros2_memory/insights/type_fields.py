@@ -51,7 +51,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         if len(fields) > MAX_FIELDS:
             view.notes.add(f"{MAX_FIELDS} of {len(fields)} fields")
         shown = tuple(fields.items())[:MAX_FIELDS]
-        return TypeFields(type_name, tuple(topics), shown, view.notes.sentences())
+        return TypeFields(type_name, tuple(topics), shown, notes=view.notes.sentences())
     raise NoDataError(
         NoDataReason.UNDECODABLE,
         f"no newest message of this type can be read: {failure or 'others came after it'}",

@@ -162,7 +162,7 @@ def _stored(stored: results.ListedMoment, now: Ns) -> JsonObject:
     return with_notes(reply, stored.missing, pending=stored.pending)
 
 
-def _labelled_window(saved: results.RememberedMoment | results.ListedMoment) -> JsonObject:
+def _labelled_window(saved: results.RememberedMoment) -> JsonObject:
     return {
         "moment": saved.moment,
         "label": saved.label,

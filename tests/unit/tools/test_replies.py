@@ -62,7 +62,7 @@ def odom(x: float, y: float) -> dict[str, Any]:
 
 def of_samples(values: list[Any], notes: tuple[str, ...] = ()) -> results.TopicRange:
     samples = tuple(Sample(T0 + n * 123_456_789, each) for n, each in enumerate(values))
-    return results.TopicRange("/odom", "nav_msgs/msg/Odometry", 5000, samples, notes)
+    return results.TopicRange("/odom", "nav_msgs/msg/Odometry", 5000, samples, notes=notes)
 
 
 def driven(jumps: int = 0, jumped_m: float = 0.0) -> MotionTotals:
@@ -184,7 +184,9 @@ def test_a_topic_value_has_no_age_and_no_notes_unless_there_are_some() -> None:
 
 
 def test_an_empty_memory_has_nulls_for_its_span() -> None:
-    empty = results.DataTimeRange(None, None, T0, 0, (), (), (), (), (), 0, ("there is nothing",))
+    empty = results.DataTimeRange(
+        None, None, T0, 0, (), (), (), (), (), 0, notes=("there is nothing",)
+    )
     shown = said(empty)
     assert [shown[key] for key in ("earliest", "latest", "earliest_local", "latest_local")] == [
         None
@@ -283,7 +285,7 @@ def test_a_position_without_a_rotation_has_no_yaw(orientation: Any) -> None:
 
 def test_a_velocity_has_a_linear_and_an_angular_part() -> None:
     twist = Twist((0.50001, 0.0, math.inf), (0.0, 0.0, -0.12345), "base_link")
-    assert said(results.Velocity("/odom", T0, twist, ("odd",))) == {
+    assert said(results.Velocity("/odom", T0, twist, notes=("odd",))) == {
         "linear": {"x": 0.5, "y": 0.0, "z": None},
         "angular": {"x": 0.0, "y": 0.0, "z": -0.1235},
         "timestamp": 1784023200.0,
@@ -334,7 +336,7 @@ def test_an_incomplete_search_without_a_match_says_what_it_missed(kind: Any) -> 
 
 def test_a_match_says_when_what_and_where_with_each_note_once() -> None:
     found = value(age=NS_PER_S, notes=("b.mcap was left open", "thinned"))
-    assert said(results.Match(found, ("b.mcap was left open",))) == {
+    assert said(results.Match(found, notes=("b.mcap was left open",))) == {
         "timestamp": 1784023200.0,
         "value": 1.5,
         "topic": "/a",
@@ -347,7 +349,7 @@ def test_a_match_says_when_what_and_where_with_each_note_once() -> None:
 def test_a_value_when_another_matched_has_both() -> None:
     matched = value(T0, {"data": True})
     held = results.TopicValue("/odom", "nav_msgs/msg/Odometry", Sample(T0 - NS_PER_S, {"x": 1}))
-    assert said(results.ValueWhen(matched, held, ("1 s older",))) == {
+    assert said(results.ValueWhen(matched, held, notes=("1 s older",))) == {
         "timestamp": 1784023200.0,
         "matched": {"data": True},
         "value": {"x": 1},
@@ -359,7 +361,7 @@ def test_a_value_when_another_matched_has_both() -> None:
 
 
 def test_a_topic_that_held_nothing_yet_gives_a_null_value() -> None:
-    shown = said(results.ValueWhen(value(), None, ("/odom held no message yet",)))
+    shown = said(results.ValueWhen(value(), notes=("/odom held no message yet",)))
     assert shown["value"] is None
     assert shown["value_timestamp"] is None
 
