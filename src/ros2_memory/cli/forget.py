@@ -97,7 +97,7 @@ def forget(
     elif dry_run:
         print_line(f"would be deleted: {_describe(plan)}")
         for bag in plan.to_delete:
-            print_line(f"  {plan.name_of(bag.path)}")
+            print_line(f"  {_name(bag.path, plan.bag_dir)}")
     else:
         print_line(f"to be deleted: {_describe(plan)}")
         if not yes:
@@ -119,10 +119,6 @@ class Plan:
     own: OwnRecordings | None
     to_delete: tuple[BagFile, ...]
     kept: tuple[str, ...]
-
-    def name_of(self, path: Path) -> str:
-        """Returns a path as people know it: relative to the bag directory, if it is in there."""
-        return _name(path, self.bag_dir)
 
 
 def plan_deletion(settings: Settings, snapshot: Snapshot, window: TimeWindow) -> Plan:
@@ -176,6 +172,7 @@ def _may_delete(bag: BagFile, own: OwnRecordings | None) -> bool:
 
 
 def _name(path: Path, bag_dir: Path) -> str:
+    """Returns a path as people know it: relative to the bag directory, if it is in there."""
     return str(path.relative_to(bag_dir)) if path.is_relative_to(bag_dir) else str(path)
 
 
@@ -262,12 +259,13 @@ def _delete(
             latched = {*carrier.with_latched(snapshot, {bag.path for bag in bags})}
             bags = [bag for bag in bags if bag not in latched]
             kept = [
-                f"{plan.name_of(bag.path)}: it has latched messages, which nobody else may "
+                f"{_name(bag.path, plan.bag_dir)}: it has latched messages, which nobody else may "
                 f"carry on beside a recorder: {recorder}; stop it for a moment, and forget again"
                 for bag in sorted(latched)
             ]
         deleted, freed = _delete_files(plan.bag_dir, bags, kept)
-        open_recordings = _open_recordings(plan.bag_dir)
+        reported_open = read_heartbeat(plan.bag_dir).recordings
+        open_recordings = {plan.bag_dir / name for name in reported_open}
         for recording in {bag.recording for bag in deleted} - open_recordings:
             try:
                 remove_emptied(plan.bag_dir, recording)
@@ -320,12 +318,6 @@ def _delete_files(
     return deleted, freed
 
 
-def _open_recordings(bag_dir: Path) -> set[Path]:
-    """Returns the recordings that a recorder says it writes."""
-    heartbeat = read_heartbeat(bag_dir).heartbeat
-    return {bag_dir / name for name in heartbeat.recordings} if heartbeat else set()
-
-
 def _correct_metadata(
     plan: Plan,
     deleted: Sequence[BagFile],
@@ -337,7 +329,7 @@ def _correct_metadata(
     That of an open recording is left to its recorder, which writes it at the end.
     """
     for recording in sorted({bag.recording for bag in deleted}):
-        name = f"{plan.name_of(recording)}/{METADATA_FILE}"
+        name = f"{_name(recording, plan.bag_dir)}/{METADATA_FILE}"
         if recording in open_recordings and not (recording / METADATA_FILE).exists():
             yield f"{name} will list what was deleted: its recorder writes it at the end"
             continue
