@@ -160,19 +160,14 @@ def watch(
 def _observations(memory: Memory, every_s: float, count: int | None) -> Iterator[Observation]:
     """Yields what there is to see now, and again every so many seconds."""
     for number in itertools.count(1):
-        yield observe(memory)
+        snapshot, wall = memory.index.snapshot(), memory.clock.now()
+        status = memory_status(memory, Call())
+        live = _is_live(memory, snapshot, status, wall)
+        yield Observation(wall, status, tuple(_rates(memory, snapshot)), live)
         if number == count:
             return
         time.sleep(every_s)
         memory.index.refresh()
-
-
-def observe(memory: Memory) -> Observation:
-    """Returns what there is to see now."""
-    snapshot, wall = memory.index.snapshot(), memory.clock.now()
-    status = memory_status(memory, Call())
-    live = _is_live(memory, snapshot, status, wall)
-    return Observation(wall, status, tuple(_rates(memory, snapshot)), live)
 
 
 def _is_live(memory: Memory, snapshot: Snapshot, status: Status, wall: Ns) -> bool:
