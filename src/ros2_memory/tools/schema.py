@@ -55,11 +55,6 @@ class Signature:
         return [name for name, schema in self._properties.items() if "default" not in schema]
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Returns the arguments in the order in which they are declared."""
-        return tuple(self._properties)
-
-    @property
     def example(self) -> JsonObject:
         """Returns a call with the required arguments alone."""
         return {name: _example(self._properties[name]) for name in self._required}
@@ -107,11 +102,12 @@ class Signature:
         raise InvalidArgumentsError("; ".join(problems))
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
+        names = ", ".join(self._properties)
+        known = f"there are: {names}" if names else "there are none"
         unknown = (name for name in given if name not in self._properties)
         for name in islice(unknown, _MAX_UNKNOWN_NAMED):
             near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
-            hint = f"do you mean {near[0]}?" if near else f"there are: {', '.join(self.names)}"
-            hint = hint if self.names else "there are none"
+            hint = f"do you mean {near[0]}?" if near else known
             yield f"there is no argument {abbreviate(name)}; {hint}"
         if more := sum(1 for _ in unknown):
             yield f"and {more} more that there are not"
