@@ -42,14 +42,12 @@ class Override:
         key: the key or group that it sets.
         text: the assignment in Hydra's grammar.
         source: who gave it, as a phrase that follows "set".
-        is_group: whether it chooses a file of a group.
-        option: the file that it chooses.
+        option: the file that it chooses, where the key is a group.
     """
 
     key: str
     text: str
     source: str
-    is_group: bool
     option: str | None = None
 
 
@@ -71,7 +69,8 @@ class Sources:
         """Returns who set a key; for a file also the key that it takes its value from."""
         for override in reversed(self.overrides):
             own, other = f"{key}.", f"{override.key}."
-            if not override.is_group and (own.startswith(other) or other.startswith(own)):
+            is_related = own.startswith(other) or other.startswith(own)
+            if override.key not in GROUPS and is_related:
                 return override.source
         variable = self.appended.get(key)
         return f"{self._file(key)}{f', and by {variable}' if variable else ''}"
@@ -79,7 +78,7 @@ class Sources:
     def choice(self, group: str) -> tuple[str | None, str]:
         """Returns the option of a group, and who chose it."""
         for override in reversed(self.overrides):
-            if override.is_group and override.key == group:
+            if override.key == group:
                 return override.option, override.source
         config = self.folder / "config.yaml"
         presets = () if group == "deployment" else self._presets()
@@ -241,9 +240,7 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
         )
     # Added by force, an unknown key reaches the validation, which names the known ones.
     option = str(override.value()) if is_group and changes else None
-    return Override(
-        key, f"++{text}" if changes and not is_group else text, source, is_group, option
-    )
+    return Override(key, f"++{text}" if changes and not is_group else text, source, option)
 
 
 def _defaults(path: Path) -> Iterator[dict[str, str]]:
