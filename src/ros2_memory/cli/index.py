@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Annotated, Final
 
 import typer
@@ -106,7 +107,7 @@ def fill_catalogue(
         for number, bag in enumerate(backfill.waiting()[:_BATCH]):
             if is_cancelled():
                 break
-            show(progress.after(number))
+            show(replace(progress, waiting=progress.waiting - number))
             done += backfill.digest(bag)
     if not is_cancelled():
         backfill.prune()

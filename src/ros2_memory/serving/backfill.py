@@ -67,10 +67,6 @@ class Progress:
     waiting: int
     refused: int
 
-    def after(self, more: int) -> Progress:
-        """Returns the progress when some more have been digested."""
-        return Progress(self.closed, self.waiting - more, self.refused)
-
 
 class Backfill:
     """Digests the bags of one memory. Only `progress` may be called from several threads.
