@@ -13,7 +13,7 @@ import pytest
 
 from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.mcp_server import SCHEMA, STATUS, TOPICS
+from ros2_memory.serving.mcp_server import SCHEMA, STATUS, TOOLS_OF_RESOURCES, TOPICS
 from ros2_memory.tools.spec_tools import build_tools
 from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
@@ -88,9 +88,10 @@ def test_every_preset_and_every_variable_stands_there() -> None:
 
 def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
     told = dict(re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE))
-    assert set(told) == {each.uri for each in (TOPICS, STATUS, SCHEMA)}
-    for each in (TOPICS, STATUS):
-        assert told[each.uri] == f"`{each.tool}`"
+    assert set(told) == {TOPICS.uri, STATUS.uri, SCHEMA.uri_template}
+    assert set(TOOLS_OF_RESOURCES) == {TOPICS.uri, STATUS.uri}
+    for uri, tool in TOOLS_OF_RESOURCES.items():
+        assert told[uri] == f"`{tool}`"
 
 
 def test_every_command_stands_there_with_its_exit_codes() -> None:

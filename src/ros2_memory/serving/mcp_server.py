@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 from urllib.parse import unquote
 
 from mcp.server.lowlevel.helper_types import ReadResourceContents
@@ -26,7 +26,7 @@ from starlette.requests import Request
 from ros2_memory.tools.instructions import PROMPT
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Mapping
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.serving.dispatch import Dispatcher
@@ -43,29 +43,27 @@ _PROMPT_TITLE: Final = "How to use the robot's memory"
 _PROMPT_DESCRIPTION: Final = "Teaches a planner which tool answers what, in one call each."
 
 
-class ToolResource(NamedTuple):
-    """A resource, or a template of resources, whose text is the reply of a tool."""
-
-    uri: str
-    name: str
-    description: str
-    tool: str
-
-
-TOPICS: Final = ToolResource(
-    "episodic://topics",
-    "topics",
-    "Every recorded topic with its type, times and count.",
-    "list_recorded_topics",
+TOPICS: Final = Resource(
+    uri="episodic://topics",
+    name="topics",
+    description="Every recorded topic with its type, times and count.",
+    mime_type=_JSON,
 )
-STATUS: Final = ToolResource(
-    "episodic://status", "status", "How far the memory can be trusted just now.", "memory_status"
+STATUS: Final = Resource(
+    uri="episodic://status",
+    name="status",
+    description="How far the memory can be trusted just now.",
+    mime_type=_JSON,
 )
-SCHEMA: Final = ToolResource(
-    "episodic://schema/{type}",
-    "schema",
-    "The fields that replies show of a message type, as dot-paths, e.g. nav_msgs/msg/Odometry.",
-    "describe_type",
+TOOLS_OF_RESOURCES: Final = {TOPICS.uri: "list_recorded_topics", STATUS.uri: "memory_status"}
+"""The tools whose replies are the text of the resources."""
+_SCHEMA_PREFIX: Final = "episodic://schema/"
+SCHEMA: Final = ResourceTemplate(
+    uri_template=f"{_SCHEMA_PREFIX}{{type}}",
+    name="schema",
+    description="The fields that replies show of a message type, as dot-paths, e.g. "
+    "nav_msgs/msg/Odometry.",
+    mime_type=_JSON,
 )
 
 
@@ -82,8 +80,9 @@ class EpisodicServer(MCPServer[object]):
         super().__init__(name, version=version, instructions=instructions)
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
-        has_status = any(tool.name == STATUS.tool for tool in dispatcher.tools)
-        self._resources = (TOPICS, STATUS, SCHEMA) if has_status else (TOPICS,)
+        has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
+        self._resources = [TOPICS, STATUS] if has_status else [TOPICS]
+        self._templates = [SCHEMA] if has_status else []
         self._prompt = f"{instructions}\n{PROMPT}"
 
     async def list_tools(self) -> list[ListedTool]:
@@ -101,24 +100,11 @@ class EpisodicServer(MCPServer[object]):
 
     async def list_resources(self) -> list[Resource]:
         """Returns the resources that have no parameter."""
-        return [
-            Resource(uri=each.uri, name=each.name, description=each.description, mime_type=_JSON)
-            for each in self._resources
-            if each is not SCHEMA
-        ]
+        return self._resources
 
     async def list_resource_templates(self) -> list[ResourceTemplate]:
         """Returns the template of the resources of message types."""
-        return [
-            ResourceTemplate(
-                uri_template=each.uri,
-                name=each.name,
-                description=each.description,
-                mime_type=_JSON,
-            )
-            for each in self._resources
-            if each is SCHEMA
-        ]
+        return self._templates
 
     async def read_resource(
         self, uri: object, context: object | None = None
@@ -129,10 +115,21 @@ class EpisodicServer(MCPServer[object]):
             ResourceNotFoundError: there is no such resource; the client receives the code that the
                 protocol has for it, -32602 (SEP-2164).
         """
-        name, arguments = _resource_call(str(uri), self._resources)
+        name, arguments = self._resource_call(str(uri))
         client = _client(context)
         reply = await self.dispatcher.answer(name, arguments, client, for_resource=True)
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
+
+    def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
+        """Returns the tool of a resource, and its arguments."""
+        if self._templates and uri.startswith(_SCHEMA_PREFIX) and uri != _SCHEMA_PREFIX:
+            return "describe_type", {"type": unquote(uri.removeprefix(_SCHEMA_PREFIX))}
+        offered = [each.uri for each in self._resources]
+        if uri in offered:
+            return TOOLS_OF_RESOURCES[uri], {}
+        shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
+        known = ", ".join([*offered, *(each.uri_template for each in self._templates)])
+        raise ResourceNotFoundError(f"there is no resource {shown}; what can be read: {known}")
 
     async def list_prompts(self) -> list[Prompt]:
         """Returns the one prompt."""
@@ -156,19 +153,6 @@ class EpisodicServer(MCPServer[object]):
         return GetPromptResult(
             description=_PROMPT_DESCRIPTION, messages=[PromptMessage(role="user", content=text)]
         )
-
-
-def _resource_call(uri: str, offered: Sequence[ToolResource]) -> tuple[str, dict[str, JsonValue]]:
-    """Returns the tool of a resource, and its arguments."""
-    prefix = SCHEMA.uri.removesuffix("{type}")
-    for each in offered:
-        if each is SCHEMA and uri.startswith(prefix) and uri != prefix:
-            return each.tool, {"type": unquote(uri.removeprefix(prefix))}
-        if each is not SCHEMA and uri == each.uri:
-            return each.tool, {}
-    shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
-    known = ", ".join(each.uri for each in offered)
-    raise ResourceNotFoundError(f"there is no resource {shown}; what can be read: {known}")
 
 
 def _client(context: object) -> Hashable:
