@@ -124,8 +124,11 @@ class Sidecars(NamedTuple):
     new: Handover
 
 
-def intended(old: Handover, new_name: str) -> Handover:
-    """Returns the old sidecar before the new recording is started, as a crash may come any time."""
+def intended(old: Handover, new_name: str | None) -> Handover:
+    """Returns the old sidecar before the new recording is started, as a crash may come any time.
+
+    None in place of its name withdraws it: the new recording did not take over.
+    """
     return replace(old, next=new_name, counts_until=None, end=None)
 
 
@@ -137,11 +140,6 @@ def pending(old_name: str) -> Handover:
 def void(old_name: str) -> Handover:
     """Returns the sidecar of a new recording that did not take over: the old one has all of it."""
     return Handover(state=Counting.VOID, previous=old_name)
-
-
-def withdrawn(old: Handover) -> Handover:
-    """Returns the old sidecar when the new recording did not take over."""
-    return replace(old, next=None, counts_until=None, end=None)
 
 
 def complete_sidecars(

@@ -25,7 +25,7 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.recorder.handover.plan import Sidecars, withdrawn
+from ros2_memory.recorder.handover.plan import Sidecars, intended
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -101,11 +101,11 @@ def recover_handover(old: Path, new: Path, reader: BagReader) -> None:
 def _complete(old: Path, new: Path, reader: BagReader) -> None:
     before = handover_to_change(old)
     if not _is_folder(new):
-        write_handover(old, withdrawn(before))
+        write_handover(old, intended(before, None))
         return
     after = handover_to_change(new)
     if after.state is Counting.VOID:
-        write_handover(old, withdrawn(before))
+        write_handover(old, intended(before, None))
     elif after.state is Counting.COUNTS and after.counts_from is not None:
         # The crash came between the two sidecars of a complete handover.
         start = after.begin.log_from if after.begin is not None else None
@@ -147,7 +147,7 @@ def _cut_at_the_end(old: Path, new: Path, found: Sidecars, reader: BagReader) ->
     last = _end_of(old, reader)
     if last is None:
         write_handover(new, replace(after, state=Counting.COUNTS, previous=old.name))
-        write_handover(old, withdrawn(before))
+        write_handover(old, intended(before, None))
         return
     bags = _bags(new, reader)
     first = min((summary.start for _, summary in bags), default=last.log_time)
@@ -170,16 +170,12 @@ def _end_of(recording: Path, reader: BagReader) -> _End | None:
     newest: _End | None = None
     try:
         for record in _records(recording / name, reader):
-            if newest is None:
-                newest = _End(record.publish_time, record.log_time)
-            newest = _End(
-                max(newest.publish_time, record.publish_time),
-                max(newest.log_time, record.log_time),
-            )
+            published, logged = newest or (MIN_NS, MIN_NS)
+            newest = _End(max(published, record.publish_time), max(logged, record.log_time))
     except BagUnreachableError:
         raise
     except BagError:
-        return newest
+        pass  # what could be read of it counts
     return newest
 
 

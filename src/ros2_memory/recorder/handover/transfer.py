@@ -23,7 +23,6 @@ from ros2_memory.recorder.handover.plan import (
     intended,
     pending,
     void,
-    withdrawn,
 )
 from ros2_memory.recorder.handover.recovery import cut_clock, recover_handover
 
@@ -82,7 +81,7 @@ class HandoverTransfer:
         """
         directory = old.splits.directory
         if _is_there(directory):
-            write_handover(directory, withdrawn(handover_to_change(directory)))
+            write_handover(directory, intended(handover_to_change(directory), None))
 
     @property
     def missing(self) -> frozenset[str]:

@@ -21,7 +21,6 @@ from ros2_memory.recorder.handover.plan import (
     pending,
     set_back,
     void,
-    withdrawn,
 )
 
 T0 = 1_795_150_000 * NS_PER_S
@@ -148,7 +147,7 @@ class TestSidecars:
     def test_before_and_after_a_failed_handover(self) -> None:
         old = Handover(previous="z")
         assert intended(old, "b") == Handover(previous="z", next="b")
-        assert withdrawn(intended(old, "b")) == old
+        assert intended(intended(old, "b"), None) == old
         assert pending("a").hides_all
         assert void("a").hides_all
 
