@@ -88,7 +88,7 @@ def options_in_help(text: str) -> frozenset[str]:
     Raises:
         RecorderError: this installation cannot write MCAP.
     """
-    usage = _usage(text)
+    usage = text.partition("usage:")[2].partition("\n\n")[0]
     storages = _STORAGES.search(usage)
     if storages is not None and "mcap" not in re.split(r"[\s,]+", storages[1] or storages[2]):
         raise RecorderError(
@@ -115,9 +115,3 @@ def storage_config(chunk_bytes: int) -> str:
     the ROS package rosbag2_storage_mcap).
     """
     return yaml.safe_dump({"chunkSize": chunk_bytes, "compression": "Zstd"}, sort_keys=True)
-
-
-def _usage(text: str) -> str:
-    """Returns the first paragraph that begins with "usage:", or an empty string."""
-    begin = text.find("usage:")
-    return "" if begin < 0 else text[begin:].split("\n\n", 1)[0]

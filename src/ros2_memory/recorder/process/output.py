@@ -60,9 +60,10 @@ _MEANINGS: Final = (
     (LineKind.UNKNOWN_TYPE, re.compile(r"Topic '(?P<topic>[^']+)' has unknown type")),
     (LineKind.SEVERAL_TYPES, re.compile(r"Topic '(?P<topic>[^']+)' has more than one type")),
     (LineKind.MESSAGES_LOST, re.compile(r"Cache buffers lost messages")),
+    # The total is on a line of its own, below one line for each topic.
+    (LineKind.MESSAGES_LOST, re.compile(r"Total lost: (?!0\b)\d+")),
 )
-# The total is on a line of its own, below one line for each topic.
-_LOST: Final = re.compile(r"Total lost: (?!0\b)\d+")
+_BY_LEVEL: Final = {"WARN": LineKind.WARNING, "ERROR": LineKind.ERROR, "FATAL": LineKind.ERROR}
 
 
 def parse_line(raw: str) -> Line:
@@ -74,12 +75,4 @@ def parse_line(raw: str) -> Line:
         found = pattern.match(text)
         if found is not None:
             return Line(kind, text, found.groupdict().get("topic"))
-    if _LOST.match(text):
-        return Line(LineKind.MESSAGES_LOST, text)
-    return Line(_by_level(logged["level"] if logged else ""), text)
-
-
-def _by_level(level: str) -> LineKind:
-    if level == "WARN":
-        return LineKind.WARNING
-    return LineKind.ERROR if level in {"ERROR", "FATAL"} else LineKind.OTHER
+    return Line(_BY_LEVEL.get(logged["level"] if logged else "", LineKind.OTHER), text)
