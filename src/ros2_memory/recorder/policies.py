@@ -21,7 +21,6 @@ SILENT_SPLITS: Final = 3
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""
 SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
-_MAX_DOUBLINGS: Final = 16
 
 
 class Backoff:
@@ -32,15 +31,12 @@ class Backoff:
     """
 
     def __init__(self) -> None:
-        self._failures = 0
+        self._wait_s = FIRST_WAIT_S
 
     def failed(self, lasted_s: float) -> float:
         """Returns the wait in seconds after an attempt that ended after `lasted_s`."""
-        if lasted_s >= STABLE_S:
-            self._failures = 0
-        doublings = min(self._failures, _MAX_DOUBLINGS)
-        wait_s = min(FIRST_WAIT_S * (1 << doublings), MAX_WAIT_S)
-        self._failures += 1
+        wait_s = FIRST_WAIT_S if lasted_s >= STABLE_S else self._wait_s
+        self._wait_s = min(2 * wait_s, MAX_WAIT_S)
         return wait_s
 
 
@@ -61,9 +57,8 @@ class SilenceWatch:
         self._cap_s = max(session_duration_s, self._first_s)
         self._patience_s = self._first_s
         self._settled_at_s = 0.0
-        self._grew_at_s = 0.0
+        self._grew_at_s: float | None = None
         self._bytes = 0
-        self._grown = False
 
     def began(self, now_s: float, settle_s: float) -> None:
         """Notes that a recording began; what it writes within `settle_s` is not the robot's.
@@ -71,9 +66,8 @@ class SilenceWatch:
         Those are its headers, and the latched messages that every recording receives again.
         """
         self._settled_at_s = now_s + settle_s
-        self._grew_at_s = self._settled_at_s
+        self._grew_at_s = None
         self._bytes = 0
-        self._grown = False
 
     def is_silent(self, now_s: float, bytes_written: int) -> bool:
         """Whether to rotate, given what the recording has written so far (it never shrinks)."""
@@ -81,8 +75,7 @@ class SilenceWatch:
             self._bytes = bytes_written
             if now_s >= self._settled_at_s:
                 self._grew_at_s = now_s
-                self._grown = True
-        return self._grown and now_s - self._grew_at_s >= self._patience_s
+        return self._grew_at_s is not None and now_s - self._grew_at_s >= self._patience_s
 
     def rotated(self, *, for_silence: bool) -> None:
         """Notes that the recording was rotated, for silence or because its session was over."""

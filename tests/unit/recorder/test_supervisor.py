@@ -9,6 +9,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.timebase import NS_PER_S
 from tests.support.simulated_recorders import World, assert_each_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
@@ -78,6 +79,20 @@ class TestStart:
 
 
 class TestRotation:
+    @pytest.mark.parametrize(("age_s", "recordings"), [(599.9, 1), (600.0, 2)])
+    def test_a_session_is_over_when_it_has_lasted_for_its_duration(
+        self, tmp_path: Path, age_s: float, recordings: int
+    ) -> None:
+        # Splits so long that a jump in time is no silence.
+        world = World(tmp_path, split_duration_s=600, session_duration_s=600)
+        began_s = world.mono
+        world.supervisor.start()
+        world.run(5)
+        world.wall += round((began_s + age_s - world.mono) * NS_PER_S)
+        world.mono = began_s + age_s
+        world.supervisor.tick()
+        assert len(world.recorders) == recordings
+
     def test_no_message_is_lost_or_counts_twice(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20)
         world.supervisor.start()
