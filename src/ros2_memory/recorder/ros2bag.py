@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Clock
     from ros2_memory.storage.base import BagReader
 
 __all__ = ["Ros2BagRecorder", "record_argv"]
@@ -63,7 +62,6 @@ class Ros2BagRecorder(Recorder):
         chunk_bytes: size of an MCAP chunk before compression.
         housekeeper: repairs and deletes; nothing does where None.
         own: the list of the recordings that were made here.
-        clock: the wall clock.
         keep_open: file descriptors that `ros2 bag record` inherits.
     """
 
@@ -83,7 +81,6 @@ class Ros2BagRecorder(Recorder):
         chunk_bytes: int,
         housekeeper: Housekeeper | None = None,
         own: OwnRecordings | None = None,
-        clock: Clock | None = None,
         keep_open: Collection[int] = (),
     ) -> None:
         self._bag_dir = bag_dir.absolute()
@@ -96,7 +93,6 @@ class Ros2BagRecorder(Recorder):
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
         self._own = own or OwnRecordings(self._bag_dir)
-        self._started = False
         self._checked = False
         self._topics = TopicSelection(())
         self._env: dict[str, str] = {}
@@ -113,7 +109,7 @@ class Ros2BagRecorder(Recorder):
             self._start_child,
             reader,
             housekeeper or Housekeeper(),
-            clock or WallClock(),
+            WallClock(),
             expected=lambda: self._topics.exact,
             own=self._own,
         )
@@ -128,13 +124,12 @@ class Ros2BagRecorder(Recorder):
 
     def start(self) -> None:
         """Begins to record, after `check` if that was not called since the last start."""
-        if self._started:
+        if not self._supervisor.stopped:
             return
         if not self._checked:
             self.check()
         self._checked = False
         self._supervisor.start()
-        self._started = True
 
     def tick(self) -> None:
         """Does what supervision needs at this moment."""
@@ -143,7 +138,6 @@ class Ros2BagRecorder(Recorder):
     def stop(self) -> None:
         """Ends recording, within the bounded patience of its children."""
         self._supervisor.stop()
-        self._started = False
 
     def is_running(self) -> bool:
         """Whether a child runs and has reported that it records."""

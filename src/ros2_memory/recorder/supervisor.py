@@ -65,6 +65,9 @@ class Supervisor:
         device: gives the device that a directory lies on.
         expected: gives the topics that are to be recorded by name.
         own: the list of recordings that were made here.
+
+    Attributes:
+        stopped: whether it does nothing at this time.
     """
 
     def __init__(
@@ -87,7 +90,6 @@ class Supervisor:
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
         self._disk = HomeDisk(orders.bag_dir, device)
-        self._disk_gone = False
         self._housekeeper = housekeeper
         self._events = EventLog()
         self._heartbeat = HeartbeatWriter(
@@ -114,7 +116,7 @@ class Supervisor:
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
-        self._stopped = True
+        self.stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
         self._applied_s = self._last.monotonic_s
@@ -131,7 +133,7 @@ class Supervisor:
         Raises:
             RecorderError: it cannot be begun.
         """
-        if not self._stopped:
+        if not self.stopped:
             return
         self._last = now = self._now()
         self._due_s.clear()
@@ -140,16 +142,15 @@ class Supervisor:
             self._disk.remember()
         except OSError as error:
             raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
-        self._disk_gone = False
         self._check_space(now)
         if not self._paused:
             self._begin(now)
-        self._stopped = False
+        self.stopped = False
         self._write_heartbeat()
 
     def tick(self) -> None:
         """Does what is due. Raises nothing: a failure is reported and tried again."""
-        if self._stopped:
+        if self.stopped:
             return
         now = self._now()
         if clock_was_set_back(self._last, now):
@@ -159,14 +160,14 @@ class Supervisor:
         self._run_tasks(now)
         if self._is_due("beat", HEARTBEAT_S, now):
             self._write_heartbeat()
-        elif not self._disk_gone:
+        elif not self._disk.away:
             self._heartbeat.write_if_changed(self._state, self._sessions)
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
-        if self._stopped:
+        if self.stopped:
             return
-        self._stopped = True
+        self.stopped = True
         self._write_heartbeat(RecorderState.STOPPING)
         self._sessions.stop(self._now())
         self._paused = False
@@ -202,8 +203,8 @@ class Supervisor:
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
         recordings = [each.name for each in self._sessions.running if each.splits.exists]
-        was_gone, self._disk_gone = self._disk_gone, self._disk.is_away(recordings)
-        if self._disk_gone and not was_gone:
+        was_away, is_away = self._disk.away, self._disk.is_away(recordings)
+        if is_away and not was_away:
             self._sessions.end_all(now)
             self._events.fail(
                 "disk_gone",
@@ -211,7 +212,7 @@ class Supervisor:
                 "lies there; recording resumes by itself when it is mounted again (to record onto "
                 "the other one, start the recorder anew)",
             )
-        elif was_gone and not self._disk_gone:
+        elif was_away and not is_away:
             self._postpone("restart", self._backoff.failed(0.0), now)
             self._events.info("disk_back", bag_dir=str(self._bag_dir))
 
@@ -228,7 +229,7 @@ class Supervisor:
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        if self._disk_gone or not self._is_due("space", SPACE_S, now):
+        if self._disk.away or not self._is_due("space", SPACE_S, now):
             return
         free = self._free_bytes()
         if free is None:
@@ -309,7 +310,7 @@ class Supervisor:
             self._postpone("rotate", self._rotation_backoff.failed(0.0), now)
 
     def _check_restart(self, now: ClockReading) -> None:
-        if self._sessions.current is not None or self._paused or self._disk_gone:
+        if self._sessions.current is not None or self._paused or self._disk.away:
             return
         if not self._is_due("restart", 0.0, now):
             return
@@ -327,35 +328,35 @@ class Supervisor:
     def _note_recorded(self, now: ClockReading) -> None:
         names = [each.name for each in self._sessions.running if each.has_recorded]
         self._housekeeper.note_recorded(
-            () if self._disk_gone else names, self._sessions.bytes_written, now.monotonic_s
+            () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
 
     def _apply_retention(self, now: ClockReading) -> None:
         self._events.report_faults(self._housekeeper.faults())
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
-        if self._disk_gone or now.monotonic_s - self._applied_s < every_s:
+        if self._disk.away or now.monotonic_s - self._applied_s < every_s:
             return
         self._applied_s = now.monotonic_s
         self._splits_closed = False
         self._housekeeper.apply()
 
     def _keep_moments(self, now: ClockReading) -> None:
-        if not self._disk_gone and self._is_due("moments", MOMENTS_S, now):
+        if not self._disk.away and self._is_due("moments", MOMENTS_S, now):
             self._housekeeper.keep_moments()
 
     def _announce(self, name: str) -> None:
         """Names a recording in the heartbeat before anything of it exists."""
-        if not self._disk_gone:
+        if not self._disk.away:
             self._heartbeat.write(self._state, self._sessions, announced=name)
 
     def _write_heartbeat(self, state: RecorderState | None = None) -> None:
         # While the bags' own disk is unmounted nothing is written to the disk below it.
-        if not self._disk_gone:
+        if not self._disk.away:
             self._heartbeat.write(state or self._state, self._sessions)
 
     @property
     def _state(self) -> RecorderState:
-        if self._paused or self._disk_gone:
+        if self._paused or self._disk.away:
             return RecorderState.PAUSED
         return RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
 

@@ -38,14 +38,18 @@ def device_of(directory: Path) -> int:
 
 
 class HomeDisk:
-    """The disk that a bag directory lay on when recording began."""
+    """The disk that a bag directory lay on when recording began.
+
+    Attributes:
+        away: the last answer of `is_away`.
+    """
 
     def __init__(self, bag_dir: Path, device: Callable[[Path], int] = device_of) -> None:
         self._bag_dir = bag_dir
         self._device_of = device
         self._device: int | None = None
         self._recordings: frozenset[str] = frozenset()
-        self._away = False
+        self.away = False
 
     def remember(self) -> None:
         """Remembers the disk that the bag directory lies on now.
@@ -54,7 +58,7 @@ class HomeDisk:
             OSError: it cannot be looked at.
         """
         self._device = self._device_of(self._bag_dir)
-        self._away = False
+        self.away = False
 
     def is_away(self, recordings: Collection[str]) -> bool:
         """Whether another disk lies there now; the answer from before if that cannot be read.
@@ -65,16 +69,16 @@ class HomeDisk:
         Args:
             recordings: those that are being written and exist.
         """
-        if recordings and not self._away:
+        if recordings and not self.away:
             self._recordings = frozenset(recordings)
         try:
             device = self._device_of(self._bag_dir)
             if device != self._device and self._has_recordings():
                 self._device = device
         except OSError:
-            return self._away
-        self._away = device != self._device
-        return self._away
+            return self.away
+        self.away = device != self._device
+        return self.away
 
     def _has_recordings(self) -> bool:
         return any((self._bag_dir / name).is_dir() for name in self._recordings)
