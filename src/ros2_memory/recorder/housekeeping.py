@@ -26,7 +26,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
-from ros2_memory.retention.collect import GarbageCollector
+from ros2_memory.retention.collect import Collected, GarbageCollector
 from ros2_memory.retention.delete import left_by_repair, remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.collect import Collected
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
     from ros2_memory.storage.base import BagReader, BagWriter
@@ -103,6 +102,7 @@ class Housekeeping(Housekeeper):
             is_synchronised=is_synchronised,
             static_topics=static_topics,
             grace_s=grace_s,
+            measure_free=measure_free,
             monotonic=monotonic,
         )
         self._index = IndexManager(
@@ -118,12 +118,10 @@ class Housekeeping(Housekeeper):
         self._links = HardLinks(bag_dir)
         self._clock = clock
         self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
-        self._age_held = 0
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
-        self._measure_free = measure_free
         self._tried: set[tuple[Path, int, int]] = set()
         self._over_budget = False
-        self._has_foreign = False
+        self._collected = Collected()
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -149,23 +147,12 @@ class Housekeeping(Housekeeper):
         Raises:
             OSError: the free space cannot be measured.
         """
-        begun = time.perf_counter_ns()
-        self._update_moments()
-        collected = self._index.apply_retention(
-            free_bytes=lambda: self._measure_free(self._bag_dir), min_free_bytes=free_bytes_wanted
-        )
-        self._report(collected, begun, free_bytes_wanted=free_bytes_wanted)
-        self._report_held(collected)
+        self._apply(free_bytes_wanted)
 
     def apply(self) -> None:
         """Deletes what exceeds the budget or is too old; repairs what nothing writes any more."""
-        begun = time.perf_counter_ns()
-        self._update_moments()
-        collected = self._index.apply_retention()
-        self._report(collected, begun)
-        self._report_over_budget(collected)
-        self._report_held(collected)
-        self._report_foreign(collected)
+        self._apply()
+        self._report_over_budget(self._collected)
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
@@ -188,15 +175,50 @@ class Housekeeping(Housekeeper):
 
     def age_held(self) -> str | None:
         """Describes the bags that are kept though their dates make them too old, or None."""
-        if not self._age_held:
+        if not self._collected.held:
             return None
-        bags = counted(self._age_held, "bag is", "bags are")
+        bags = counted(self._collected.held, "bag is", "bags are")
         limit = f"{self._max_age_h:g} h"
         return (
             f"{bags} older than {limit} (retention.max_age_h) by the dates, and kept: the clock is "
             "not known to be right. They go when it is synchronised with a time server "
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
+
+    def _apply(self, free_bytes_wanted: int | None = None) -> None:
+        begun = time.perf_counter_ns()
+        self._update_moments()
+        before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
+        self._collected = collected
+        wanted = {} if free_bytes_wanted is None else {"free_bytes_wanted": free_bytes_wanted}
+        (_log.info if collected.bags else _log.debug)(
+            "retention_applied",
+            bags=collected.bags,
+            bytes=collected.bytes,
+            recordings=collected.recordings,
+            carried=collected.carried,
+            failed=collected.failed,
+            total_bytes=collected.total_bytes,
+            foreign_bytes=collected.foreign_bytes,
+            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            **wanted,
+        )
+        self._report_changes(before, collected)
+
+    def _report_changes(self, before: Collected, after: Collected) -> None:
+        """Reports what began or ended with this pass: age held back, and bags no limit counts."""
+        if after.held and not before.held:
+            _log.warning("age_held", bags=after.held, reason=self.age_held())
+        elif before.held and not after.held:
+            _log.info("age_no_longer_held")
+        if after.foreign_bytes and not before.foreign_bytes:
+            _log.warning(
+                "foreign_bags_kept",
+                bytes=after.foreign_bytes,
+                reason="the recorder did not make them, so they are neither deleted nor counted in "
+                "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
+                "retention.foreign=delete all",
+            )
 
     def _update_moments(self) -> None:
         """Saves what was asked for and updates sidecars, before anything is deleted.
@@ -297,41 +319,6 @@ class Housekeeping(Housekeeper):
                 str(path), f"{size} bytes are too many to repair while recording: {remedy}"
             )
         return self._repairer.repair(path)
-
-    def _report(self, collected: Collected, begun: int, **values: object) -> None:
-        log = _log.info if collected.bags else _log.debug
-        log(
-            "retention_applied",
-            bags=collected.bags,
-            bytes=collected.bytes,
-            recordings=collected.recordings,
-            carried=collected.carried,
-            failed=collected.failed,
-            total_bytes=collected.total_bytes,
-            foreign_bytes=collected.foreign_bytes,
-            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
-            **values,
-        )
-
-    def _report_held(self, collected: Collected) -> None:
-        """Reports once that bags are kept whose dates make them too old, and once the end of it."""
-        before, self._age_held = self._age_held, collected.held
-        if self._age_held and not before:
-            _log.warning("age_held", bags=self._age_held, reason=self.age_held())
-        elif before and not self._age_held:
-            _log.info("age_no_longer_held")
-
-    def _report_foreign(self, collected: Collected) -> None:
-        """Reports once that there are bags which no limit counts."""
-        if collected.foreign_bytes and not self._has_foreign:
-            _log.warning(
-                "foreign_bags_kept",
-                bytes=collected.foreign_bytes,
-                reason="the recorder did not make them, so they are neither deleted nor counted in "
-                "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
-                "retention.foreign=delete all",
-            )
-        self._has_foreign = bool(collected.foreign_bytes)
 
     def _report_over_budget(self, collected: Collected) -> None:
         """Reports once that the budget cannot be kept."""

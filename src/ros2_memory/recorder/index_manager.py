@@ -124,13 +124,10 @@ class IndexManager:
         with self._lock:
             yield self._scan(patrolling=False)
 
-    def apply_retention(
-        self, *, free_bytes: Callable[[], int] | None = None, min_free_bytes: int | None = None
-    ) -> Collected:
+    def apply_retention(self, free_bytes_wanted: int | None = None) -> Collected:
         """Scans, and deletes what exceeds the limits; nothing without a `collector`.
 
-        `free_bytes` measures what the disk has left, if that is to count; `min_free_bytes` is what
-        it must have, in place of the limits' own figure.
+        `free_bytes_wanted` is how much of the disk must be free, if that is to count.
         """
         if self._collector is None:
             return Collected()
@@ -138,10 +135,7 @@ class IndexManager:
             snapshot = self._scan()
             named = read_heartbeat(self.bag_dir).recordings
             collected = self._collector.apply(
-                self._table.known(named, snapshot.scanned_at),
-                snapshot,
-                free_bytes=free_bytes,
-                min_free_bytes=min_free_bytes,
+                self._table.known(named, snapshot.scanned_at), snapshot, free_bytes_wanted
             )
             if collected.bags:
                 self._scan()

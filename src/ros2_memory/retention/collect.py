@@ -17,6 +17,7 @@ import structlog
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
+from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import ages, plan_deletions
 from ros2_memory.retention.recorded_time import relative_recording
@@ -100,6 +101,7 @@ class GarbageCollector:
         is_synchronised: whether the system clock is synchronised; may take some seconds.
         static_topics: topics that are latched whatever their publishers declare.
         grace_s: how long latched messages are carried before their bag is deleted.
+        measure_free: measures what the disk of a directory has left, in bytes.
         monotonic: a clock that never steps, in seconds.
     """
 
@@ -114,6 +116,7 @@ class GarbageCollector:
         is_synchronised: Callable[[], bool],
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
+        measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bag_dir = bag_dir
@@ -123,39 +126,34 @@ class GarbageCollector:
         self._is_synchronised = is_synchronised
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
+        self._measure_free = measure_free
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
         self._reported: set[str] = set()
         self._emptied: set[Path] = set()
 
     def apply(
-        self,
-        known: KnownBags,
-        snapshot: Snapshot,
-        *,
-        free_bytes: Callable[[], int] | None = None,
-        min_free_bytes: int | None = None,
+        self, known: KnownBags, snapshot: Snapshot, free_bytes_wanted: int | None = None
     ) -> Collected:
         """Deletes what is too old, then what exceeds the budget. Reports what cannot be deleted.
 
         Args:
             known: what the index knows about files.
             snapshot: the index's snapshot of the same files.
-            free_bytes: measures what the disk has left; None if that does not count.
-            min_free_bytes: what must be free, in place of the limits' own figure.
+            free_bytes_wanted: how much of the disk must be free; None if that does not count.
 
         Raises:
             OSError: the free space cannot be measured, or the list of the recorder's own recordings
                 cannot be read.
         """
         limits = self._limits
-        if min_free_bytes is not None:
-            limits = replace(limits, min_free_bytes=min_free_bytes)
-        run = _Pass(urgent=free_bytes is not None)
+        if free_bytes_wanted is not None:
+            limits = replace(limits, min_free_bytes=free_bytes_wanted)
+        run = _Pass(urgent=free_bytes_wanted is not None)
         while True:
             stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
-            if free_bytes is not None:
-                stock = replace(stock, free_bytes=free_bytes())
+            if free_bytes_wanted is not None:
+                stock = replace(stock, free_bytes=self._measure_free(self._bag_dir))
             stock = self._with_clocks(stock, limits, run)
             plan = plan_deletions(stock, limits)
             run.result.foreign_bytes = stock.foreign_bytes

@@ -77,7 +77,6 @@ class _Folder(NamedTuple):
     """A recording's directory: its device, and the size of what goes with its last bag."""
 
     mtime_ns: Ns
-    is_complete: bool
     device: int
     size: int
 
@@ -229,13 +228,12 @@ class Inventory:
         try:
             status = Path(path).stat()
         except OSError:
-            return _Folder(0, is_complete=False, device=-1, size=0)
-        if known is None or not known.is_complete or known.mtime_ns != status.st_mtime_ns:
+            return _Folder(0, device=-1, size=0)
+        if known is None or known.mtime_ns != status.st_mtime_ns:
+            known = _Folder(status.st_mtime_ns, status.st_dev, beside_bags(Path(path)))
             # metadata.yaml is created first and written some moments later.
-            since = abs(now - status.st_mtime_ns)
-            size = beside_bags(Path(path))
-            known = _Folder(status.st_mtime_ns, since >= COMPLETE_AFTER_NS, status.st_dev, size)
-            self._folders[path] = known
+            if abs(now - status.st_mtime_ns) >= COMPLETE_AFTER_NS:
+                self._folders[path] = known
         return known
 
     def _forget(self, known: KnownBags) -> None:
