@@ -1,25 +1,156 @@
-"""One recording while its `ros2 bag record` runs: the child process, its output and its files."""
+"""One recording while its `ros2 bag record` runs: the child process, its output and its files.
+
+Only the end of a bag file shows whether it is closed: distributions number splits differently, and
+a new file appears some milliseconds before the old one is closed.
+"""
 
 from __future__ import annotations
 
+import os
 from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.core.errors import BagError
 from ros2_memory.recorder.process.output import LineKind, parse_line
+from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child
     from ros2_memory.recorder.process.output import Line
-    from ros2_memory.recorder.split_watcher import Splits
+    from ros2_memory.storage.base import BagReader
 
 MAX_DISTINCT: Final = 200
 """How many warnings that differ in more than their numbers are reported for one recording."""
+EMPTY_GRACE_S: Final = 5.0
+"""A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
 _LAST_LINES: Final = 6
 _REPORTED: Final = frozenset(LineKind) - {LineKind.OTHER, LineKind.FLUSHING}
+
+
+@dataclass(frozen=True, slots=True)
+class SplitChanges:
+    """What changed since the last observation.
+
+    `closed` and `empty` name splits. `gone`: the directory existed and does not any more. `faults`
+    are sentences about what could not be read.
+    """
+
+    closed: tuple[str, ...] = ()
+    empty: tuple[str, ...] = ()
+    gone: bool = False
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Split:
+    first_seen_s: float
+    size: int = 0
+    closed: bool = False
+    reported_empty: bool = False
+
+
+@dataclass(slots=True)
+class Splits:
+    """The splits of one recording, as of the last observation.
+
+    Attributes:
+        directory: the recording.
+        reader: reads splits that are closed.
+        exists: whether the directory exists.
+        received: the topics of which a closed split has a message.
+        messages: how many messages all closed splits have.
+    """
+
+    directory: Path
+    reader: BagReader
+    exists: bool = False
+    received: set[str] = field(default_factory=set)
+    messages: int = 0
+    _files: dict[str, _Split] = field(default_factory=dict)
+
+    def observe(self, now_s: float) -> SplitChanges:
+        """Reads the directory again. Raises nothing."""
+        try:
+            sizes = self._sizes()
+        except (FileNotFoundError, NotADirectoryError):
+            existed, self.exists = self.exists, False
+            return SplitChanges(gone=existed)
+        except OSError as error:
+            return SplitChanges(faults=(f"{self.directory}: {error.strerror or error}",))
+        self.exists = True
+        for name, size in sizes.items():
+            split = self._files.setdefault(name, _Split(now_s))
+            split.size = max(split.size, size)
+        faults: list[str] = []
+        closed = tuple(name for name in sizes if self._has_closed(name, faults))
+        newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
+        overdue = now_s - newest_s >= EMPTY_GRACE_S
+        empty = tuple(
+            name for name, size in sizes.items() if overdue and self._is_empty(name, size, newest_s)
+        )
+        return SplitChanges(closed, empty, faults=tuple(faults))
+
+    @property
+    def bytes_written(self) -> int:
+        """The size of all splits in bytes, deleted ones included; it never shrinks."""
+        return sum(split.size for split in self._files.values())
+
+    @property
+    def closed_names(self) -> frozenset[str]:
+        """The splits that were closed at the last observation."""
+        return frozenset(name for name, split in self._files.items() if split.closed)
+
+    def names(self) -> frozenset[str]:
+        """Returns the names of all splits, seen before or present now."""
+        with suppress(OSError):
+            return frozenset(self._files) | frozenset(self._sizes())
+        return frozenset(self._files)
+
+    def _sizes(self) -> dict[str, int]:
+        sizes: dict[str, int] = {}
+        with os.scandir(self.directory) as entries:
+            for entry in entries:
+                if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
+                    sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
+        return sizes
+
+    def _has_closed(self, name: str, faults: list[str]) -> bool:
+        """Whether the split has been closed since the last observation."""
+        split = self._files[name]
+        if split.closed or split.size == 0:
+            return False
+        path = self.directory / name
+        try:
+            if self.reader.closing(path) is not Closing.CLOSED:
+                return False
+            split.closed = True
+            summary = self.reader.summarize(path)
+        except BagError as error:
+            if split.closed:
+                faults.append(str(error))
+            return split.closed
+        except OSError as error:
+            faults.append(f"{path}: {error.strerror or error}")
+            return split.closed
+        self.received.update(topic.topic for topic in summary.topics)
+        self.messages += summary.count
+        return True
+
+    def _is_empty(self, name: str, size: int, newest_s: float) -> bool:
+        """Whether the split is empty though a newer one was seen; True only once."""
+        split = self._files[name]
+        if size > 0 or split.reported_empty or newest_s <= split.first_seen_s:
+            return False
+        split.reported_empty = True
+        return True
 
 
 class SessionState(Enum):

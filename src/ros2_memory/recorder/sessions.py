@@ -21,8 +21,7 @@ from ros2_memory.recorder.handover.plan import (
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.policies import describe_silent_topics
 from ros2_memory.recorder.process.child import end_all
-from ros2_memory.recorder.session import RecordingSession, SessionState
-from ros2_memory.recorder.split_watcher import Splits
+from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child
-    from ros2_memory.recorder.split_watcher import SplitChanges
+    from ros2_memory.recorder.session import SplitChanges
     from ros2_memory.storage.base import BagReader
 
 WHOLE_RECORDING_S: Final = 15.0
@@ -68,6 +67,7 @@ class RecordingSessions:
         own: the list of recordings that were made here.
 
     Attributes:
+        running: all sessions whose children have not ended, oldest first.
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None mostly.
         restarts: how often a recording had to be started again.
@@ -93,21 +93,16 @@ class RecordingSessions:
         self._events = events
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
-        self._running: list[RecordingSession] = []
+        self.running: tuple[RecordingSession, ...] = ()
         # By the old recording's name, until that has ended.
         self._completed: dict[str, HandoverTransfer] = {}
         self._ended_bytes = 0
         self.restarts = 0
 
     @property
-    def running(self) -> tuple[RecordingSession, ...]:
-        """All sessions whose children have not ended, oldest first."""
-        return tuple(self._running)
-
-    @property
     def bytes_written(self) -> int:
         """The bytes that all recordings wrote since the start."""
-        return self._ended_bytes + sum(each.splits.bytes_written for each in self._running)
+        return self._ended_bytes + sum(each.splits.bytes_written for each in self.running)
 
     def begin(self, now: ClockReading) -> None:
         """Starts a recording when there is none.
@@ -217,10 +212,10 @@ class RecordingSessions:
     def stop(self, now: ClockReading) -> None:
         """Ends all sessions, and waits for that within the patience of the children."""
         self.end_all(now)
-        for child in end_all([session.child for session in self._running]):
+        for child in end_all([session.child for session in self.running]):
             self._events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
         self.collect_ended(now)
-        self._running.clear()
+        self.running = ()
 
     def _launch(self, name: str, now: ClockReading) -> RecordingSession:
         self._own.begin(name)
@@ -233,7 +228,7 @@ class RecordingSessions:
         self._unlisted.add(name)
         self._events.info("recorder_started", recording=name, pid=child.pid)
         session = RecordingSession(name, child, Splits(directory, self._reader), now)
-        self._running.append(session)
+        self.running += (session,)
         return session
 
     def _list_own(self, session: RecordingSession) -> None:
@@ -316,7 +311,7 @@ class RecordingSessions:
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""
         session.state = SessionState.ENDED
-        self._running = [each for each in self._running if each is not session]
+        self.running = tuple(each for each in self.running if each is not session)
         self._observe(session, now)
         completed = self._completed.pop(session.name, None)
         if completed is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.recorder.split_watcher import EMPTY_GRACE_S, SplitChanges, Splits
+from ros2_memory.recorder.session import EMPTY_GRACE_S, SplitChanges, Splits
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
 
