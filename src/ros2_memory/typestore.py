@@ -25,6 +25,7 @@ from rosbags.typesys.store import Typestore
 
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,9 +40,10 @@ MAX_MEMBERS: Final = 4_000
 MAX_NESTING: Final = 40
 MAX_UNROLLED: Final = 5_000
 """Elements of fixed arrays of strings or messages: rosbags writes a line of code for each."""
-MAX_CACHED_TYPES: Final = 4_096
 MAX_CACHED_BYTES: Final = 8 << 20
 """Of definitions whose deserializers are cached; a deserializer takes some ten times as much."""
+_CACHED_TYPE_BYTES: Final = 2_048
+"""Counted for each besides its text, so that no more than 4,096 are cached."""
 _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
@@ -62,7 +64,6 @@ class MessageType:
     `definitions` are those of the type and of its nested types; None with a reason.
     """
 
-    name: str
     deserialize: Callable[[bytes], object] | None
     reason: str | None
     fieldless: bool = False
@@ -94,8 +95,7 @@ class Typestores:
         for path in custom_msg_paths:
             for name, text in _definitions_below(Path(path)):
                 self._folders.setdefault(name, _Section("ros2msg", text))
-        self._types: dict[tuple[str, str, bytes], MessageType] = {}
-        self._bytes = 0
+        self._types: ByteLru[MessageType] = ByteLru(MAX_CACHED_BYTES)
         self._lock = threading.Lock()
 
     def lookup(self, name: str, encoding: str, text: bytes) -> MessageType:
@@ -115,18 +115,8 @@ class Typestores:
             known = self._types.get(key)
             if known is None:
                 known = self._build(name, encoding, text)
-                self._cache(key, known)
+                self._types.put(key, known, _CACHED_TYPE_BYTES + len(name) + len(text))
             return known
-
-    def _cache(self, key: tuple[str, str, bytes], made: MessageType) -> None:
-        size = len(key[0]) + len(key[2])
-        if size > MAX_CACHED_BYTES:
-            return
-        if len(self._types) >= MAX_CACHED_TYPES or self._bytes + size > MAX_CACHED_BYTES:
-            self._types.clear()
-            self._bytes = 0
-        self._types[key] = made
-        self._bytes += size
 
     def _build(self, name: str, encoding: str, text: bytes) -> MessageType:
         root = full_name(name)
@@ -134,12 +124,12 @@ class Typestores:
             definitions = self._closure(root, _sections(root, encoding, text))
             store = _compiled(definitions, root)
         except _UnusableError as error:
-            return MessageType(name, None, " ".join(str(error).split())[:_REASON_LENGTH])
+            return MessageType(None, " ".join(str(error).split())[:_REASON_LENGTH])
 
         def deserialize(payload: bytes) -> object:
             return store.deserialize_cdr(payload, root)
 
-        return MessageType(name, deserialize, None, not definitions[root][1], definitions)
+        return MessageType(deserialize, None, not definitions[root][1], definitions)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""
@@ -238,16 +228,13 @@ def full_name(name: str) -> str:
 
 
 def _parse(name: str, section: _Section) -> Typesdict:
-    text = _plain_idl(section.text) if section.encoding == "ros2idl" else section.text + "\n"
-    if section.encoding == "ros2msg":
-        text = _MSG_NOISE.sub("", text)
-    statements = text.count(";" if section.encoding == "ros2idl" else "\n")
+    is_idl = section.encoding == "ros2idl"
+    text = _plain_idl(section.text) if is_idl else _MSG_NOISE.sub("", section.text + "\n")
+    statements = text.count(";" if is_idl else "\n")
     if statements > MAX_STATEMENTS:
         raise _UnusableError(f"its definition of {name} has {statements} statements, too many")
     try:
-        if section.encoding == "ros2idl":
-            return get_types_from_idl(text)
-        return get_types_from_msg(text, name)
+        return get_types_from_idl(text) if is_idl else get_types_from_msg(text, name)
     # The parser raises its own error, or whatever Python does with what it took for a number.
     except Exception as error:
         reason = f"its definition of {name} cannot be parsed: {_brief(error)}"
@@ -321,9 +308,8 @@ def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
         files = [file for file in files if file.parent.name == "msg"]
         if not files:
             raise ConfigError(f"reader.custom_msg_paths: {folder} holds no msg/*.msg file")
-        packages = {file.parent.parent: "" for file in files}
-        for package in packages:
-            packages[package] = _package_name(package)
+        folders = {file.parent.parent for file in files}
+        packages = {each: _package_name(each) for each in folders}
         for file in files:
             text = file.read_text(encoding="utf-8", errors="replace")
             yield f"{packages[file.parent.parent]}/msg/{file.stem}", text

@@ -272,7 +272,7 @@ def test_what_could_not_be_asked_once_is_asked_again(tmp_path: Path) -> None:
     assert opened is not None
     recall = DigestCache(memory.recall.catalogue, tmp_path)
     [run] = memory.index.snapshot().timeline.segments
-    as_of = recall.as_of()
+    as_of = recall.catalogue.newest()
     base._opened = replace(opened, connection=Busy(":memory:"))
     assert not recall.digests_for(run, as_of).numbers
     base._opened = opened
@@ -350,7 +350,7 @@ def test_entries_that_another_program_makes_anew_are_not_taken_for_the_lost_ones
         base.commit()
     # It is noticed by the next question about the way driven, which has other bounds.
     [run] = memory.index.snapshot().timeline.segments
-    notes = memory.recall.digests_for(run, memory.recall.as_of())
+    notes = memory.recall.digests_for(run, memory.recall.catalogue.newest())
     notes.catalogue.poses("/odom", [*notes.numbers.values()])
     _, other = served(tmp_path)
     fill_up(other)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -343,13 +343,18 @@ def test_threads_that_look_up_at_once_get_one_type() -> None:
     assert sorted(answers) == sorted((m.type, oracle(m)) for m in messages * 8)
 
 
+def cached_texts(stores: Typestores) -> list[bytes]:
+    keys = cast("list[tuple[str, str, bytes]]", [*stores._types._values])
+    return [text for _, _, text in keys]
+
+
 def test_the_cache_of_definitions_is_bounded_by_their_length() -> None:
     stores = Typestores()
     long = (f"# {n} {'x' * (MAX_TEXT_BYTES - 100)}\nuint8 x\n" for n in range(20))
     for each in long:
         assert stores.lookup("a_msgs/msg/A", "ros2msg", each.encode()).reason is None
-        assert sum(len(text) for _, _, text in stores._types) <= MAX_CACHED_BYTES
-    assert stores._types
+        assert sum(map(len, cached_texts(stores))) <= MAX_CACHED_BYTES
+    assert cached_texts(stores)
 
 
 def test_a_definition_longer_than_the_cache_is_refused_and_not_cached() -> None:
@@ -357,4 +362,4 @@ def test_a_definition_longer_than_the_cache_is_refused_and_not_cached() -> None:
     stores.lookup("a_msgs/msg/A", "ros2msg", b"uint8 x\n")
     found = stores.lookup("a_msgs/msg/A", "ros2msg", b"#" * (MAX_CACHED_BYTES + 1))
     assert "larger than" in reason(found)
-    assert [text for _, _, text in stores._types] == [b"uint8 x\n"]
+    assert cached_texts(stores) == [b"uint8 x\n"]

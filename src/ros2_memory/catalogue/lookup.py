@@ -156,10 +156,6 @@ class DigestCache:
         self._with_messages: OrderedDict[SegmentDigests, None] = OrderedDict()
         self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
-    def as_of(self) -> int:
-        """Returns the state of the catalogue that one question should be answered by."""
-        return self.catalogue.newest()
-
     def digests_for(self, segment: Segment, as_of: int) -> SegmentDigests:
         """Returns what is known of a segment, at that state of the catalogue or a later one."""
         with self._lock:
@@ -201,7 +197,7 @@ class DigestCache:
 
 def bags_without_entry(segments: Sequence[Segment], cache: DigestCache) -> list[BagFile]:
     """Returns the closed bags that the catalogue does not know, in order."""
-    as_of = cache.as_of()
+    as_of = cache.catalogue.newest()
     return [
         bag
         for segment in segments

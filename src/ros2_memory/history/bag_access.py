@@ -102,7 +102,7 @@ class BagAccess:
             return settled
         if self._as_of is None:
             # One state of the catalogue for the whole call, asked for only where it may have grown.
-            self._as_of = cache.as_of()
+            self._as_of = cache.catalogue.newest()
         return cache.digests_for(segment, self._as_of)
 
     def entry(self, bag: BagFile) -> tuple[SegmentDigests, int] | None:

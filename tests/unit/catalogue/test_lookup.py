@@ -38,7 +38,7 @@ def test_a_segment_whose_bags_all_have_an_entry_is_complete_after_the_first_look
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path).recall
     assert recall is not None
-    notes = recall.digests_for(run, recall.as_of())
+    notes = recall.digests_for(run, recall.catalogue.newest())
     assert len(notes.numbers) == 2
     assert recall.complete_digests(run) is notes
 
@@ -47,7 +47,7 @@ def test_a_segment_with_a_bag_without_an_entry_is_not_complete(tmp_path: Path) -
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path, part=0.5).recall
     assert recall is not None
-    assert len(recall.digests_for(run, recall.as_of()).numbers) == 1
+    assert len(recall.digests_for(run, recall.catalogue.newest()).numbers) == 1
     assert recall.complete_digests(run) is None
 
 
@@ -55,12 +55,12 @@ def test_digests_of_a_catalogue_that_was_lost_are_not_complete(tmp_path: Path) -
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path).recall
     assert recall is not None
-    recall.digests_for(run, recall.as_of())
+    recall.digests_for(run, recall.catalogue.newest())
     (tmp_path / FOLDER / FILE).unlink()
     recall.catalogue.look_after()
-    recall.as_of()
+    recall.catalogue.newest()
     assert recall.complete_digests(run) is None
-    assert not recall.digests_for(run, recall.as_of()).numbers
+    assert not recall.digests_for(run, recall.catalogue.newest()).numbers
 
 
 @pytest.mark.parametrize("answer", ["", "x", "7", "[]", '["zz", 1, 2]', '{"a": [[1], 2]}'])
