@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
@@ -41,15 +42,11 @@ def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
     text = to_json_text([_topic_row(row) for row in rows])
     if len(text) <= max_chars:
         return text
-    spare = max_chars - _LONGEST_LAST_ROW_CHARS
     busiest = sorted(rows, key=lambda row: -row.count)
-    listed: list[JsonValue] = []
-    for row in busiest:
-        spare -= len(to_json_text(_topic_row(row))) + 1
-        if spare < 0:
-            break
-        listed.append(_topic_row(row))
-    rest = busiest[len(listed) :]
+    shown: list[JsonValue] = [_topic_row(row) for row in busiest]
+    sizes = accumulate(len(to_json_text(row)) + 1 for row in shown)
+    fitting = sum(size <= max_chars - _LONGEST_LAST_ROW_CHARS for size in sizes)
+    rest = busiest[fitting:]
     others = results.TopicRow(
         f"({len(rest)} more: use pattern)",
         "",
@@ -57,7 +54,7 @@ def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
         max(row.last for row in rest),
         sum(row.count for row in rest),
     )
-    return to_json_text([*listed, _topic_row(others)])
+    return to_json_text([*shown[:fitting], _topic_row(others)])
 
 
 def _topic_row(row: results.TopicRow) -> JsonObject:
