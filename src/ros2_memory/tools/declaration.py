@@ -90,19 +90,16 @@ class ToolDeclaration:
     def _describe(
         self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
     ) -> tuple[str, JsonObject]:
-        description = self._description(name, defaults)
-        text = f"{description} Example: {to_json_text(signature.example)}"
-        if self.blocking:
-            text = f"Blocking, up to {defaults['timeout']} s. {text}"
-        return text, signature.json_schema()
-
-    def _description(self, name: ToolName, defaults: Mapping[str, object]) -> str:
         """Returns the full description for the first name, and a reference to it for the others."""
         first, when = self.names[0], name.when
         if name is first or when is None:
-            return self.description.format(when=when.text if when else "", **defaults)
-        extra = f" Reply: the same, {when.extra_reply}." if when.extra_reply else ""
-        return f"As {first.name}, {when.text}.{extra}"
+            text = self.description.format(when=when.text if when else "", **defaults)
+        else:
+            extra = f" Reply: the same, {when.extra_reply}." if when.extra_reply else ""
+            text = f"As {first.name}, {when.text}.{extra}"
+        if self.blocking:
+            text = f"Blocking, up to {defaults['timeout']} s. {text}"
+        return f"{text} Example: {to_json_text(signature.example)}", signature.json_schema()
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))
