@@ -153,8 +153,6 @@ class Dispatcher:
             stages_ms=done.stages_ms,
             chars=done.chars,
         )
-        if not self._telemetry.observers:
-            return
         try:
             self._telemetry.answered(done)
         except Exception:
