@@ -44,9 +44,8 @@ class Page:
         if not is_page or scope["method"] not in _METHODS:
             await self._app(scope, receive, send)
             return
+        # Uvicorn leaves the body out of the response to HEAD.
         response = Response(self._html, media_type="text/html", headers=self._headers)
-        if scope["method"] == "HEAD":
-            response.body = b""
         await response(scope, receive, send)
 
 
