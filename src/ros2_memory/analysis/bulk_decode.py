@@ -363,23 +363,13 @@ class MotionSample(NamedTuple):
     speed_mps: float | None
 
 
-class MotionDecoder:
-    """Decodes poses and speeds of one topic; the same as the extractor gives one by one."""
+def motion_decoder(reader: BagReader, extractor: SchemaExtractor) -> BulkDecoder[MotionSample]:
+    """Returns a decoder of poses and speeds of one topic, equal to the extractor's one by one."""
 
-    def __init__(self, reader: BagReader, extractor: SchemaExtractor) -> None:
-        self._reader = reader
-        self._extractor = extractor
-        self._bulk = BulkDecoder(
-            self._decode_one, partial(template_for, reader, extractor), _motion_samples
-        )
+    def decode(record: Record) -> MotionSample:
+        return motion_sample(extractor, reader.decode(record), record.channel.type)
 
-    def decode(self, records: Sequence[Record]) -> list[MotionSample | UndecodableError]:
-        """Returns the sample of each message, or why it cannot be decoded."""
-        return self._bulk.decode(records)
-
-    def _decode_one(self, record: Record) -> MotionSample:
-        message = self._reader.decode(record)
-        return motion_sample(self._extractor, message, record.channel.type)
+    return BulkDecoder(decode, partial(template_for, reader, extractor), _motion_samples)
 
 
 def motion_sample(extractor: SchemaExtractor, message: object, type_name: str) -> MotionSample:

@@ -232,18 +232,13 @@ class Leg:
         before, after = self.tail.creep, later.head.creep
         if before is not None and after is not None:
             creep = before.joined(after)
-            if self.still and later.still:
-                return replace(
-                    whole,
-                    head=self.head._replace(creep=creep),
-                    tail=later.tail._replace(creep=creep),
-                    still=True,
-                )
             if self.still:
-                return replace(whole, head=self.head._replace(creep=creep))
+                whole = replace(whole, head=self.head._replace(creep=creep))
             if later.still:
-                return replace(whole, tail=later.tail._replace(creep=creep))
-            return replace(whole, length_m=whole.length_m + creep.length_m)
+                whole = replace(whole, tail=later.tail._replace(creep=creep))
+            if not (self.still or later.still):
+                whole = replace(whole, length_m=whole.length_m + creep.length_m)
+            return replace(whole, still=self.still and later.still)
         inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
         # A creep that filled its leg reaches only one end of the whole.
         if self.still:
@@ -396,7 +391,8 @@ class Motion:
         odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
         for index in np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist():
             here, there = path[index], path[index + 1]
-            usual_ns = _usual_ns(apart, index, self._period_ns)
+            leg = self.totals.newest
+            usual_ns = _usual_ns(apart, index, None if leg is None else leg.period_ns)
             sides = (
                 path[max(begin, index - _NEARBY) : index + 1],
                 path[index + 1 : index + 2 + _NEARBY],
@@ -438,11 +434,6 @@ class Motion:
             totals.sum_m += later.sum_m
             totals.tail = later.tail
         return parted
-
-    @property
-    def _period_ns(self) -> Ns | None:
-        leg = self.totals.newest
-        return None if leg is None else leg.period_ns
 
     def _go_on(self, before: Leg | None, measured_leg: _MeasuredLeg) -> bool:
         """Takes the leg that comes next; returns whether a jump or reset led to it.

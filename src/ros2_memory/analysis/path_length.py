@@ -175,12 +175,8 @@ def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
     apart = np.diff(seconds)
     if len(points) < FEWEST:
         speed_mps = _sparse_speed(plain, apart)
-        ends = (
-            [End(float(step), 0.0, plain=True, creep=None) for step in plain[[0, -1]]]
-            if len(plain)
-            else [End(0.0, 0.0, plain=True, creep=None)] * 2
-        )
-        return Measured(total, total, ends[0], ends[1], still=False, speed_mps=speed_mps)
+        ends = [End(step, 0.0, plain=True, creep=None) for step in plain.tolist() or [0.0]]
+        return Measured(total, total, ends[0], ends[-1], still=False, speed_mps=speed_mps)
     noise = _noise(points)
     lengths, as_plain, stationary = _steps(points, plain, noise)
     if np.median(apart) > _DENSE_S:

@@ -406,10 +406,6 @@ class _Linking:
             chain.end = _end(self.before, self.newest, after)
         return chain
 
-    def resume(self, before: _Slot, newest: _Slot) -> None:
-        """Continues after slots that were taken elsewhere."""
-        self.before, self.newest = before, newest
-
 
 class StandstillCollector:
     """Builds the digest of one bag's poses, which come in log-time order."""
@@ -576,8 +572,8 @@ class StandstillBuilder:
         """Takes the last slots of the bag before."""
         if self._tail is None:
             return
-        before, newest, self._open = _slots(decode_positions(self._tail[0]))
-        self._linking.resume(before, newest)
+        linking = self._linking
+        linking.before, linking.newest, self._open = _slots(decode_positions(self._tail[0]))
         self._tail = None
 
     def _add(self, pose: TimedPosition) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.analysis.bulk_decode import MotionDecoder
+from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
@@ -17,6 +17,7 @@ from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
+    from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow, Vector3
@@ -64,7 +65,7 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
     fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(fastest)
-    decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
+    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
 
     def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest, Span | None]:
         collector = PoseCollector(fastest)
@@ -125,7 +126,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
 def add_poses(
     view: View,
     add: AddPose,
-    decoder: MotionDecoder,
+    decoder: BulkDecoder[MotionSample],
     messages: Iterable[StoredMessage],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:

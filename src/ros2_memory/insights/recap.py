@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.bulk_decode import MotionDecoder
+from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.intervals import united
 from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.standstills import (
@@ -314,7 +314,7 @@ def _standstills_in(
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     builder = StandstillBuilder()
-    decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
+    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
     failures: list[UndecodableError] = []
 
     def add(

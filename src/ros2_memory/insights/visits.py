@@ -12,7 +12,7 @@ from itertools import chain, islice, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.bulk_decode import MotionDecoder
+from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.dwell import Approach, DwellBuilder, Unread
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -187,7 +187,7 @@ class _VisitSearch:
         self._x, self._y, self._radius = target
         self._is_fixed = place.is_fixed(topic)
         self._digests = StoredDigests(view, topic, POSES, TimeWindow.everything())
-        self._decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
+        self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
 
     @property

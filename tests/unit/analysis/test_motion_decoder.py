@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.bulk_decode import MotionDecoder, MotionSample
+from ros2_memory.analysis.bulk_decode import MotionSample, motion_decoder
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
@@ -50,7 +50,7 @@ def assert_seen_as_alone(tmp_path: Path, messages: list[Msg]) -> None:
     topic = messages[0].topic
     records = list(reader.records(path, [topic], TimeWindow.everything()))
     assert len(records) == len(messages)
-    decoder = MotionDecoder(reader, extractor())
+    decoder = motion_decoder(reader, extractor())
     half = len(records) // 2
     seen = [*decoder.decode(records[:half]), *decoder.decode(records[half:])]
     expected = [alone(reader, record) for record in records]
@@ -95,7 +95,7 @@ def test_poses_of_another_type_are_found_by_the_same_paths(tmp_path: Path) -> No
 def test_of_many_alike_few_are_decoded(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "bag.mcap", [odom(T0 + n, n / 9, 1.0) for n in range(500)])
     reader = Counting()
-    decoder = MotionDecoder(reader, extractor())
+    decoder = motion_decoder(reader, extractor())
     records = list(reader.records(path, ["/odom"], TimeWindow.everything()))
     assert len(decoder.decode(records)) == 500
     assert reader.decoded < 10
