@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import yaml
 
-from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
+from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
 from ros2_memory.bag_dir.json_fields import integer
 from ros2_memory.bag_dir.layout import COMPRESSED, METADATA_FILE, bag_kind
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     Counts = Mapping[str, int]
 
+_MAX_BYTES: Final = 64 << 20
 _ROOT: Final = "rosbag2_bagfile_information"
 # Patterns, not YAML: parsing the list of a day of splits takes 0.8 s (8640 files).
 _BAG_NAME: Final = re.compile(
@@ -75,6 +76,17 @@ def parse_listing(text: str) -> Listing:
         messages,
         None if total is None else int(total[1]),
     )
+
+
+def read_listing(path: Path | str, directory: int | None = None) -> Listing:
+    """Returns what a file lists; its path may be relative to an open directory.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is not a regular file.
+    """
+    with open_plain(path, directory) as stream:
+        return parse_listing(stream.read(_MAX_BYTES).decode("utf-8", errors="replace"))
 
 
 class Contents(NamedTuple):

@@ -20,14 +20,16 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import set_back_while_written
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
+    from ros2_memory.index.timeline import Timeline
 
 FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
 """2017-01-01, before the first release of ROS 2. Clocks without a battery start in 1970."""
@@ -119,19 +121,18 @@ def max_plausible(now: Ns) -> Ns:
 
 
 def check_dates(
-    parts: Sequence[Segment],
+    timeline: Timeline,
     steps: Sequence[StepBack],
     now: Ns,
-    around: Callable[[Ns, Ns], Sequence[BagFile]],
 ) -> Dating:
     """Returns what the dates of all bags show.
 
     Args:
-        parts: the bags, some at a time, in order.
+        timeline: the bags; that of carried messages shows nothing about clocks.
         steps: where a clock was set back while a recording ran.
         now: the present by this machine's clock.
-        around: returns the bags that overlap two log times (inclusive).
     """
+    parts = timeline.recorded_segments
     limit = max_plausible(now)
     ahead = [
         ClockFault(bag, FaultyClock.AHEAD, bag.end - now)
@@ -149,7 +150,7 @@ def check_dates(
     elif len(ahead) + len(unset) == bags:
         unset = []  # a simulated clock, or a robot that has none
     faults = [*unset, *ahead]
-    faults += _step_faults(steps, {fault.bag.file for fault in faults}, around)
+    faults += _step_faults(steps, {fault.bag.file for fault in faults}, timeline)
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
         dating = replace(dating, faults=tuple(each._replace(misleads=False) for each in faults))
@@ -168,7 +169,7 @@ def _unset(parts: Iterable[Segment]) -> Iterator[BagFile]:
 def _step_faults(
     steps: Iterable[StepBack],
     known: Collection[str],
-    around: Callable[[Ns, Ns], Sequence[BagFile]],
+    timeline: Timeline,
 ) -> Iterator[ClockFault]:
     """Yields the faults of clocks that were set back, if no other fault explains the step."""
     named: set[str] = set()
@@ -181,7 +182,10 @@ def _step_faults(
         if within or step.by < FAR_BACK_NS:
             continue
         half = FAR_BACK_NS // 2
-        sides = [around(at - half, at + half) for at in (step.after.start, step.before.end)]
+        sides = [
+            timeline.overlapping(TimeWindow.around(at, half))
+            for at in (step.after.start, step.before.end)
+        ]
         # Of equals the earlier one is wrong: a clock that loses its time falls back.
         for bag in min(sides, key=len):
             if bag.file not in named and bag.file not in known:

@@ -33,9 +33,8 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.durable_write import open_plain
 from ros2_memory.bag_dir.layout import bag_kind
-from ros2_memory.bag_dir.metadata_yaml import parse_listing
+from ros2_memory.bag_dir.metadata_yaml import read_listing
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, BagSummary, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -58,7 +57,6 @@ _ANSWERS = "still being written: its complete chunks answer"
 _NO_MESSAGE = (
     "it ends before its first message: its recorder was killed before any reached the disk"
 )
-_METADATA_LIMIT: Final = 1 << 26
 
 
 class FileState(IntEnum):
@@ -253,11 +251,9 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
 def files_in_metadata(path: Path) -> frozenset[str]:
     """Returns the bag files that a metadata.yaml lists; none where it cannot be read."""
     try:
-        with open_plain(path) as stream:
-            text = stream.read(_METADATA_LIMIT).decode("utf-8", errors="replace")
+        return frozenset(read_listing(path).names)
     except (OSError, ValueError):
         return frozenset()
-    return frozenset(parse_listing(text).names)
 
 
 def _is_active(notes: FileNotes, context: ScanContext) -> bool:

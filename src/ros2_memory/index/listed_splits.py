@@ -13,10 +13,9 @@ from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.durable_write import open_plain
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
-from ros2_memory.bag_dir.metadata_yaml import Listing, bare_name, parse_listing
+from ros2_memory.bag_dir.metadata_yaml import Listing, bare_name, read_listing
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.index.snapshot import Snapshot
 
-_MAX_BYTES: Final = 64 << 20
 _MAX_CACHED_FOLDERS: Final = 1024
 _MISSING: Final = "metadata.yaml lists it, and it is not there"
 
@@ -171,9 +169,7 @@ def _folder(bag_dir: Path, folder: Path, now: int) -> _Folder | None:
 def _read_folder(bag_dir: Path, folder: Path, _stamp: tuple[int, int, int]) -> _Folder:
     with opened(bag_dir, folder) as descriptor:
         names = os.listdir(descriptor)  # noqa: PTH208 - of a descriptor
-        with open_plain(METADATA_FILE, descriptor) as stream:
-            text = stream.read(_MAX_BYTES).decode("utf-8", errors="replace")
+        listing = read_listing(METADATA_FILE, descriptor)
     present = frozenset(bare_name(name) for name in names if bag_kind(name))
-    listing = parse_listing(text)
     unique = tuple(dict.fromkeys(map(bare_name, listing.names)))
     return _Folder(listing._replace(names=unique), present, HANDOVER_FILE in names)

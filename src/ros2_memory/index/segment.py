@@ -92,10 +92,11 @@ class Pace(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """How many bags, and how many messages they hold."""
+    """How many bags, how many messages they hold, and their bytes."""
 
-    bags: int
-    messages: int
+    bags: int = 0
+    messages: int = 0
+    size: int = 0
 
 
 def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
@@ -130,27 +131,18 @@ class Segment:
         return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
-    def bytes_in(self) -> dict[str, int]:
-        """The bytes of the bags, by folder."""
-        sizes: dict[str, int] = {}
-        for bag in self.bags:
-            folder = _folder_of(bag)
-            sizes[folder] = sizes.get(folder, 0) + bag.size
-        return sizes
-
-    @cached_property
     def folders(self) -> frozenset[str]:
         """The folders of the bags."""
         return frozenset(map(_folder_of, self.bags))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
-        """How many bags lie in each folder, and how many messages they hold."""
+        """By folder, the tally of the bags in it."""
         found: dict[str, Tally] = {}
         for bag in self.bags:
             folder = _folder_of(bag)
-            bags, messages = found.get(folder, (0, 0))
-            found[folder] = Tally(bags + 1, messages + bag.summary.count)
+            bags, messages, size = found.get(folder, Tally())
+            found[folder] = Tally(bags + 1, messages + bag.summary.count, size + bag.size)
         return found
 
     @cached_property

@@ -22,7 +22,7 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -79,7 +79,7 @@ class Snapshot:
 
     @cached_property
     def _dates(self) -> Dating:
-        return self._check_dates(())
+        return check_dates(self.timeline, (), self.scanned_at)
 
     @property
     def misdated(self) -> Sequence[ClockFault]:
@@ -89,21 +89,11 @@ class Snapshot:
     @cached_property
     def dating(self) -> Dating:
         """What the dates and the order of all bags show about the clocks that dated them."""
-        segments = self.timeline.segments
-        between = steps_of([each.split_ranges for each in segments], self._bags_of)
         recorded = self.timeline.recorded_segments
         within = chain.from_iterable(segment.set_back for segment in recorded)
         steps = [StepBack(bag, bag, bag.summary.schema.set_back) for bag in within]
-        return self._check_dates([*between, *steps])
-
-    def _check_dates(self, steps: Sequence[StepBack]) -> Dating:
-        """Checks the dates of the bags; that of carried messages shows nothing about clocks."""
-        return check_dates(
-            self.timeline.recorded_segments,
-            steps,
-            self.scanned_at,
-            lambda first, last: self.timeline.overlapping(TimeWindow(first, min(last + 1, MAX_NS))),
-        )
+        between = steps_of(self.timeline.segments)
+        return check_dates(self.timeline, [*between, *steps], self.scanned_at)
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:
@@ -149,11 +139,5 @@ class Snapshot:
 
     def _neighbours(self, aside: SetAside) -> Neighbours:
         folder = str(aside.path.parent)
-        numbers = [nth for nth, each in enumerate(self.timeline.segments) if folder in each.folders]
-        ranges = [self.timeline.segments[nth].split_ranges for nth in numbers]
-        return neighbours(
-            str(aside.path), ranges, lambda at: self._bags_of([numbers[each] for each in at])
-        )
-
-    def _bags_of(self, segments: Sequence[int]) -> Iterator[BagFile]:
-        return chain.from_iterable(self.timeline.segments[nth].bags for nth in segments)
+        segments = (each for each in self.timeline.segments if folder in each.folders)
+        return neighbours(str(aside.path), segments)

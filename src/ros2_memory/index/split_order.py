@@ -15,13 +15,11 @@ from ros2_memory.bag_dir.layout import COMPRESSED
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-
-BagsOf: TypeAlias = "Callable[[Sequence[int]], Iterable[BagFile]]"
-"""Returns all bags of some segments, which are given by their positions."""
+    from ros2_memory.index.segment import Segment
 
 Series: TypeAlias = str
 """The path of a bag file without its number: what the files of one recording share."""
@@ -86,45 +84,41 @@ def split_ranges_of(bags: Iterable[BagFile]) -> dict[Series, SplitRange]:
     return ranges
 
 
-def steps_of(segments: Sequence[Mapping[Series, SplitRange]], bags_of: BagsOf) -> list[StepBack]:
+def steps_of(segments: Iterable[Segment]) -> list[StepBack]:
     """Returns where the clock was set back, from the ranges of all segments in order.
 
-    `bags_of` is called only for series whose ranges do not follow each other.
+    All bags are looked at only of series whose ranges do not follow each other.
     """
-    found: dict[Series, list[int]] = {}
-    for number, ranges in enumerate(segments):
-        for series in ranges:
+    found: dict[Series, list[Segment]] = {}
+    for segment in segments:
+        for series in segment.split_ranges:
             if is_recording(series):
-                found.setdefault(series, []).append(number)
+                found.setdefault(series, []).append(segment)
     steps: list[StepBack] = []
-    for series, numbers in found.items():
-        ranges_of_series = [segments[number][series] for number in numbers]
+    for series, holding in found.items():
+        ranges_of_series = [segment.split_ranges[series] for segment in holding]
         if all(a.last.number < b.first.number for a, b in pairwise(ranges_of_series)):
             steps.extend(chain.from_iterable(each.steps for each in ranges_of_series))
             for a, b in pairwise(ranges_of_series):
                 steps.extend(_steps((a.last, b.first)))
         else:
-            steps.extend(_steps(_by_series(bags_of(numbers))[series]))
+            bags = chain.from_iterable(segment.bags for segment in holding)
+            steps.extend(_steps(_by_series(bags)[series]))
     return steps
 
 
-def neighbours(
-    file: str, segments: Sequence[Mapping[Series, SplitRange]], bags_of: BagsOf
-) -> Neighbours:
-    """Returns the nearest splits on both sides of a file in its series.
-
-    `bags_of` is called only for segments that the file's number falls into.
-    """
+def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
+    """Returns the nearest splits on both sides of a file in its series."""
     split = split_of(file)
     if split is None:
         return Neighbours()
     series, number = split
     splits: list[Split] = []
-    for at, ranges in enumerate(segments):
-        known = ranges.get(series)
+    for segment in segments:
+        known = segment.split_ranges.get(series)
         if known is not None:
             is_inside = known.first.number < number < known.last.number
-            splits += _by_series(bags_of([at]))[series] if is_inside else known[:2]
+            splits += _by_series(segment.bags)[series] if is_inside else known[:2]
     before = max((each for each in splits if each.number < number), key=_BY_NUMBER, default=None)
     after = min((each for each in splits if each.number > number), key=_BY_NUMBER, default=None)
     return Neighbours(before and before.bag.end, after and after.bag.start)

@@ -58,8 +58,8 @@ class ForeignBags:
     def _measured(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
         sizes: dict[str, int] = {}
         for run in snapshot.timeline.segments:
-            for folder, size in run.bytes_in.items():
-                sizes[folder] = sizes.get(folder, 0) + size
+            for folder, tally in run.tallies.items():
+                sizes[folder] = sizes.get(folder, 0) + tally.size
         asides = [
             aside
             for aside in (*snapshot.active, *snapshot.damaged, *snapshot.unread)

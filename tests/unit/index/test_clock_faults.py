@@ -17,6 +17,7 @@ from ros2_memory.index.clock_faults import (
 )
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import StepBack
+from ros2_memory.index.timeline import Timeline
 
 S = 10**9
 HOUR = 3600 * S
@@ -35,13 +36,7 @@ def dating(
 ) -> Dating:
     ordered = sorted(bags, key=lambda each: (each.start, each.end, each.file))
     groups = [ordered[at : at + size] for at in range(0, len(ordered), size)]
-    parts = [Segment(group) for group in groups]
-    return check_dates(
-        parts,
-        steps,
-        now,
-        lambda first, last: [each for each in bags if each.start <= last and each.end >= first],
-    )
+    return check_dates(Timeline([Segment(group) for group in groups]), steps, now)
 
 
 def kinds(found: Dating) -> dict[str, FaultyClock]:

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import BagFile, BagState, BagSummary, TopicSummary
+from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
     is_recording,
     neighbours,
     split_of,
-    split_ranges_of,
     steps_of,
 )
 
@@ -31,26 +31,18 @@ def split(number: int, start_s: int, end_s: int) -> BagFile:
     return bag(f"rec_{number}.mcap", start_s, end_s)
 
 
-def in_parts(bags: list[BagFile], size: int) -> list[list[BagFile]]:
+def in_parts(bags: list[BagFile], size: int) -> list[Segment]:
     ordered = sorted(bags, key=lambda each: (each.start, each.end))
-    return [ordered[at : at + size] for at in range(0, len(ordered), size)]
+    return [Segment(ordered[at : at + size]) for at in range(0, len(ordered), size)]
 
 
 def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
-    parts = in_parts(bags, size)
-    found = steps_of(
-        [split_ranges_of(part) for part in parts], lambda at: [bag for n in at for bag in parts[n]]
-    )
+    found = steps_of(in_parts(bags, size))
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
 
 def near(name: str, bags: list[BagFile], size: int = 256) -> Neighbours:
-    parts = in_parts(bags, size)
-    return neighbours(
-        f"/bags/rec/{name}",
-        [split_ranges_of(part) for part in parts],
-        lambda at: [bag for n in at for bag in parts[n]],
-    )
+    return neighbours(f"/bags/rec/{name}", in_parts(bags, size))
 
 
 @pytest.mark.parametrize(
