@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.directory_identity import identity_of
 from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.core.directories import identity_of
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import size_of
 from tests.support.memories import ROOT

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.directory_identity import identity_of
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE, MOMENT_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
 from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.core.directories import identity_of
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits

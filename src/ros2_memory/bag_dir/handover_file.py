@@ -28,7 +28,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
-from ros2_memory.bag_dir.json_fields import integer, strings
+from ros2_memory.bag_dir.json_fields import is_integer, strings
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -271,8 +271,10 @@ def _name(fields: dict[object, object], key: str) -> str | None:
 
 
 def _nanoseconds(fields: dict[object, object], key: str) -> Ns | None:
-    is_null = fields.get(key) is None
-    return None if is_null else integer(fields, key, what="nanoseconds, or null")
+    value = fields.get(key)
+    if value is None or is_integer(value):
+        return value
+    raise ValueError(f"{key} must be nanoseconds, or null")
 
 
 def _overlap(fields: dict[object, object], key: str) -> Overlap | None:

@@ -16,21 +16,16 @@ def is_integer(value: object, least: int = MIN_NS, most: int = MAX_NS) -> TypeGu
 
 
 def integer(
-    fields: Mapping[object, object],
-    key: str,
-    least: int = MIN_NS,
-    most: int = MAX_NS,
-    *,
-    what: str | None = None,
+    fields: Mapping[object, object], key: str, least: int = MIN_NS, most: int = MAX_NS
 ) -> int:
-    """Returns the integer under a key; `what` it must be is for the error, if not its range.
+    """Returns the integer under a key.
 
     Raises:
         ValueError: the value is not an integer in the range.
     """
     value = fields.get(key)
     if not is_integer(value, least, most):
-        raise ValueError(f"{key} must be {what or f'an integer from {least} to {most}'}")
+        raise ValueError(f"{key} must be an integer from {least} to {most}")
     return value
 
 

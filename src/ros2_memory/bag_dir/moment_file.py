@@ -200,7 +200,7 @@ def save_request_from(fields: Mapping[object, object]) -> SaveRequest:
     if not isinstance(label, str) or fault_of_label(label):
         raise ValueError("label must be a text of one line")
     start, end, asked = (
-        integer(fields, f"{key}_ns", MIN_NS + 1, MAX_NS - 1, what="nanoseconds")
+        integer(fields, f"{key}_ns", MIN_NS + 1, MAX_NS - 1)
         for key in ("start", "end", "requested")
     )
     if end < start:

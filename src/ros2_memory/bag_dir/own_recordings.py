@@ -9,7 +9,7 @@ Only those are ever deleted. The file has one JSON object a line:
                                                                     upgrade from before the list
 
 The last line of a recording counts. A directory is the recorder's own while it lies under its name
-and is the very directory that was listed (see `directory_identity`).
+and is the very directory that was listed (see `directories.Identity`).
 
 Lines are appended and flushed, so a power cut leaves at most a part of the last line, which readers
 ignore and the next writer ends. Writers take turns by `flock`. Once most lines are of recordings
@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
-from ros2_memory.bag_dir.directory_identity import Identity, identity_of
 from ros2_memory.bag_dir.durable_write import (
     append_lines,
     flush,
@@ -45,6 +44,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.json_fields import integer
 from ros2_memory.bag_dir.layout import LIST_FILE, bag_kind, has_own_name
+from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from ros2_memory.bag_dir.directory_identity import Identity, identity_of
 from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
@@ -22,6 +21,7 @@ from ros2_memory.cli.options import (
     print_line,
 )
 from ros2_memory.config import NullRecorderNode
+from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import (
     ConfigError,
     InvalidArgumentsError,

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.directory_identity import identity_at
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
     METADATA_FILE,
@@ -27,6 +26,7 @@ from ros2_memory.bag_dir.layout import (
     is_kept_apart,
 )
 from ros2_memory.core import directories
+from ros2_memory.core.directories import identity_at
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.bag_dir.directory_identity import known_identity
 from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.directories import known_identity
 from ros2_memory.retention.delete import size_of
 
 if TYPE_CHECKING:

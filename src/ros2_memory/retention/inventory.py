@@ -12,7 +12,6 @@ from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.directory_identity import known_identity
 from ros2_memory.bag_dir.layout import (
     LOCK_FILE,
     MOMENT_FILE,
@@ -23,6 +22,7 @@ from ros2_memory.bag_dir.layout import (
     is_carried,
     other_form,
 )
+from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
