@@ -280,10 +280,6 @@ class SchemaExtractor:
         """Returns the frame in a message's header; empty where it has none."""
         return _text(_FRAME.of(message))
 
-    def stamp(self, message: object) -> Ns | None:
-        """Returns the time in a message's header; None where it has none."""
-        return nanoseconds(_STAMP.of(message))
-
     def transforms(
         self, message: object, log_time: Ns, *, static: bool
     ) -> tuple[StampedTransform, ...]:

@@ -89,7 +89,6 @@ def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> Non
         assert EXTRACTOR.twist(message, type_name) == Twist(
             (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), "base_link"
         )
-    assert EXTRACTOR.stamp(message) == 1_000_000_002
 
 
 @pytest.mark.parametrize(
@@ -140,11 +139,6 @@ def test_a_point_is_a_pose_without_orientation() -> None:
     assert EXTRACTOR.pose(point, "geometry_msgs/msg/PointStamped") == Pose(
         (1.0, 2.0, 0.0), None, "map"
     )
-
-
-def test_the_stamp_is_that_of_the_header() -> None:
-    assert EXTRACTOR.stamp(odometry()) == NS
-    assert EXTRACTOR.stamp(bags.twist(0.0, 0.0)) is None
 
 
 def tf_message(*transforms: object) -> object:
