@@ -8,7 +8,6 @@ raise `NoDataError`, `InvalidArgumentsError` and `QueryTimeoutError`.
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -35,6 +34,7 @@ from ros2_memory.history.coverage import (
     by_remark,
     describe_misdated,
     describe_odd,
+    not_covered,
     note_edges,
     note_unread,
     recording_gaps,
@@ -52,7 +52,7 @@ from ros2_memory.history.no_data import (
     seconds,
     with_notes,
 )
-from ros2_memory.history.reverse_search import ReverseSearch, not_covered
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.view import (
     AtTime,
@@ -462,11 +462,9 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
     """Returns a message as a reply shows it, with the notes on that message alone."""
-    begin = time.perf_counter_ns()
-    message = decode(view, found)
-    shown = view.memory.extractor.shown(message, found.record.channel.type, fields)
-    view.call.stages.add("extract", time.perf_counter_ns() - begin)
-    return shown
+    with view.call.stages.timed("extract"):
+        message = decode(view, found)
+        return view.memory.extractor.shown(message, found.record.channel.type, fields)
 
 
 def _value(

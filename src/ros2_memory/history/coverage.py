@@ -88,18 +88,18 @@ def unix_text(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
 
 
-def is_covered(view: View, window: TimeWindow) -> bool:
-    """Whether a search of a window that found nothing read all that closed files hold of it.
+def not_covered(view: View, window: TimeWindow) -> tuple[str, ...]:
+    """Returns why a search of a window that found nothing was not complete; empty where it was.
 
-    A file that is being written does not count: or else no search of a robot that records would be
-    complete.
+    It was where all that closed files hold of the window was read. A file that is being written
+    does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    return (
-        view.notes.complete
-        and not lost
-        and all(map(_is_whole, view.snapshot.timeline.faulty(window)))
-    )
+    whole = all(map(_is_whole, view.snapshot.timeline.faulty(window)))
+    if view.notes.complete and whole and not lost:
+        return ()
+    note_unread(view, window, nothing=True)
+    return view.notes.sentences()
 
 
 def _is_noted(view: View, bag: BagFile) -> bool:
@@ -139,7 +139,7 @@ def unread_spans(
         ]
         files = counted(len(lost), "bag file")
         yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
-    if active := _being_written(snapshot, window):
+    if active := being_written(snapshot, window):
         yield _describe_active(snapshot, active, window)
     faults = [
         fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
@@ -170,12 +170,8 @@ def lost_in(
     ]
 
 
-def may_be_written(snapshot: Snapshot, window: TimeWindow) -> bool:
-    """Whether a file that is still being written may hold messages of a window."""
-    return bool(_being_written(snapshot, window))
-
-
-def _being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:
+def being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:
+    """Returns the files still being written that may hold messages of a window."""
     return [
         aside
         for aside in snapshot.active

@@ -15,7 +15,7 @@ from ros2_memory.core.timebase import (
     Ns,
     unix_from_ns,
 )
-from ros2_memory.history.coverage import may_be_written, note_unread, unix_text
+from ros2_memory.history.coverage import being_written, note_unread, unix_text
 
 if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
@@ -235,7 +235,7 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
     While one recording takes over from another, the older one may not be on disk as far as the
     newer one begins: what lies between is no gap.
     """
-    written = may_be_written(view.snapshot, window)
+    written = being_written(view.snapshot, window)
     return NoDataReason.NOT_CLOSED_YET if written else NoDataReason.GAP
 
 

@@ -17,7 +17,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
-from ros2_memory.history.coverage import is_covered, note_unread, unix_text
+from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 
@@ -171,14 +171,6 @@ class ReverseSearch:
                 self._view.notes.complete = False
                 kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
                 self._view.notes.add(Note(kind, f"{topic} ({type_name})"))
-
-
-def not_covered(view: View, window: TimeWindow) -> tuple[str, ...]:
-    """Returns why a search of a window without a match was not complete; empty where it was."""
-    if is_covered(view, window):
-        return ()
-    note_unread(view, window, nothing=True)
-    return view.notes.sentences()
 
 
 class SearchWindow(NamedTuple):

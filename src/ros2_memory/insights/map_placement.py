@@ -93,9 +93,7 @@ class MapPlacement:
     def of(self, recording: Path, time: Ns, position: Vector3) -> Vector3 | None:
         """Returns the place (m) of a recording's position at a time; None without a transform."""
         pose = self._pose(recording, time)
-        if pose is None:
-            return None
-        return transform_point(pose, position)
+        return None if pose is None else transform_point(pose, position)
 
     def in_poses(self, recording: Path, at: Ns, x: float, y: float) -> tuple[float, float] | None:
         """Returns a place of the plane (m) in the own frame of a recording's poses.
@@ -161,7 +159,8 @@ class MapPlacement:
             static = static_transforms(self.view, session)
             changes = _change_times(static)
             fixed = None
-            if not changes and not children_moving(self.view, session) & _children(static):
+            children = {each.child.lstrip("/") for each in static}
+            if not changes and children.isdisjoint(children_moving(self.view, session)):
                 fixed = self._fixed_pose(static)
             self._known[session] = _SessionTransforms(static, changes, fixed)
         return self._known[session]
@@ -219,7 +218,3 @@ def _change_times(static: list[StampedTransform]) -> list[Ns]:
             changes[each.log_time] = None
         latest[child] = each
     return [*changes]
-
-
-def _children(static: list[StampedTransform]) -> set[str]:
-    return {each.child.lstrip("/") for each in static}

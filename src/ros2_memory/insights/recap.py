@@ -74,8 +74,6 @@ _UNDECODED: Final = Reason("could not be decoded: what they say is not told", "t
 _STANDSTILLS_UNKNOWN: Final = (
     "the positions are too noisy, or too few, to tell when the robot stood: stood_s is null"
 )
-_KINDS: Final = ("gap", "error", "stop", "flip", "thing")
-"""Kinds of events, the most important first."""
 _PLURALS: Final = {
     "gap": "gaps",
     "error": "errors",
@@ -83,6 +81,8 @@ _PLURALS: Final = {
     "flip": "flips",
     "thing": "sights of things",
 }
+"""The kinds of events, the most important first, and the words for several of each."""
+_KINDS: Final = tuple(_PLURALS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,8 +106,7 @@ def find_matches(
     if collected.cut and collected.selected:
         searched = TimeWindow(collected.selected[-1].first, window.stop)
     view.notes.retract_before(searched.start)
-    pose_topic = memory.limits.pose_topic
-    found = tuple(_sighting(view, condition, matches, pose_topic) for matches in collected.selected)
+    found = tuple(_sighting(view, condition, matches) for matches in collected.selected)
     note_unread(view, searched, nothing=not found, search=True)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
@@ -307,9 +306,9 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     return bool(held) and view.stream.first([topic], gap) is not None
 
 
-def _sighting(view: View, condition: Condition, matches: _Matches, pose_topic: str) -> Sighting:
+def _sighting(view: View, condition: Condition, matches: _Matches) -> Sighting:
     """Returns the result, with where the robot and the thing were at the newest match."""
-    robot = _robot(view, pose_topic, matches.newest)
+    robot = _robot(view, matches.newest)
     return Sighting(
         topic=matches.newest.record.channel.topic,
         first=matches.first,
@@ -321,13 +320,13 @@ def _sighting(view: View, condition: Condition, matches: _Matches, pose_topic: s
     )
 
 
-def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
+def _robot(view: View, seen: StoredMessage) -> Pose | None:
     """Returns the robot's newest pose at or before a match; None where it is not known.
 
     Where the session of the match has poses, it is one of these.
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
-    found = newest_in_session(view, topic, window, seen.bag.recording)
+    found = newest_in_session(view, view.memory.limits.pose_topic, window, seen.bag.recording)
     message = None if found is None else view.bags.decode(found)
     if found is None or message is None:
         return None

@@ -138,7 +138,8 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     folders = frozenset[str]() if foreign is None else foreign.folders
     foreign_bytes = None if foreign is None else foreign.total_bytes
     used -= 0 if foreign is None else foreign.bag_bytes
-    if heartbeat is None or not _is_recording(heartbeat, wall):
+    recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING
+    if heartbeat is None or not (recording and heartbeat.is_live(wall)):
         return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes)
     grown, since = 0, latest
     if latest is not None:
@@ -152,10 +153,6 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     span = 0 if latest is None or since is None else latest - since
     per_day = grown * _GROWTH_NS // span if span > 0 else None
     return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes)
-
-
-def _is_recording(heartbeat: Heartbeat, wall: Ns) -> bool:
-    return heartbeat.state is RecorderState.RECORDING and heartbeat.is_live(wall)
 
 
 def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
@@ -202,12 +199,9 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
 
 def undecodable_types(view: View, topic: str) -> dict[str, str]:
     """Returns why messages of a topic cannot be decoded, by type; from one bag for each type."""
-    reasons: dict[str, str] = {}
-    for type_name in view.snapshot.timeline.types_of(topic):
-        reason = _why_undecodable(view, topic, type_name)
-        if reason:
-            reasons[type_name] = reason
-    return reasons
+    types = view.snapshot.timeline.types_of(topic)
+    reasons = {type_name: _why_undecodable(view, topic, type_name) for type_name in types}
+    return {type_name: reason for type_name, reason in reasons.items() if reason}
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:

@@ -90,14 +90,14 @@ def visits(
     wall = memory.clock.now()
     view = open_view(memory, call, wall)
     topic = resolve_pose_topic(view)
-    place = map_placement(view, _pose_frame(view, topic), topic, frame_id)
-    search = _VisitSearch(view, topic, place, (x, y, radius))
+    placement = map_placement(view, _pose_frame(view, topic), topic, frame_id)
+    search = _VisitSearch(view, topic, placement, (x, y, radius))
     latest, newest = view.snapshot.latest, search.newest_time
     now = memory.now(wall, latest)
     stale = _SPLITS * ns_from_unix(memory.limits.split_duration_s)
     known = newest is not None and newest >= now - stale
     found, total = search.newest(limit)
-    resets = () if place.is_map or not found else _resets(view, topic, found[-1][0].arrived)
+    resets = () if placement.is_map or not found else _resets(view, topic, found[-1][0].arrived)
     note_unread(view, TimeWindow.everything(), nothing=not found)
     shown = tuple(
         Visit(
@@ -121,7 +121,7 @@ def visits(
             "the same coordinates may have been another place"
         )
     return Visits(
-        frame_id=place.frame_id,
+        frame_id=placement.frame_id,
         x=x,
         y=y,
         radius_m=radius,
@@ -179,13 +179,13 @@ class _VisitSearch:
     """Goes through the poses of a topic from the newest on, without bags that are ruled out."""
 
     def __init__(
-        self, view: View, topic: str, place: MapPlacement, target: tuple[float, float, float]
+        self, view: View, topic: str, placement: MapPlacement, target: tuple[float, float, float]
     ) -> None:
         self._view = view
         self._topic = topic
-        self._place = place
+        self._placement = placement
         self._x, self._y, self._radius = target
-        self._is_fixed = place.is_fixed(topic)
+        self._is_fixed = placement.is_fixed(topic)
         self._digests = StoredDigests(view, topic, POSES, TimeWindow.everything())
         self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
@@ -237,12 +237,12 @@ class _VisitSearch:
         Whole bags within the radius are read only where one of their poses may be closer.
         """
         closest = visit.closest
-        for bound, window, here in sorted(visit.unread, key=attrgetter("bound")):
+        for bound, window, target in sorted(visit.unread, key=attrgetter("bound")):
             if closest is not None and closest <= bound:
                 break
             approaches = [] if closest is None else [closest]
             try:
-                self._add_approaches(approaches, window, here)
+                self._add_approaches(approaches, window, target)
             except QueryTimeoutError:
                 self._view.notes.complete = False
                 self._view.notes.add(
@@ -255,11 +255,11 @@ class _VisitSearch:
         return closest or min(each.bound for each in visit.unread)
 
     def _add_approaches(
-        self, approaches: list[Approach], window: TimeWindow, here: tuple[float, float]
+        self, approaches: list[Approach], window: TimeWindow, target: tuple[float, float]
     ) -> None:
         def add(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
             if is_place(pose.position):
-                approaches.append(Approach(_away(pose.position, here), time))
+                approaches.append(Approach(_away(pose.position, target), time))
 
         messages = self._view.stream.messages([self._topic], window)
         add_poses(self._view, add, self._decoder, messages, [])
@@ -271,11 +271,11 @@ class _VisitSearch:
             yield TimeWindow.everything()
             return
         bags = self._view.stream.overlapping_bags([self._topic], TimeWindow.everything())
-        here = self._here_in(bags[0]) if self._is_fixed and bags else None
-        if here is None:  # its coordinates are not the same in all bags, so none is ruled out
+        target = self._target_in(bags[0]) if self._is_fixed and bags else None
+        if target is None:  # its coordinates are not the same in all bags, so none is ruled out
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:
-            near = Condition(NearPosition(*here, None, self._radius))
+            near = Condition(NearPosition(*target, None, self._radius))
         for part in CandidateBags(self._view, (self._topic,), near, MAX_NS).windows():
             yield part.window
 
@@ -291,12 +291,12 @@ class _VisitSearch:
         """Adds the poses of a part: by their digest where that is enough, else one by one."""
         groups = groups_of(self._view.stream, self._topic, part)
         alone = len(groups) == 1 and groups[0].is_whole and not self._may_have_duplicates(part)
-        here = self._here_in(groups[0].bags[0]) if alone else None
-        if here is not None:
+        target = self._target_in(groups[0].bags[0]) if alone else None
+        if target is not None:
             known = self._digests.of(groups[0])
-            if known is not None and self._add_digest(visits, groups[0], *known, here):
+            if known is not None and self._add_digest(visits, groups[0], *known, target):
                 return
-        self._place.use_window(part)
+        self._placement.use_window(part)
         for found, position in self._positions(part):
             self._check_counting()
             distance = self._distance(found, position)
@@ -311,7 +311,7 @@ class _VisitSearch:
         group: Group,
         digest: PoseDigest,
         span: tuple[Ns, Ns],
-        here: tuple[float, float],
+        target: tuple[float, float],
     ) -> bool:
         """Adds a whole group by the digest of its poses; False where that is not enough to know."""
         if digest.invalid or not digest.vertices:
@@ -319,19 +319,19 @@ class _VisitSearch:
         path = [vertex[1] for vertex in digest.vertices]
         first, last = digest.vertices[0][0], digest.vertices[-1][0]
         error_m = digest.error_m + _ROUNDING_M
-        bound_m = _off_path(path, here) - error_m
+        bound_m = _off_path(path, target) - error_m
         if bound_m > self._radius:
             visits.away(first)
             return True
-        near = all(_away(position, here) + error_m <= self._radius for position in path)
+        near = all(_away(position, target) + error_m <= self._radius for position in path)
         if not near or not self._unbroken(group, digest, span):
             return False
         if digest.error_m == 0 and len({*path}) == 1:
             # The robot stood still: the digest has the exact position of all poses.
-            visits.near(Approach(_away(path[0], here), first), last)
+            visits.near(Approach(_away(path[0], target), first), last)
             return True
         bound = Approach(max(bound_m, 0.0), span[0])
-        visits.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), here))
+        visits.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), target))
         return True
 
     def _unbroken(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
@@ -353,18 +353,18 @@ class _VisitSearch:
         bags = self._view.stream.overlapping_bags([self._topic], wider)
         return len({each.bag.recording for each in bags}) > 1
 
-    def _here_in(self, held: BagSpan) -> tuple[float, float] | None:
+    def _target_in(self, held: BagSpan) -> tuple[float, float] | None:
         """Returns the target in the frame of a bag's poses; None where that frame moves."""
-        return self._place.in_poses(held.bag.recording, held.first, self._x, self._y)
+        return self._placement.in_poses(held.bag.recording, held.first, self._x, self._y)
 
     def _distance(self, found: StoredMessage, position: Vector3) -> float | None:
         """Returns how far (m) a pose is from the target; None where no transform tells."""
         recording = found.bag.recording
-        here = self._place.in_poses(recording, found.time, self._x, self._y)
-        if here is not None:
-            return _away(position, here)
-        there = self._place.of(recording, found.time, position)
-        return None if there is None else _away(there, (self._x, self._y))
+        target = self._placement.in_poses(recording, found.time, self._x, self._y)
+        if target is not None:
+            return _away(position, target)
+        placed = self._placement.of(recording, found.time, position)
+        return None if placed is None else _away(placed, (self._x, self._y))
 
     def _positions(self, part: TimeWindow) -> Iterator[tuple[StoredMessage, Vector3]]:
         """Returns the positions of a part, newest first."""
@@ -372,14 +372,14 @@ class _VisitSearch:
         return positions_of(self._view, messages)
 
 
-def _away(position: Vector3, here: tuple[float, float]) -> float:
+def _away(position: Vector3, target: tuple[float, float]) -> float:
     """Returns how far (m, in the plane) a position is from a place of the same frame."""
-    return math.dist(position[:2], here)
+    return math.dist(position[:2], target)
 
 
-def _off_path(path: Sequence[Vector3], here: tuple[float, float]) -> float:
+def _off_path(path: Sequence[Vector3], target: tuple[float, float]) -> float:
     """Returns how far (m, in the plane) a place is from a path of the same frame."""
     # Each vertex by itself too: a part of the path may be a single vertex.
     pairs = chain(zip(path, path, strict=True), pairwise(path))
-    gaps = [off_segment(here, before[:2], after[:2]) for before, after in pairs]
+    gaps = [off_segment(target, before[:2], after[:2]) for before, after in pairs]
     return min(gap for gap in gaps if not math.isnan(gap))
