@@ -159,14 +159,14 @@ class DigestKind(Generic[T]):
     Attributes:
         name: part of the key under which the catalogue stores one; never changes its meaning.
         look_up: those that the catalogue has of a topic, for some entries of one segment of bags.
-        encode: a digest as text.
-        decode: the text as a digest; ValueError where it is none.
+        encode: a digest as bytes.
+        decode: the bytes as a digest; ValueError where they are none.
     """
 
     name: str
     look_up: Callable[[SegmentDigests, str, Sequence[int]], Mapping[int, T]]
-    encode: Callable[[T], str]
-    decode: Callable[[str], T]
+    encode: Callable[[T], bytes]
+    decode: Callable[[bytes], T]
 
 
 class StoredDigests(Generic[T]):
@@ -218,12 +218,12 @@ class StoredDigests(Generic[T]):
         The catalogue's own entries are of single bags.
         """
         if len(group.bags) > 1 and not group.may_be_relatched:
-            answer = json.dumps([self._kind.encode(digest), *span])
+            answer = json.dumps([self._kind.encode(digest).hex(), *span])
             self._view.bags.cache_answer(self._question, group.bags, answer)
 
     def _decode(self, answer: str) -> tuple[T, Span]:
         digest, first, last = json.loads(answer)
-        return self._kind.decode(digest), (int(first), int(last))
+        return self._kind.decode(bytes.fromhex(digest)), (int(first), int(last))
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,8 +48,8 @@ class DrivenPath:
 POSES: Final = DigestKind(
     "poses",
     look_up=lambda digests, topic, among: digests.catalogue.poses(topic, among),
-    encode=lambda digest: encode_poses(digest).hex(),
-    decode=lambda text: decode_poses(bytes.fromhex(text)),
+    encode=encode_poses,
+    decode=decode_poses,
 )
 
 

@@ -257,14 +257,10 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     limits = view.memory.limits
     pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
     pairs |= dict.fromkeys(_pairs(view, limits.tf_topics), False)
-    refused = [pair for pair in pairs if not _is_edge(pair)]
-    for pair in refused:
-        del pairs[pair]
-    if refused:
-        view.notes.add(f"pairs left out, since a frame has no name: {len(refused)}")
-    return tuple(
-        FrameEdge(parent, child, static) for (parent, child), static in sorted(pairs.items())
-    )
+    named = [each for each in sorted(pairs.items()) if _is_edge(each[0])]
+    if len(named) < len(pairs):
+        view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
+    return tuple(FrameEdge(parent, child, static) for (parent, child), static in named)
 
 
 def _pairs(

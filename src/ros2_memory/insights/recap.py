@@ -288,14 +288,14 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
 _STANDSTILLS: Final = DigestKind(
     "standstills",
     look_up=lambda digests, topic, among: digests.catalogue.standstills(topic, among),
-    encode=lambda digest: encode_standstills(digest).hex(),
-    decode=lambda text: decode_standstills(bytes.fromhex(text)),
+    encode=encode_standstills,
+    decode=decode_standstills,
 )
 _TOPIC_EVENTS: Final = DigestKind(
     "story",
     look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
-    encode=lambda events: "" if events is None else encode_topic_events(events).hex(),
-    decode=lambda text: decode_topic_events(bytes.fromhex(text)) if text else None,
+    encode=lambda events: b"" if events is None else encode_topic_events(events),
+    decode=lambda stored: decode_topic_events(stored) if stored else None,
 )
 
 
