@@ -28,7 +28,7 @@ from ros2_memory.bootstrap import (
 )
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.core.logging_setup import configure_logging, get_logger
-from ros2_memory.core.sd_notify import READY, STOPPING, ServiceManager
+from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.serving.auth import take_token
 from ros2_memory.serving.backfill import keep_backfilled
 from ros2_memory.serving.connection_limits import (
@@ -221,10 +221,10 @@ class _Listener(uvicorn.Server):
             host, port = each.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
             log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)
-        ServiceManager().notify(READY)
+        notify(READY)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        ServiceManager().notify(STOPPING)
+        notify(STOPPING)
         self._server.dispatcher.stop()
         self._app.stop()
         await super().shutdown(sockets)

@@ -97,13 +97,10 @@ class ScanResult:
 
     def is_like(self, before: ScanResult | None) -> bool:
         """Returns whether an earlier scan found the same, apart from bag files."""
-        return before is not None and (self.problem, *self._names()) == (
-            before.problem,
-            *before._names(),
-        )
+        return before is not None and self._beside_bags() == before._beside_bags()
 
-    def _names(self) -> tuple[set[SetAside], set[SetAside], set[str]]:
-        return set(self.damaged), set(self.links), set(self.metadata_folders)
+    def _beside_bags(self) -> tuple[object, ...]:
+        return self.problem, set(self.damaged), set(self.links), set(self.metadata_folders)
 
 
 @dataclass(slots=True)

@@ -26,7 +26,7 @@ from ros2_memory.core.sd_notify import (
     READY,
     STOPPING,
     WATCHDOG,
-    ServiceManager,
+    notify,
     watchdog_interval_s,
 )
 from ros2_memory.recorder.handover.recovery import recover_handovers, recover_unwritten
@@ -159,14 +159,13 @@ def _record_until_signal(
     Raises:
         EpisodicError: recording cannot begin, or another recorder took the bag directory.
     """
-    manager = ServiceManager()
     interval_s = watchdog_interval_s()
     next_sign_s = 0.0
     recover_at_s = time.monotonic() + RECOVER_EVERY_S
     with _ending_signals() as received:
         try:
             recorder.start()
-            manager.notify(READY)
+            notify(READY)
             while not received:
                 # A signal does not cut this short: Python runs its handler and sleeps on (PEP 475).
                 time.sleep(TICK_S)
@@ -180,11 +179,11 @@ def _record_until_signal(
                     with suppress(OSError):
                         recover_unwritten(bag_dir, reader)
                 if interval_s is not None and now_s >= next_sign_s:
-                    manager.notify(WATCHDOG)
+                    notify(WATCHDOG)
                     next_sign_s = now_s + interval_s / 2
             _log.info("signal_received", signal=signal.Signals(received[0]).name)
         finally:
-            manager.notify(STOPPING)
+            notify(STOPPING)
             recorder.stop()
 
 

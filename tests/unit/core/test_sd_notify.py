@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.core.sd_notify import (
     READY,
     STOPPING,
-    ServiceManager,
+    notify,
     watchdog_interval_s,
 )
 
@@ -23,32 +23,47 @@ def listener() -> socket.socket:
     return listener
 
 
+def set_only(monkeypatch: pytest.MonkeyPatch, env: dict[str, str]) -> None:
+    for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in env.items():
+        monkeypatch.setenv(name, value)
+
+
 def test_it_is_told_over_a_socket_in_the_file_system(
-    tmp_path: Path, listener: socket.socket
+    tmp_path: Path, listener: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     with listener:
         listener.bind(str(tmp_path / "notify"))
-        assert ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify")}).notify(READY)
+        assert notify(READY)
         assert listener.recv(100) == b"READY=1"
 
 
-def test_it_is_told_over_an_abstract_socket(listener: socket.socket) -> None:
+def test_it_is_told_over_an_abstract_socket(
+    listener: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
     name = f"ros2-memory-test-{os.getpid()}"
+    monkeypatch.setenv("NOTIFY_SOCKET", "@" + name)
     with listener:
         listener.bind("\0" + name)
-        assert ServiceManager({"NOTIFY_SOCKET": "@" + name}).notify(STOPPING, "STATUS=over")
+        assert notify(STOPPING, "STATUS=over")
         assert listener.recv(100) == b"STOPPING=1\nSTATUS=over"
 
 
 @pytest.mark.parametrize("env", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "/nowhere/at/all"}])
-def test_where_nobody_listens_nothing_happens(env: dict[str, str]) -> None:
-    assert not ServiceManager(env).notify(READY)
+def test_where_nobody_listens_nothing_happens(
+    env: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_only(monkeypatch, env)
+    assert not notify(READY)
 
 
-def test_it_is_told_twice_as_often_as_it_asks() -> None:
-    assert watchdog_interval_s({"WATCHDOG_USEC": "30000000"}) == 15
-    mine = {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": str(os.getpid())}
-    assert watchdog_interval_s(mine) == 15
+def test_it_is_told_twice_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_only(monkeypatch, {"WATCHDOG_USEC": "30000000"})
+    assert watchdog_interval_s() == 15
+    monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
+    assert watchdog_interval_s() == 15
 
 
 @pytest.mark.parametrize(
@@ -61,5 +76,8 @@ def test_it_is_told_twice_as_often_as_it_asks() -> None:
         {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"},
     ],
 )
-def test_it_is_not_told_what_it_does_not_ask_for(env: dict[str, str]) -> None:
-    assert watchdog_interval_s(env) is None
+def test_it_is_not_told_what_it_does_not_ask_for(
+    env: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    set_only(monkeypatch, env)
+    assert watchdog_interval_s() is None
