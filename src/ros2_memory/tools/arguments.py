@@ -267,13 +267,18 @@ class TransformArguments(Arguments):
     moment: AtTime
 
 
-class LastMatchArguments(Arguments):
+class ConditionArguments(Arguments):
     """A condition on a topic."""
 
     topic: _SearchTopic
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
+
+
+class LastMatchArguments(ConditionArguments):
+    """A condition on a topic, of which the last match is returned."""
+
     fields: _Fields = ()
     before_s: _Before | None = Field(default=None, alias="before")
 
@@ -336,13 +341,9 @@ class VisitsArguments(Arguments):
     limit: _Limit = 10
 
 
-class MatchesArguments(Arguments):
+class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
-    topic: _SearchTopic
-    condition_type: _ConditionType
-    value: _ConditionValue
-    field: _SearchField | None = None
     last_s: Annotated[_Positive, Field(description="Only the last so many s.")] | None = Field(
         default=None, alias="seconds"
     )
