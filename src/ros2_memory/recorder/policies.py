@@ -6,12 +6,10 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.recorder.handover.plan import set_back
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from ros2_memory.recorder.handover.plan import ClockReading
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 60.0
@@ -21,6 +19,11 @@ SILENT_SPLITS: Final = 3
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""
 SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
+"""A wall clock that is set back by more would keep the open split open until it has caught up.
+
+A split is closed by the time of a message that comes long enough after its first. A smaller step is
+waited out.
+"""
 
 
 class Backoff:
@@ -126,15 +129,6 @@ def space_action(
         return SpaceAction.MAKE_ROOM
     waits = making_room and free_bytes >= min_free_bytes // 2
     return SpaceAction.WAIT if waits else SpaceAction.PAUSE
-
-
-def clock_was_set_back(before: ClockReading, now: ClockReading) -> bool:
-    """Whether the wall clock was set back by so much that the open split would not be closed.
-
-    A split is closed by the time of a message that comes long enough after its first, so it would
-    stay open until the clock has caught up. A smaller step is waited out.
-    """
-    return set_back(before, now, SET_BACK_NS)
 
 
 def describe_silent_topics(subscribed: Collection[str], received: Collection[str]) -> str | None:

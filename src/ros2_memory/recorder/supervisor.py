@@ -13,13 +13,13 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.event_log import EventLog
-from ros2_memory.recorder.handover.plan import ClockReading, Step
+from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
 from ros2_memory.recorder.policies import (
+    SET_BACK_NS,
     Backoff,
     SilenceWatch,
     SpaceAction,
-    clock_was_set_back,
     resume_bytes,
     space_action,
 )
@@ -153,7 +153,7 @@ class Supervisor:
         if self.stopped:
             return
         now = self._now()
-        if clock_was_set_back(self._last, now):
+        if set_back(self._last, now, SET_BACK_NS):
             self._rotate_now = True
             self._events.warn("clock_set_back", "the clock was set back: a new recording begins")
         self._last = now

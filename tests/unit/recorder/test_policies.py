@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.handover.plan import ClockReading
+from ros2_memory.recorder.handover.plan import ClockReading, set_back
 from ros2_memory.recorder.policies import (
+    SET_BACK_NS,
     Backoff,
     SilenceWatch,
     SpaceAction,
-    clock_was_set_back,
     describe_silent_topics,
     resume_bytes,
     space_action,
@@ -152,7 +152,7 @@ def test_only_a_clock_set_back_by_minutes_calls_for_a_new_recording(
 ) -> None:
     before = ClockReading(10.0, 10**18)
     now = ClockReading(10.2, 10**18 + round(wall_s * NS_PER_S))
-    assert clock_was_set_back(before, now) is expected
+    assert set_back(before, now, SET_BACK_NS) is expected
 
 
 class TestSilentTopics:
