@@ -79,10 +79,9 @@ class Repairer:
                 # The open directory itself, even if something else takes its name meanwhile.
                 here = Path(f"/proc/self/fd/{folder}", path.name)
                 return self._repair(here, path, progress)
-        except BagVanishedError as error:
-            raise BagVanishedError(str(path), error.reason) from error
         except BagError as error:
-            raise BagError(str(path), error.reason) from error
+            # With the name of the file in place of that of the open directory.
+            raise type(error)(str(path), error.reason) from error
         except FileNotFoundError as error:
             raise BagVanishedError(str(path), "the file is not there any more") from error
         except OSError as error:
