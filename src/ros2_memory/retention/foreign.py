@@ -51,7 +51,7 @@ class ForeignBags:
         set_aside = (snapshot.active, snapshot.damaged, snapshot.unread)
         key = (snapshot.timeline, *set_aside, self._own.stamp, tuple(recording))
         known = self._known
-        if known is None or any(a is not b and a != b for a, b in zip(known[0], key, strict=True)):
+        if known is None or known[0] != key:
             known = self._known = (key, self._measured(snapshot, frozenset(recording)))
         return known[1]
 
