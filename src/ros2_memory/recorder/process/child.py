@@ -45,11 +45,6 @@ class Patience:
     terminate_s: float = 4.0
     kill_s: float = 3.0
 
-    @property
-    def total_s(self) -> float:
-        """After so long it is given up: not even SIGKILL ends a process that waits for a disk."""
-        return self.interrupt_s + self.terminate_s + self.kill_s
-
     def signal_due(self, since_s: float) -> signal.Signals:
         """Returns the strongest signal that is due `since_s` seconds after the first."""
         if since_s < self.interrupt_s:
@@ -64,7 +59,8 @@ class Child:
 
     Attributes:
         pid: its process number, which is also its group's.
-        patience_s: for how many seconds `end` is worth calling; after that nothing ends it.
+        patience_s: for how many seconds `end` is worth calling: not even SIGKILL ends a process
+            that waits for a disk.
     """
 
     def __init__(
@@ -73,7 +69,7 @@ class Child:
         self._process = process
         self._patience = patience
         self.pid = process.pid
-        self.patience_s = patience.total_s
+        self.patience_s = patience.interrupt_s + patience.terminate_s + patience.kill_s
         self._lines: deque[str] = deque(maxlen=MAX_LINES)
         self._status: int | None = None
         self._ending_since: float | None = None
