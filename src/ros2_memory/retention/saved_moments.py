@@ -148,8 +148,8 @@ class MomentKeeper:
         self._clock = clock
         self._queue = RequestQueue(bag_dir)
         self._links = HardLinks(bag_dir)
-        self._started = False
-        self._waiting = False
+        # Until the first call of `keep` shows that nothing is pending.
+        self._waiting = True
 
     def open(self) -> None:
         """Makes the folder of requests, so that a server may be given access to it alone."""
@@ -157,7 +157,7 @@ class MomentKeeper:
 
     def has_work(self) -> bool:
         """Whether a request or a pending moment waits; also before the first call of `keep`."""
-        return not self._started or self._waiting or self._queue.has_requests()
+        return self._waiting or self._queue.has_requests()
 
     def keep(self, snapshot: Snapshot) -> None:
         """Answers requests and continues pending moments. Nothing may be deleted meanwhile.
@@ -165,8 +165,7 @@ class MomentKeeper:
         Raises:
             OSError: the folders cannot be listed or written to; the next call tries again.
         """
-        if not self._started:
-            self._remove_unbegun()
+        self._remove_unbegun()
         now = self._clock.now()
         stored = {each.folder.name: each for each in stored_moments_in(self._bag_dir)}
         for name, moment in stored.items():
@@ -178,7 +177,6 @@ class MomentKeeper:
             outcome = _outcome_of(known) if known else self._grant(request, stored, snapshot)
             self._queue.answer(request, outcome)
         self._waiting = any(each.moment.pending for each in stored.values())
-        self._started = True
 
     def update_sidecars(self) -> None:
         """Links the sidecars of recordings again that were rewritten; a fault is reported.
