@@ -74,8 +74,8 @@ def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
         return status.st_size
 
 
-def remove_emptied(root: Path, recording: Path) -> int:
-    """Deletes a recording of which no bag is left; returns how many files were deleted.
+def remove_emptied(root: Path, recording: Path) -> None:
+    """Deletes a recording of which no bag is left.
 
     A file that is not known by name is kept, and so is the directory then.
 
@@ -83,25 +83,20 @@ def remove_emptied(root: Path, recording: Path) -> int:
         OSError: a file or the directory cannot be deleted.
     """
     if recording == root:
-        return 0
-    removed = 0
-    try:
+        return
+    with suppress(FileNotFoundError):
         with directories.opened(root, recording) as directory:
             with os.scandir(directory) as listing:
                 entries = list(listing)
             if any(bag_kind(entry.name) for entry in entries):
-                return 0
-            for entry in entries:
-                if goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False):
-                    os.unlink(entry.name, dir_fd=directory)
-                    removed += 1
-            if len(entries) > removed:
-                return removed
+                return
+            sidecars = [entry.name for entry in entries if _is_sidecar(entry)]
+            for name in sidecars:
+                os.unlink(name, dir_fd=directory)
+            if len(entries) > len(sidecars):
+                return
         with directories.opened(root, recording.parent) as above:
             os.rmdir(recording.name, dir_fd=above)
-    except FileNotFoundError:
-        pass
-    return removed
 
 
 def beside_bags(recording: Path) -> int:
@@ -109,9 +104,13 @@ def beside_bags(recording: Path) -> int:
     size = 0
     with suppress(OSError), os.scandir(recording) as entries:
         for entry in entries:
-            if goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False):
+            if _is_sidecar(entry):
                 size += entry.stat(follow_symlinks=False).st_size
     return size
+
+
+def _is_sidecar(entry: os.DirEntry[str]) -> bool:
+    return goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False)
 
 
 def size_of(path: Path) -> int:
