@@ -116,13 +116,9 @@ class Ages(NamedTuple):
     by_dates: frozenset[str]
     by_recording: frozenset[str]
 
-    def too_old(self, *, synchronised: bool) -> frozenset[str]:
-        """Returns the bags that age deletes."""
-        return self.by_dates if synchronised else self.by_recording
-
     def held(self, *, synchronised: bool) -> frozenset[str]:
         """Returns the bags that would be deleted if the clock were known to be right."""
-        return self.by_dates - self.too_old(synchronised=synchronised)
+        return frozenset() if synchronised else self.by_dates - self.by_recording
 
 
 class DeletionPlan(NamedTuple):
@@ -147,7 +143,8 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
     plan = _Plan(stock)
     total = plan.total
     eras = _eras(stock, limits)
-    aged = _ages(stock, eras, limits.max_age_ns).too_old(synchronised=stock.synchronised)
+    old = _ages(stock, eras, limits.max_age_ns)
+    aged = old.by_dates if stock.synchronised else old.by_recording
     if not aged and plan.fits(limits):
         return DeletionPlan((), total, fits=True)
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
