@@ -94,7 +94,15 @@ class OpenFile:
         return b"".join(pieces)
 
     def read_each(self, offsets: Iterable[int], length: int) -> list[bytes]:
-        """Returns up to `length` bytes from each of these offsets, fewer at the end of the file."""
+        """Returns up to `length` bytes from each of these offsets, fewer at the end of the file.
+
+        Raises:
+            UnreadableError: the file became shorter.
+        """
         # One call for all: a file has a chunk, and so an offset, for each 16 KiB to 1 MiB.
         read, descriptor = os.pread, self._descriptor
-        return [read(descriptor, length, offset) for offset in offsets]
+        pieces = [(offset, read(descriptor, length, offset)) for offset in offsets]
+        return [
+            piece if len(piece) == length else self.read(offset, min(length, self.size - offset))
+            for offset, piece in pieces
+        ]
