@@ -209,11 +209,14 @@ class Segment:
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""
-        column = _columns(self).of(topic, window)
-        if column is not None:
-            rows = zip(*(each.tolist() for each in column), strict=True)
-            for row, first, last in rows:
-                yield TopicExtent(self.bags[row], first, last)
+        column = _columns(self).of(topic)
+        if column is None:
+            return
+        if window is not None:
+            here = np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))
+            column = _Column(*(each[here] for each in column))
+        for row, first, last in zip(*(each.tolist() for each in column), strict=True):
+            yield TopicExtent(self.bags[row], first, last)
 
     def bags_with(self, topic: str) -> tuple[BagFile, ...]:
         """Returns the bags that hold the topic, in order; `bags` itself where all do."""
@@ -317,15 +320,11 @@ class _Columns:
         self.groups = tuple(_group([bags[row] for row in each], each) for each in rows.values())
         self._columns: dict[str, _Column | None] = {}
 
-    def of(self, topic: str, window: TimeWindow | None = None) -> _Column | None:
-        """Returns what the bags hold of a topic, or can in a window; None where nothing."""
+    def of(self, topic: str) -> _Column | None:
+        """Returns what the bags hold of a topic; None where nothing."""
         if topic not in self._columns:
             self._columns[topic] = self._merged(topic)
-        column = self._columns[topic]
-        if column is None or window is None:
-            return column
-        rows = np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))
-        return _Column(*(each[rows] for each in column))
+        return self._columns[topic]
 
     def _merged(self, topic: str) -> _Column | None:
         columns = [
