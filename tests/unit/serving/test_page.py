@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import re
@@ -9,6 +10,7 @@ from importlib import resources
 import pytest
 
 from ros2_memory.serving.page import policy
+from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import EVERYWHERE, GOOD, SHOWN, app, client
 
 PAGE = resources.files("ros2_memory.serving.page").joinpath("index.html")
@@ -25,6 +27,19 @@ async def test_the_page_is_served_at_the_root() -> None:
     assert response.text == HTML
     assert head.content == b""
     assert head.headers["content-length"] == response.headers["content-length"]
+
+
+async def test_on_a_socket_the_headers_alone_answer_a_head_request() -> None:
+    async with listening(app(), lifespan="on") as server:
+        port = server.servers[0].sockets[0].getsockname()[1]
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        for ending in ("HEAD / HTTP/1.1", "GET / HTTP/1.1\r\nConnection: close"):
+            writer.write(f"{ending}\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+        async with asyncio.timeout(BOUND_S):
+            answers = await reader.read()
+        writer.close()
+    assert answers.count(b"HTTP/1.1 200 OK") == 2
+    assert answers.count(b"</html>") == 1
 
 
 async def test_only_the_root_is_the_page_and_only_to_be_read() -> None:
