@@ -25,10 +25,12 @@ import errno
 import json
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
+
+from pydantic import AfterValidator, ConfigDict, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
-from ros2_memory.bag_dir.json_fields import is_integer, strings
+from ros2_memory.bag_dir.json_fields import Int64, json_object, validated
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -61,6 +63,20 @@ class CutClock(StrEnum):
     LOG = "log"
 
 
+def _checked_name(value: str) -> str:
+    if "/" in value or value in {"", ".", ".."}:
+        raise ValueError("it must be the name of a recording")
+    return value
+
+
+_Name: TypeAlias = Annotated[str, AfterValidator(_checked_name)]
+_Time: TypeAlias = Int64 | None
+# The keys of the file: those of times end in `_ns`.
+_KEYS: Final = ConfigDict(
+    alias_generator=lambda name: f"{name}_ns" if name.startswith(("counts_", "log_")) else name
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Overlap:
     """Where a cut applies: in these files, to log times in the half-open `[log_from, log_until)`.
@@ -68,8 +84,10 @@ class Overlap:
     None leaves a side open: log times of a simulated clock cannot be foreseen.
     """
 
-    log_from: Ns | None
-    log_until: Ns | None
+    __pydantic_config__ = _KEYS
+
+    log_from: _Time
+    log_until: _Time
     files: tuple[str, ...]
 
 
@@ -82,13 +100,15 @@ class Handover:
     `next` without `counts_until` is a handover that was begun and not finished.
     """
 
+    __pydantic_config__ = _KEYS
+
     state: Counting = Counting.COUNTS
     clock: CutClock = CutClock.PUBLISH
-    previous: str | None = None
-    counts_from: Ns | None = None
+    previous: _Name | None = None
+    counts_from: _Time = None
     begin: Overlap | None = None
-    next: str | None = None
-    counts_until: Ns | None = None
+    next: _Name | None = None
+    counts_until: _Time = None
     end: Overlap | None = None
     notes: tuple[str, ...] = ()
 
@@ -105,6 +125,9 @@ class Handover:
         if self.end is not None and self.counts_until is not None:
             found += _exclusion(self.end, file_name, self.counts_until, MAX_NS)
         return tuple(found)
+
+
+_HANDOVER: Final = TypeAdapter(Handover)
 
 
 class Exclusion(NamedTuple):
@@ -150,7 +173,8 @@ def sure_handover(recording: Path) -> HandoverReading:
     """
     try:
         text = read_small_file(recording / HANDOVER_FILE)
-        return HandoverReading(_parse(text), None)
+        handover = validated(_HANDOVER, json_object(text, FORMAT))
+        return HandoverReading(handover, None)
     except (FileNotFoundError, NotADirectoryError):
         return HandoverReading(Handover(), None)
     except OSError as error:
@@ -205,18 +229,7 @@ def write_handovers(handovers: Mapping[Path, Handover]) -> None:
 
 
 def _text(handover: Handover) -> str:
-    content = {
-        "format": FORMAT,
-        "state": handover.state,
-        "clock": handover.clock,
-        "previous": handover.previous,
-        "counts_from_ns": handover.counts_from,
-        "begin": _overlap_json(handover.begin),
-        "next": handover.next,
-        "counts_until_ns": handover.counts_until,
-        "end": _overlap_json(handover.end),
-        "notes": list(handover.notes),
-    }
+    content = {"format": FORMAT, **_HANDOVER.dump_python(handover, by_alias=True)}
     return json.dumps(content, indent=1) + "\n"
 
 
@@ -226,64 +239,3 @@ def _exclusion(overlap: Overlap, file_name: str, start: Ns, stop: Ns) -> list[Ex
     log_from = MIN_NS if overlap.log_from is None else overlap.log_from
     log_until = MAX_NS if overlap.log_until is None else overlap.log_until
     return [Exclusion(start, stop, log_from, log_until)]
-
-
-def _overlap_json(overlap: Overlap | None) -> dict[str, object] | None:
-    if overlap is None:
-        return None
-    return {
-        "log_from_ns": overlap.log_from,
-        "log_until_ns": overlap.log_until,
-        "files": list(overlap.files),
-    }
-
-
-def _parse(text: str) -> Handover:
-    fields = _object(json.loads(text), "it")
-    if fields.get("format") != FORMAT:
-        raise ValueError(f"its format is {fields.get('format')!r}, and {FORMAT} is what is known")
-    return Handover(
-        state=Counting(str(fields.get("state"))),
-        clock=CutClock(str(fields.get("clock"))),
-        previous=_name(fields, "previous"),
-        counts_from=_nanoseconds(fields, "counts_from_ns"),
-        begin=_overlap(fields, "begin"),
-        next=_name(fields, "next"),
-        counts_until=_nanoseconds(fields, "counts_until_ns"),
-        end=_overlap(fields, "end"),
-        notes=strings(fields, "notes"),
-    )
-
-
-def _object(value: object, what: str) -> dict[object, object]:
-    if isinstance(value, dict):
-        return value
-    raise ValueError(f"{what} must be a JSON object")
-
-
-def _name(fields: dict[object, object], key: str) -> str | None:
-    value = fields.get(key)
-    if value is not None and (
-        not isinstance(value, str) or "/" in value or value in {"", ".", ".."}
-    ):
-        raise ValueError(f"{key} must be the name of a recording, or null")
-    return value
-
-
-def _nanoseconds(fields: dict[object, object], key: str) -> Ns | None:
-    value = fields.get(key)
-    if value is None or is_integer(value):
-        return value
-    raise ValueError(f"{key} must be nanoseconds, or null")
-
-
-def _overlap(fields: dict[object, object], key: str) -> Overlap | None:
-    value = fields.get(key)
-    if value is None:
-        return None
-    inner = _object(value, key)
-    return Overlap(
-        _nanoseconds(inner, "log_from_ns"),
-        _nanoseconds(inner, "log_until_ns"),
-        strings(inner, "files"),
-    )

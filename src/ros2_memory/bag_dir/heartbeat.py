@@ -14,15 +14,16 @@ import os
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
+
+from pydantic import Field, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import integer, strings
+from ros2_memory.bag_dir.json_fields import Count, Int64, json_object, validated
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
 HEARTBEAT_FILE: Final = "recorder.json"
@@ -33,6 +34,9 @@ _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 _BLOCK_BYTES: Final = 512  # the unit of `st_blocks` on every file system
 _LIVE_INTERVALS: Final = 3
 _MIN_LIVE_NS: Final[Ns] = 15 * NS_PER_S
+
+_Pid: TypeAlias = Annotated[int, Field(strict=True, ge=1, le=MAX_NS)]
+_Interval: TypeAlias = Annotated[float, Field(strict=True, gt=0, le=MAX_INTERVAL_S)]
 
 
 class RecorderState(StrEnum):
@@ -65,17 +69,18 @@ class Heartbeat:
             None where there are none.
     """
 
-    pid: int
-    updated: Ns
+    pid: _Pid
+    updated: Int64
     state: RecorderState
     recordings: tuple[str, ...]
-    since: Ns
-    bytes_written: int
+    since: Int64
+    bytes_written: Count
     subscribed: tuple[str, ...]
     silent: tuple[str, ...]
     last_error: str | None
-    interval_s: float
-    restarts: int = 0
+    interval_s: _Interval
+    # Older recorders did not write these three.
+    restarts: Count = 0
     missing: tuple[str, ...] = ()
     age_held: str | None = None
 
@@ -111,7 +116,7 @@ def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
     except OSError as error:
         return HeartbeatReading(None, f"{HEARTBEAT_FILE} cannot be read: {error.strerror or error}")
     # json raises RecursionError for a file of nothing but brackets.
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         return HeartbeatReading(None, f"{HEARTBEAT_FILE} is no heartbeat: {error}")
 
 
@@ -155,48 +160,10 @@ def _overwrite_in_place(target: Path, data: bytes) -> None:
         os.close(descriptor)
 
 
+_HEARTBEAT: Final = TypeAdapter(Heartbeat)
+
+
 # Read for every question about the present, and written every few seconds.
 @lru_cache(4)
 def _parse(text: str) -> Heartbeat:
-    """Returns the heartbeat in a text; a ValueError or TypeError names the wrong key."""
-    value: object = json.loads(text)
-    if not isinstance(value, dict):
-        raise TypeError("it is not a JSON object")
-    # Older recorders did not write these three.
-    fields: dict[object, object] = {"restarts": 0, "missing": [], "age_held": None, **value}
-    for key in Heartbeat.__slots__:
-        if key not in fields:
-            raise ValueError(f"it has no {key}")
-    state = fields["state"]
-    if state not in list(RecorderState):
-        raise ValueError(f"state must be one of {', '.join(RecorderState)}")
-    return Heartbeat(
-        pid=integer(fields, "pid", least=1),
-        updated=integer(fields, "updated"),
-        state=RecorderState(str(state)),
-        recordings=strings(fields, "recordings"),
-        since=integer(fields, "since"),
-        bytes_written=integer(fields, "bytes_written", least=0),
-        subscribed=strings(fields, "subscribed"),
-        silent=strings(fields, "silent"),
-        last_error=_text_or_null(fields, "last_error"),
-        interval_s=_interval(fields["interval_s"]),
-        restarts=integer(fields, "restarts", least=0),
-        missing=strings(fields, "missing"),
-        age_held=_text_or_null(fields, "age_held"),
-    )
-
-
-def _text_or_null(fields: Mapping[object, object], key: str) -> str | None:
-    value = fields[key]
-    if value is not None and not isinstance(value, str):
-        raise ValueError(f"{key} must be a string or null")
-    return value
-
-
-def _interval(value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError("interval_s must be a number of seconds")
-    if not 0 < value <= MAX_INTERVAL_S:
-        raise ValueError(f"interval_s must be above 0 and at most {MAX_INTERVAL_S:g} s")
-    return float(value)
+    return validated(_HEARTBEAT, json_object(text))

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import integer
+from ros2_memory.bag_dir.json_fields import integer, json_object
 from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -147,7 +147,7 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
 def read_saved_moment(folder: Path) -> SavedMoment | None:
     """Returns the moment of a folder; None where there is no file, or no valid one."""
     try:
-        fields = json_object(read_small_file(folder / MOMENT_FILE))
+        fields = json_object(read_small_file(folder / MOMENT_FILE), FORMAT)
         request = save_request_from(fields)
         pending, missing = fields.get("pending"), fields.get("missing")
         if not isinstance(pending, bool) or not isinstance(missing, list):
@@ -174,18 +174,6 @@ def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
         moment = None if folder.is_symlink() else read_saved_moment(folder)
         if moment is not None:
             yield StoredMoment(folder, moment, _bag_sizes(folder))
-
-
-def json_object(text: str) -> dict[object, object]:
-    """Returns the JSON object in a text.
-
-    Raises:
-        ValueError: there is none, or it is of an unknown format.
-    """
-    value: object = json.loads(text)
-    if not isinstance(value, dict) or value.get("format") != FORMAT:
-        raise ValueError(f"it is no JSON object of format {FORMAT}")
-    return value
 
 
 def save_request_from(fields: Mapping[object, object]) -> SaveRequest:

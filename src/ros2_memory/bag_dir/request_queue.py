@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
+from ros2_memory.bag_dir.json_fields import json_object
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.bag_dir.moment_file import FORMAT, SaveRequest, json_object, save_request_from
+from ros2_memory.bag_dir.moment_file import FORMAT, SaveRequest, save_request_from
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import NS_PER_S
 
@@ -78,7 +79,7 @@ class PendingRequest:
     def outcome(self) -> Outcome | None:
         """Returns the outcome; None while there is none."""
         try:
-            fields = json_object(read_small_file(self._path("answer")))
+            fields = json_object(read_small_file(self._path("answer")), FORMAT)
         except (OSError, ValueError, RecursionError):
             return None
         moment, refused = (
@@ -202,7 +203,7 @@ def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:
     """
     if path.lstat().st_size > MAX_REQUEST_BYTES:
         raise ValueError(f"it is larger than {MAX_REQUEST_BYTES} bytes")
-    request = save_request_from(json_object(read_small_file(path)))
+    request = save_request_from(json_object(read_small_file(path), FORMAT))
     if request.number != number:
         raise ValueError("it has the number of another")
     if abs(now - request.asked) > STALE_NS:
