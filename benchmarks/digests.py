@@ -154,7 +154,7 @@ def _moved_poses(poses: PoseDigest, by: int) -> PoseDigest:
         return stop._replace(time=stop.time + by)
 
     def leg(one: Leg | None) -> Leg | None:
-        return one and replace(one, first=later(one.first), last=later(one.last))
+        return one and one._replace(first=later(one.first), last=later(one.last))
 
     totals = replace(
         poses.totals,

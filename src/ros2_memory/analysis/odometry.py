@@ -9,7 +9,7 @@ not.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median_low
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
@@ -162,8 +162,7 @@ def _motion_of(path: Sequence[TimedPosition]) -> NearbyMotion:
     return NearbyMotion(max(steps), speed_mps)
 
 
-@dataclass(frozen=True, slots=True)
-class Leg:
+class Leg(NamedTuple):
     """A path driven without a gap, a jump or a reset.
 
     Attributes:
@@ -209,8 +208,7 @@ class Leg:
     def joined(self, later: Leg) -> Leg:
         """Returns this leg continued, without a break, by a later one."""
         step_m = distance(self.last.position, later.first.position)
-        whole = replace(
-            self,
+        whole = self._replace(
             last=later.last,
             poses=self.poses + later.poses,
             period_ns=(self if self.poses >= later.poses else later).period_ns
@@ -233,21 +231,21 @@ class Leg:
         if before is not None and after is not None:
             creep = before.joined(after)
             if self.still:
-                whole = replace(whole, head=self.head._replace(creep=creep))
+                whole = whole._replace(head=self.head._replace(creep=creep))
             if later.still:
-                whole = replace(whole, tail=later.tail._replace(creep=creep))
+                whole = whole._replace(tail=later.tail._replace(creep=creep))
             if not (self.still or later.still):
-                whole = replace(whole, length_m=whole.length_m + creep.length_m)
-            return replace(whole, still=self.still and later.still)
+                whole = whole._replace(length_m=whole.length_m + creep.length_m)
+            return whole._replace(still=self.still and later.still)
         inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
         # A creep that filled its leg reaches only one end of the whole.
         if self.still:
-            whole = replace(whole, head=self.head)
+            whole = whole._replace(head=self.head)
         elif before is not None:
             inner_m += before.length_m
         if after is not None and not later.still:
             inner_m += after.length_m
-        return replace(whole, length_m=whole.length_m + inner_m)
+        return whole._replace(length_m=whole.length_m + inner_m)
 
     def _bridged(self, later: Leg, whole: Leg, step_m: float) -> Leg:
         """Joins two legs one of which has too few poses to estimate its noise."""
@@ -258,8 +256,8 @@ class Leg:
             net_m = distance(self.first.position, later.first.position)
             end, short, long = later.head, self, later
         added_m = _step_m(end, end, short.poses, net_m, step_m + short.sum_m)
-        kept = replace(whole, length_m=long.length_m + added_m, head=long.head, tail=long.tail)
-        return replace(kept, still=long.still)
+        kept = whole._replace(length_m=long.length_m + added_m, head=long.head, tail=long.tail)
+        return kept._replace(still=long.still)
 
 
 def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -> float:
@@ -500,21 +498,10 @@ def _leg(path: Sequence[TimedPosition]) -> _MeasuredLeg:
     apart = np.diff(times)
     seconds = (times - times[0]) / NS_PER_S
     positions = [pose.position for pose in path]
-    length_m, sum_m, head, tail, still, speed_mps = measured(seconds, positions)
+    found = measured(seconds, positions)
     period_ns = int(np.median(apart)) if len(apart) else None
-    leg = Leg(
-        path[0],
-        path[-1],
-        len(path),
-        period_ns,
-        length_m,
-        sum_m,
-        head,
-        tail,
-        still,
-        near_first=_motion_of(path[: _NEARBY + 1]),
-        near_last=_motion_of(path[-_NEARBY - 1 :]),
-    )
+    near = (_motion_of(path[: _NEARBY + 1]), _motion_of(path[-_NEARBY - 1 :]))
+    leg = Leg(path[0], path[-1], len(path), period_ns, *found[:5], *near)
     step_mps = 0.0
     if len(path) <= SPEED_STEPS:
         step_mps = max(
@@ -525,7 +512,7 @@ def _leg(path: Sequence[TimedPosition]) -> _MeasuredLeg:
             ),
             default=0.0,
         )
-    return leg, speed_mps, step_mps
+    return leg, found.speed_mps, step_mps
 
 
 def _usual_ns(

@@ -1,6 +1,7 @@
 """Encodes digests as the bytes and texts in the catalogue. Exact: floats stay bit by bit.
 
-All integers and floats are little-endian. The layouts belong to the catalogue's schema version.
+JSON, and packed numbers (little-endian) where there are many. The layouts belong to the
+catalogue's schema version.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import json
 import math
 import struct
 import zlib
+from dataclasses import fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
@@ -20,87 +22,28 @@ from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, 
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from ros2_memory.analysis.odometry import Vertex
     from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import JsonValue, Vector3
 
-_HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
-_LEG: Final = struct.Struct("<qdddqdddqqddBdddddddd")
-_CREEP: Final = struct.Struct("<ddddddddddd")
 _VERTEX: Final = struct.Struct("<qdddd")
 _EVENTS: Final = struct.Struct("<qqqqqI")
 _MIN_COMPRESSED_BYTES: Final = 256
 """A shorter text is not worth compressing."""
-_NOWHERE: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
 
 
 def encode_poses(poses: PoseDigest) -> bytes:
     """Encodes a digest of poses."""
-    totals = poses.totals
-    legs = [leg for leg in (totals.head, totals.tail) if leg is not None]
-    ends = (poses.vertices[0], poses.vertices[-1]) if poses.vertices else (_NOWHERE, _NOWHERE)
-    head = _HEAD.pack(
-        poses.poses,
-        poses.invalid,
-        totals.jumps,
-        totals.gaps,
-        len(totals.resets),
-        len(poses.vertices),
-        len(legs),
-        totals.length_m,
-        totals.sum_m,
-        totals.jumped_m,
-        totals.gap_m,
-        math.nan if totals.speed_mps is None else totals.speed_mps,
-        math.nan if poses.twist is None else poses.twist,
-        poses.error_m,
-        *(number for time, position, _ in ends for number in (time, *position)),
+    totals = [getattr(poses.totals, each.name) for each in fields(poses.totals)]
+    head = json.dumps(
+        [poses.poses, poses.invalid, totals, poses.twist, poses.frames, poses.error_m],
+        separators=(",", ":"),
     )
     vertices = b"".join(
         _VERTEX.pack(time, *position, turn if isinstance(turn, float) else math.nan)
         for time, position, turn in poses.vertices
     )
-    resets = struct.pack(f"<{len(totals.resets)}q", *totals.resets)
-    frames = json.dumps(poses.frames).encode()
-    return b"".join((head, *map(_encode_leg, legs), resets, vertices, frames))
-
-
-def _encode_leg(leg: Leg) -> bytes:
-    ends = (leg.head,) if leg.still else (leg.head, leg.tail)
-    creeps = [end.creep for end in ends]
-    flags = leg.still | leg.head.plain << 1 | leg.tail.plain << 2
-    for place, creep in enumerate(creeps):
-        flags |= (creep is not None) << 3 + place
-    packed = _LEG.pack(
-        leg.first.time,
-        *leg.first.position,
-        leg.last.time,
-        *leg.last.position,
-        leg.poses,
-        -1 if leg.period_ns is None else leg.period_ns,
-        leg.length_m,
-        leg.sum_m,
-        flags,
-        leg.head.pace_m,
-        leg.head.noise_m,
-        leg.tail.pace_m,
-        leg.tail.noise_m,
-        *leg.near_first,
-        *leg.near_last,
-    )
-    return packed + b"".join(
-        _CREEP.pack(
-            *creep.start,
-            *((math.nan,) * 3 if creep.second is None else creep.second),
-            creep.middle_m,
-            *creep.end,
-            creep.reach_m,
-        )
-        for creep in creeps
-        if creep is not None
-    )
+    return b"".join((head.encode(), b"\n", vertices))
 
 
 def decode_poses(packed: bytes) -> PoseDigest:
@@ -109,10 +52,19 @@ def decode_poses(packed: bytes) -> PoseDigest:
     Raises:
         ValueError: the bytes are not one.
     """
+    head, _, body = packed.partition(b"\n")
     try:
-        return _decode_poses(packed)
-    except struct.error as error:
+        poses, invalid, driven, twist, frames, error_m = json.loads(head)
+        totals = MotionTotals(*driven)
+        totals.head, totals.tail = _decode_leg(totals.head), _decode_leg(totals.tail)
+        totals.resets = tuple(totals.resets)
+        vertices: list[Vertex] = [
+            (time, (x, y, z), None if math.isnan(heading) else heading)
+            for time, x, y, z, heading in _VERTEX.iter_unpack(body)
+        ]
+    except (TypeError, struct.error) as error:
         raise ValueError(f"not a digest of poses: {error}") from error
+    return PoseDigest(poses, invalid, totals, twist, tuple(frames), tuple(vertices), error_m)
 
 
 def encode_standstills(digest: StandstillDigest) -> bytes:
@@ -210,81 +162,40 @@ def _decode_text(
     )
 
 
-def _decode_poses(packed: bytes) -> PoseDigest:
-    poses, invalid, jumps, gaps, reset, count, legs, *numbers = _HEAD.unpack_from(packed)
-    length_m, sum_m, jumped_m, gap_m, speed_mps, twist, error_m, *_ = numbers
-    begin = _HEAD.size
-    ends: list[Leg] = []
-    for _ in range(legs):
-        leg, begin = _decode_leg(packed, begin)
-        ends.append(leg)
-    resets = struct.unpack_from(f"<{reset}q", packed, begin)
-    begin += 8 * len(resets)
-    end = begin + count * _VERTEX.size
-    vertices: list[Vertex] = [
-        (time, (x, y, z), None if math.isnan(heading) else heading)
-        for time, x, y, z, heading in _VERTEX.iter_unpack(packed[begin:end])
-    ]
-    totals = MotionTotals(
-        head=ends[0] if ends else None,
-        tail=ends[1] if len(ends) > 1 else None,
-        length_m=length_m,
-        sum_m=sum_m,
-        jumps=jumps,
-        jumped_m=jumped_m,
-        gaps=gaps,
-        gap_m=gap_m,
-        resets=resets,
-        speed_mps=None if math.isnan(speed_mps) else speed_mps,
-    )
-    return PoseDigest(
-        poses=poses,
-        invalid=invalid,
-        totals=totals,
-        twist=None if math.isnan(twist) else twist,
-        frames=_frames(packed[end:]),
-        vertices=tuple(vertices),
-        error_m=error_m,
-    )
-
-
-def _ends(numbers: Sequence[float]) -> tuple[TimedPosition, TimedPosition]:
-    first, ax, ay, az, last, bx, by, bz = numbers
-    return TimedPosition(int(first), (ax, ay, az)), TimedPosition(int(last), (bx, by, bz))
-
-
-def _decode_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
-    """Returns the leg that begins at a byte, and where it ends."""
-    numbers = _LEG.unpack_from(packed, begin)
-    poses, period_ns, length_m, sum_m, flags, *paces = numbers[8:]
-    begin += _LEG.size
-    creeps: list[Creep | None] = [None, None]
-    for place in (0, 1):
-        if flags >> 3 + place & 1:
-            a, b, c, d, e, f, middle_m, g, h, i, reach_m = _CREEP.unpack_from(packed, begin)
-            second = None if math.isnan(d) else (d, e, f)
-            creeps[place] = Creep((a, b, c), second, middle_m, (g, h, i), reach_m)
-            begin += _CREEP.size
-    still = bool(flags & 1)
-    leg = Leg(
-        *_ends(numbers[:8]),
+def _decode_leg(stored: Leg | None) -> Leg | None:
+    """Returns the same leg, with tuples in place of the lists of JSON."""
+    if stored is None:
+        return None
+    first, last, poses, period_ns, length_m, sum_m, head, tail, still, *near = stored
+    return Leg(
+        _decode_pose(*first),
+        _decode_pose(*last),
         poses,
-        None if period_ns < 0 else period_ns,
+        period_ns,
         length_m,
         sum_m,
-        End(paces[0], paces[1], bool(flags & 2), creeps[0]),
-        End(paces[2], paces[3], bool(flags & 4), creeps[0] if still else creeps[1]),
+        _decode_end(*head),
+        _decode_end(*tail),
         still,
-        near_first=NearbyMotion(paces[4], paces[5]),
-        near_last=NearbyMotion(paces[6], paces[7]),
+        *(NearbyMotion(*each) for each in near),
     )
-    return leg, begin
 
 
-@lru_cache(256)
-def _frames(text: bytes) -> tuple[str, ...]:
-    """Decodes the list of frames, which is equal for nearly all bags."""
-    return tuple(json.loads(text))
+def _decode_pose(time: int, position: Vector3) -> TimedPosition:
+    return TimedPosition(time, _decode_vector(position))
+
+
+def _decode_end(pace_m: float, noise_m: float, plain: bool, creep: Creep | None) -> End:
+    if creep is not None:
+        start, second, middle_m, end, reach_m = creep
+        second = None if second is None else _decode_vector(second)
+        creep = Creep(_decode_vector(start), second, middle_m, _decode_vector(end), reach_m)
+    return End(pace_m, noise_m, plain, creep)
+
+
+def _decode_vector(numbers: Vector3) -> Vector3:
+    x, y, z = numbers
+    return x, y, z
 
 
 def encode_schema(schema: SummarySchema) -> str:
