@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.config import Settings
-    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.history.context import Memory
 
 _MAX_MS = 10.0

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
-from ros2_memory.core.model import BagSummary, TopicSummary
 from ros2_memory.storage.base import BagReader, Channel, Closing, Record, Schema
 from tests.support.bags import typestore
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.core.model import BagSummary, TopicSummary
 from ros2_memory.storage.base import BagReader, Channel, Closing, Record
 
 if TYPE_CHECKING:

@@ -32,13 +32,14 @@ from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.bag_dir.moment_file import moments_of
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
-from ros2_memory.core.model import BagSummary, TimeWindow, TopicSummary
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.bag_dir.handover_file import Exclusion
+    from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import CdrLayout, Channel, Closing, Record
 

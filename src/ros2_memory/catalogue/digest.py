@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue.topic_digest import TopicDigest
-    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader
 

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -23,22 +22,8 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 
-__all__ = [
-    "BagFile",
-    "BagState",
-    "BagSummary",
-    "JsonValue",
-    "Pose",
-    "Quaternion",
-    "Sample",
-    "SetAside",
-    "StampedTransform",
-    "TimeWindow",
-    "TopicSummary",
-    "Transform",
-    "Twist",
-    "Vector3",
-]
+if TYPE_CHECKING:
+    from ros2_memory.core.bag_summary import BagSummary
 
 JsonValue: TypeAlias = "bool | int | float | str | list[JsonValue] | dict[str, JsonValue] | None"
 """The values of a reply; NaN and infinities are not JSON and become null before they are sent."""

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
-from ros2_memory.core.model import BagFile, BagState, BagSummary, SetAside
+from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.scan import YOUNG_NS, settled
 from ros2_memory.storage.base import Closing
@@ -44,6 +44,7 @@ from ros2_memory.storage.base import Closing
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader
 

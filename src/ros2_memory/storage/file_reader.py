@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary, TimeWindow
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import CdrLayout, Channel, Record
     from ros2_memory.storage.errors import LostError

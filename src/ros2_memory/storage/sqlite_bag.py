@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.errors import LostError
     from ros2_memory.storage.file_io import FileKey

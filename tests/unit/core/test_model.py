@@ -7,14 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import (
-    BagFile,
-    BagState,
-    BagSummary,
-    TimeWindow,
-    TopicSummary,
-)
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,

@@ -8,14 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.model import (
-    BagFile,
-    BagState,
-    BagSummary,
-    SetAside,
-    TimeWindow,
-    TopicSummary,
-)
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot

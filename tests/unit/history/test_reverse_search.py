@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary, JsonValue, TimeWindow
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.history.context import Memory
     from ros2_memory.results import Match
     from ros2_memory.storage.base import Record

@@ -5,7 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.model import BagFile, BagState, BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import (
     FIRST_BAGS_NS,

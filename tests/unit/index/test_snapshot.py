@@ -10,13 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER
-from ros2_memory.core.model import (
-    BagFile,
-    BagState,
-    BagSummary,
-    TimeWindow,
-    TopicSummary,
-)
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
 

@@ -7,14 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.core.model import (
-    BagFile,
-    BagState,
-    BagSummary,
-    SetAside,
-    TimeWindow,
-    TopicSummary,
-)
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
 from ros2_memory.recorder.index_manager import IndexManager

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.model import BagFile, BagState, BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,

@@ -57,7 +57,7 @@ from tests.support.memories import LAST_WRITTEN, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.bag_summary import BagSummary
 
 AT = LAST_WRITTEN
 # A file has one size.

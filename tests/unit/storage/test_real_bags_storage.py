@@ -22,7 +22,7 @@ from tests.support.shared_bags import BAGS, REAL, RECORDED, needs_real, needs_re
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary, TopicSummary
+    from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.storage.base import BagReader, Record
 
 EVERYTHING = TimeWindow.everything()

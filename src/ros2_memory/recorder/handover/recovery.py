@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import BagReader, Record
 
 JITTER_NS: Final[Ns] = 100 * NS_PER_MS

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
 
 
