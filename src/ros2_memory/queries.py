@@ -77,7 +77,6 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
-from ros2_memory.messages.downsample import samples_note
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -133,7 +132,7 @@ def topic_range(
     if len(types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
-        view.notes.add(samples_note(len(chosen), total))
+        view.notes.add(f"{len(chosen)} of {total} samples, evenly spaced over the window")
     note_unread(view, window)
     note_edges(view, window)
     extremes: tuple[results.Extremes, ...] = ()

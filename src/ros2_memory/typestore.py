@@ -11,10 +11,8 @@ memory on some inputs.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 import threading
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -56,18 +54,21 @@ _IDL_DIRECTIVE: Final = re.compile(r"^[ \t]*#[^\n]*", re.MULTILINE)
 _IDL_NESTED_SEQUENCE: Final = re.compile(r"sequence\s*<\s*sequence")
 
 
-@dataclass(frozen=True, slots=True)
-class MessageType:
-    """The deserializer of one schema, or the reason why there is none (one of both is None).
+class MessageType(NamedTuple):
+    """What one schema defines.
 
-    `fieldless`: the definition has no field, so any payload of more than a byte contradicts it.
-    `definitions` are those of the type and of its nested types; None with a reason.
+    Attributes:
+        name: the type, `package/msg/Name`.
+        definitions: those of the type and of its nested types.
+        fieldless: whether the definition has no field, so that any payload of more than a byte
+            contradicts it.
+        deserialize: decodes a payload.
     """
 
-    deserialize: Callable[[bytes], object] | None
-    reason: str | None
-    fieldless: bool = False
-    definitions: Typesdict | None = dataclasses.field(default=None, repr=False, compare=False)
+    name: str
+    definitions: Typesdict
+    fieldless: bool
+    deserialize: Callable[[bytes], object]
 
 
 class _UnusableError(Exception):
@@ -95,11 +96,11 @@ class Typestores:
         for path in custom_msg_paths:
             for name, text in _definitions_below(Path(path)):
                 self._folders.setdefault(name, _Section("ros2msg", text))
-        self._types: ByteLru[MessageType] = ByteLru(MAX_CACHED_BYTES)
+        self._types: ByteLru[MessageType | str] = ByteLru(MAX_CACHED_BYTES)
         self._lock = threading.Lock()
 
-    def lookup(self, name: str, encoding: str, text: bytes) -> MessageType:
-        """Returns the type that a schema of a bag defines.
+    def lookup(self, name: str, encoding: str, text: bytes) -> MessageType | str:
+        """Returns the type that a schema of a bag defines, or why it cannot be decoded.
 
         Args:
             name: the type, `package/msg/Name`.
@@ -118,18 +119,18 @@ class Typestores:
                 self._types.put(key, known, _CACHED_TYPE_BYTES + len(name) + len(text))
             return known
 
-    def _build(self, name: str, encoding: str, text: bytes) -> MessageType:
+    def _build(self, name: str, encoding: str, text: bytes) -> MessageType | str:
         root = full_name(name)
         try:
             definitions = self._closure(root, _sections(root, encoding, text))
             store = _compiled(definitions, root)
         except _UnusableError as error:
-            return MessageType(None, " ".join(str(error).split())[:_REASON_LENGTH])
+            return " ".join(str(error).split())[:_REASON_LENGTH]
 
         def deserialize(payload: bytes) -> object:
             return store.deserialize_cdr(payload, root)
 
-        return MessageType(deserialize, None, not definitions[root][1], definitions)
+        return MessageType(root, definitions, not definitions[root][1], deserialize)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""

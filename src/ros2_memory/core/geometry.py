@@ -87,12 +87,6 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def conjugate(q: Quaternion) -> Quaternion:
-    """Returns the inverse rotation."""
-    x, y, z, w = q
-    return (-x, -y, -z, w)
-
-
 def rotate(q: Quaternion, v: Vector3) -> Vector3:
     """Returns `v` rotated by `q`."""
     x, y, z, w = q
@@ -121,7 +115,8 @@ def compose(a: Transform, b: Transform) -> Transform:
 
 def invert(t: Transform) -> Transform:
     """Returns the pose of the parent in the child."""
-    back = conjugate(t.rotation)
+    qx, qy, qz, qw = t.rotation
+    back = (-qx, -qy, -qz, qw)
     x, y, z = rotate(back, t.translation)
     return Transform((-x, -y, -z), back)
 

@@ -28,7 +28,7 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import deduplicate_forward
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import require_bags
-from ros2_memory.messages.downsample import evenly
+from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -24,7 +24,6 @@ from ros2_memory.messages.conversions import (
     summaries_of,
     xyz,
 )
-from ros2_memory.messages.downsample import array_note, evenly
 from ros2_memory.messages.fields import ABSENT, field_table_of
 
 if TYPE_CHECKING:
@@ -101,6 +100,24 @@ def _whole_or_null(number: float) -> JsonValue:
         return None
     whole = int(number)
     return whole if whole == number and abs(whole) < _LARGEST_WHOLE else float(number)
+
+
+def evenly(count: int, at_most: int) -> list[int]:
+    """Returns at most `at_most` evenly spaced indices into `count` values, strictly increasing.
+
+    The first and the last value are kept, and the distances between neighbours differ by at most
+    one. If only one may be kept it is the last: the newest.
+
+    Raises:
+        ValueError: `at_most` is below 1.
+    """
+    if at_most < 1:
+        raise ValueError(f"at most {at_most} values cannot be kept; at least 1 is")
+    if count <= at_most:
+        return list(range(count))
+    if at_most == 1:
+        return [count - 1]
+    return [place * (count - 1) // (at_most - 1) for place in range(at_most)]
 
 
 class NumberWriter(NamedTuple):
@@ -294,7 +311,8 @@ class ReplyJson(ExactJson):
         return [nodes[at] for at in evenly(len(nodes), self._limit)]
 
     def _note_thinned(self, total: int, path: str) -> None:
-        self.note("array", path, array_note(_named(path), self._limit, total), total)
+        note = f"{_named(path)}: {self._limit} of {total} values, evenly spaced"
+        self.note("array", path, note, total)
 
     def _entries(self, node: Mapping[object, object], path: str, /) -> list[tuple[str, object]]:
         entries = [(_encodable(str(name)), value) for name, value in node.items()]

@@ -12,6 +12,7 @@ import struct
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from rosbags.interfaces import Nodetype
+from rosbags.serde.utils import SIZEMAP
 
 from ros2_memory.storage.base import CdrLayout
 
@@ -23,21 +24,9 @@ if TYPE_CHECKING:
 _LITTLE_ENDIAN: Final = b"\x00\x01"
 _HEADER_BYTES: Final = 4
 _MAX_NUMBERS: Final = 200
-_SIZES: Final = {
-    "bool": 1,
-    "byte": 1,
-    "char": 1,
-    "octet": 1,
-    "int8": 1,
-    "uint8": 1,
-    "int16": 2,
-    "uint16": 2,
-    "int32": 4,
-    "uint32": 4,
-    "int64": 8,
-    "uint64": 8,
-    "float32": 4,
-    "float64": 8,
+# A float128 is not aligned to its own size.
+_SIZES: Final[Mapping[str, int]] = {
+    str(name): size for name, size in SIZEMAP.items() if name != "float128"
 }
 _FLOATS: Final = ("float32", "float64")
 _TIME: Final = [("sec", "int32"), ("nanosec", "uint32")]

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.storage.cdr_layout import MAX_OBJECTS, holds_too_many, layout_of
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
-from ros2_memory.typestore import Typestores, full_name
+from ros2_memory.typestore import Typestores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from rosbags.interfaces.typing import Typesdict
-
     from ros2_memory.storage.base import CdrLayout, Channel, Record
+    from ros2_memory.typestore import MessageType
 
 _MAX_KNOWN = 10_000
 _MAX_JSON_BYTES = 4 << 20
@@ -70,10 +70,10 @@ class Decoding:
         if channel.encoding != "cdr":
             return None
         schema = channel.schema
-        definitions = self._typestores.lookup(schema.name, schema.encoding, schema.text).definitions
-        if definitions is None:
+        found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
+        if isinstance(found, str):
             return None
-        return layout_of(definitions, full_name(schema.name), record.payload)
+        return layout_of(found.definitions, found.name, record.payload)
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
         known = self._known.get(id(channel))
@@ -92,11 +92,7 @@ class Decoding:
             return f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
         schema = channel.schema
         found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
-        if found.deserialize is None or found.definitions is None:
-            return found.reason or "its definition cannot be used"
-        if found.fieldless:
-            return _fieldless(found.deserialize)
-        return _bounded(found.deserialize, found.definitions, full_name(schema.name))
+        return found if isinstance(found, str) else partial(_deserialized, found)
 
 
 def _json(payload: bytes) -> object:
@@ -106,31 +102,17 @@ def _json(payload: bytes) -> object:
     return value
 
 
-def _bounded(
-    deserialize: Callable[[bytes], object], definitions: Typesdict, root: str
-) -> Callable[[bytes], object]:
-    """Returns a decoder that refuses messages of more than `MAX_OBJECTS` objects."""
-
-    def decode(payload: bytes) -> object:
-        if holds_too_many(definitions, root, payload):
-            raise UnreadableError(f"it holds more than {MAX_OBJECTS} texts or messages")
-        return deserialize(payload)
-
-    return decode
-
-
-def _fieldless(deserialize: Callable[[bytes], object]) -> Callable[[bytes], object]:
-    """Returns a decoder for an empty definition, whose text the recorder may not have found."""
-
-    def decode(payload: bytes) -> object:
-        if len(payload) > _EMPTY_MESSAGE_BYTES:
-            raise UnreadableError(
-                "the definition in the bag is empty and the message is not; put the package's .msg"
-                " folder into reader.custom_msg_paths"
-            )
-        return deserialize(payload)
-
-    return decode
+def _deserialized(found: MessageType, payload: bytes) -> object:
+    """Decodes a payload, unless it holds more than `MAX_OBJECTS` objects."""
+    # The recorder may not have found the text of an empty definition.
+    if found.fieldless and len(payload) > _EMPTY_MESSAGE_BYTES:
+        raise UnreadableError(
+            "the definition in the bag is empty and the message is not; put the package's .msg"
+            " folder into reader.custom_msg_paths"
+        )
+    if holds_too_many(found.definitions, found.name, payload):
+        raise UnreadableError(f"it holds more than {MAX_OBJECTS} texts or messages")
+    return found.deserialize(payload)
 
 
 def _reason(record: Record, error: Exception) -> str:

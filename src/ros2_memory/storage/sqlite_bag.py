@@ -233,11 +233,7 @@ class SqliteBags:
         if found[1:] != (time, number):
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
-        payload = (
-            uncompressed_payload(found[0], self._max_message_bytes)
-            if channel.encoding == "cdr"
-            else found[0]
-        )
+        payload = uncompressed_payload(channel, found[0], self._max_message_bytes)
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from ros2_memory.storage.base import Channel
+
 # As large as a block, so that the data before a damaged block is not lost with it.
 _PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE
 
@@ -39,9 +41,8 @@ _MAX_BLOCKS: Final = 1_000_000
 def closing_of_zstd(path: Path) -> Closing:
     """Returns whether the file is made of whole frames; one that is not zstd counts as closed."""
     with OpenFile(path) as file:
-        if file.size and not starts_as_zstd(file):
-            return Closing.CLOSED
-        return Closing.CLOSED if ends_whole(file) else Closing.OPEN
+        is_open = starts_as_zstd(file) and not ends_whole(file)
+    return Closing.OPEN if is_open else Closing.CLOSED
 
 
 def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
@@ -127,14 +128,14 @@ def decompress_zstd(compressed: bytes, max_bytes: int) -> bytes:
     return data
 
 
-def uncompressed_payload(payload: bytes, max_bytes: int) -> bytes:
+def uncompressed_payload(channel: Channel, payload: bytes, max_bytes: int) -> bytes:
     """Returns a serialized message as it was before rosbag2's message compression.
 
-    Nothing but the magic of the frame tells that a payload is compressed; no CDR message begins
-    with it. A payload that cannot be decompressed, or not into `max_bytes`, is returned as it is:
-    decoding reports it.
+    Nothing but the magic of the frame marks a compressed payload; no CDR message begins with it. A
+    payload that cannot be decompressed, or not into `max_bytes`, is returned as it is: decoding
+    reports it.
     """
-    if payload[:4] != FRAME_MAGIC:
+    if channel.encoding != "cdr" or payload[:4] != FRAME_MAGIC:
         return payload
     try:
         return decompress_zstd(payload, max_bytes)

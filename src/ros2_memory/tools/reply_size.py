@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.text import shortened
-from ros2_memory.messages.downsample import evenly
+from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -15,7 +15,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
-from ros2_memory.messages.downsample import evenly
+from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
 from tests.support.memories import memory_of

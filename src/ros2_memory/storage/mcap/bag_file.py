@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_left
+from functools import lru_cache, partial
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
@@ -250,7 +251,12 @@ class McapBags:
                 when a run is read.
         """
         wanted = _wanted(index, topics)
-        large: dict[int, bytes] = {}
+        # Of large chunks only the last used stays decompressed: all that overlap in time would
+        # otherwise be in memory at once.
+        last_used = lru_cache(1)(partial(self._chunk_data, file))
+
+        def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
+            return _fetch_from_chunk(last_used(chunk), wanted, self._max_chunk_bytes)(place, time)
 
         def chunk_run(chunk: Chunk) -> SortedRun[Record | LostError]:
             def rows() -> Rows[Record | LostError] | None:
@@ -265,7 +271,9 @@ class McapBags:
                 column = joined([each.between(window.start, window.stop) for each in columns])
                 if not column.times.size:
                     return None
-                fetch = self._fetch(file, chunk, data, wanted, large)
+                fetch = _fetch_from_chunk(data, wanted, self._max_chunk_bytes)
+                if len(data) > _LARGE_BYTES:
+                    fetch = partial(fetch_large, chunk)
                 return _rows(column, fetch, newest_first=newest_first)
 
             return SortedRun(chunk.start, chunk.end, chunk.offset, rows)
@@ -278,31 +286,6 @@ class McapBags:
             fetch = _fetch_loose(file, wanted, self._max_chunk_bytes)
             rows = _rows(column, fetch, newest_first=newest_first)
             yield SortedRun(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
-
-    def _fetch(
-        self,
-        file: OpenFile,
-        chunk: Chunk,
-        data: bytes,
-        wanted: dict[int, Channel],
-        large: dict[int, bytes],
-    ) -> Callable[[int, Ns], Record]:
-        """Returns what fetches messages of a chunk.
-
-        Of large chunks only the last used stays decompressed, in `large`: all that overlap in time
-        would otherwise be in memory at once.
-        """
-        if len(data) <= _LARGE_BYTES:
-            return _fetch_from_chunk(data, wanted, self._max_chunk_bytes)
-
-        def fetch(place: int, time: Ns) -> Record:
-            last = large.get(chunk.offset)
-            if last is None:
-                large.clear()
-                last = large[chunk.offset] = self._chunk_data(file, chunk)
-            return _fetch_from_chunk(last, wanted, self._max_chunk_bytes)(place, time)
-
-        return fetch
 
     def _index(self, file: OpenFile) -> McapIndex:
         index = self._indexes.get(file.key)
@@ -593,6 +576,5 @@ def _record(
     channel = channels.get(number)
     if channel is None:
         raise UnreadableError("damaged: a message is not of the channel that its index says")
-    if channel.encoding == "cdr":
-        payload = uncompressed_payload(payload, max_bytes)
+    payload = uncompressed_payload(channel, payload, max_bytes)
     return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)

@@ -187,9 +187,8 @@ def _declaration(opcode: int, body: bytes) -> tuple[int, Schema | mcap_records.C
 
 def closing_of(file: OpenFile) -> Closing:
     """Returns open if the closing magic is missing; a file that is not MCAP counts as closed."""
-    if file.size and not starts_as_mcap(file):
-        return Closing.CLOSED
-    return Closing.CLOSED if _ends_as_mcap(file) else Closing.OPEN
+    is_open = starts_as_mcap(file) and not _ends_as_mcap(file)
+    return Closing.OPEN if is_open else Closing.CLOSED
 
 
 def is_finished(file: OpenFile) -> bool:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.messages.downsample import array_note, evenly, samples_note
+from ros2_memory.messages.to_json import evenly
 
 counts = st.integers(0, 5000)
 limits = st.integers(1, 600)
@@ -41,8 +41,3 @@ def test_a_single_place_goes_to_the_newest(count: int) -> None:
 def test_keeping_nothing_is_refused(at_most: int) -> None:
     with pytest.raises(ValueError, match=f"at most {at_most} values"):
         evenly(10, at_most)
-
-
-def test_the_notes_name_what_was_thinned() -> None:
-    assert array_note("ranges", 50, 360) == "ranges: 50 of 360 values, evenly spaced"
-    assert samples_note(100, 1300) == "100 of 1300 samples, evenly spaced over the window"
