@@ -13,7 +13,6 @@ are of one robot, so a reply that uses borrowed transforms has to say so.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
@@ -198,36 +197,30 @@ class Sessions:
             recordings = map(timeline.recordings, self._topics)
             paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
             chains = _joined(paths) if len(paths) > 1 else {}
-            known = {folder: joined | {self._carried} for folder, joined in chains.items()}
+            known = {folder: frozenset(each | {self._carried}) for folder, each in chains.items()}
             _JOINED[timeline] = known
         return known
 
 
-def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
+def _joined(paths: Mapping[str, Path]) -> dict[str, set[str]]:
     """Returns, by folder, all folders that are joined with it by handovers, itself included."""
-    beside: defaultdict[str, set[str]] = defaultdict(set)
-    for folder, path in paths.items():
-        for name in _neighbours(path):
-            other = f"{folder.rpartition('/')[0]}/{name}"
-            beside[folder].add(other)
-            beside[other].add(folder)
-    joined: dict[str, Session] = {}
-    for folder in paths:
-        if folder in joined:
-            continue
-        session = frozenset(reachable(folder, beside))
-        joined.update(dict.fromkeys(session, session))
-    return joined
+    return components(
+        (folder, f"{folder.rpartition('/')[0]}/{name}")
+        for folder, path in paths.items()
+        for name in _neighbours(path)
+    )
 
 
-def reachable(begin: str, beside: Mapping[str, set[str]]) -> set[str]:
-    """Returns the nodes of an undirected graph that are connected with one, itself included."""
-    reached, waiting = {begin}, [begin]
-    while waiting:
-        fresh = beside.get(waiting.pop(), set()) - reached
-        reached |= fresh
-        waiting += fresh
-    return reached
+def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
+    """Returns, by node of an undirected graph, all that are connected with it, itself included."""
+    component: dict[str, set[str]] = {}
+    for one, other in pairs:
+        ends = [component.setdefault(node, {node}) for node in (one, other)]
+        small, large = sorted(ends, key=len)
+        if small is not large:
+            large |= small
+            component.update(dict.fromkeys(small, large))
+    return component
 
 
 def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:

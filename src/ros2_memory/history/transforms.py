@@ -7,7 +7,6 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -30,7 +29,6 @@ from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
-    MIN_NS,
     NS_PER_MS,
     NS_PER_S,
     Ns,
@@ -45,7 +43,7 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.sessions import Sessions, reachable
+from ros2_memory.history.sessions import Sessions, components
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -175,10 +173,8 @@ def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -
 
 def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
     """Returns the moving transforms of a session that a lookup at any moment of a window needs."""
-    wider = TimeWindow(
-        max(window.start - TF_CACHE_NS, MIN_NS), min(window.stop + TF_CACHE_NS, MAX_NS)
-    )
-    return list(_transforms(view, view.memory.limits.tf_topics, wider, among))
+    topics = view.memory.limits.tf_topics
+    return list(_transforms(view, topics, window.widened(TF_CACHE_NS), among))
 
 
 def graph_of(
@@ -370,13 +366,9 @@ def connected(
         pairs |= _pairs(view, limits.tf_static_topics, among=among)
     except QueryTimeoutError:
         return False
-    beside: defaultdict[str, set[str]] = defaultdict(set)
-    for parent, child in filter(_is_edge, pairs):
-        beside[parent.lstrip("/")].add(child.lstrip("/"))
-        beside[child.lstrip("/")].add(parent.lstrip("/"))
     origin, target = (name.lstrip("/") for name in frames)
-    reached = reachable(origin, beside)
-    return target in reached and len(reached) > 1
+    linked = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(_is_edge, pairs))
+    return target in components(linked).get(origin, ())
 
 
 def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:

@@ -12,6 +12,8 @@ import json
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.messages.conversions import triple, xyz
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -127,22 +129,10 @@ def _position(value: dict[str, JsonValue]) -> Vector3 | None:
         found: JsonValue = value
         for name in path:
             found = found.get(name) if isinstance(found, dict) else None
-        point = _point(found)
-        if point is not None and any(point):
+        point = xyz(found) if isinstance(found, dict) else triple(found)
+        if point is not None and any(point) and all(map(math.isfinite, point)):
             return point
     return None
-
-
-def _point(value: JsonValue) -> Vector3 | None:
-    if isinstance(value, dict):
-        value = [value.get("x"), value.get("y"), value.get("z")]
-    if not isinstance(value, list) or len(value) != 3:
-        return None
-    x, y, z = (
-        float(part) if isinstance(part, int | float) and not isinstance(part, bool) else math.nan
-        for part in value
-    )
-    return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
 
 
 def _from_json(text: str) -> JsonValue:

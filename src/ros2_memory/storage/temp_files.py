@@ -83,13 +83,10 @@ class Scratch:
         self._empty(entry)
         try:
             return fill(_new_folder(entry), lambda size: self._reserve(entry, size))
-        except OSError as error:
+        except BaseException as error:
             self._empty(entry)
-            if error.errno in _DISK_FULL:
+            if isinstance(error, OSError) and error.errno in _DISK_FULL:
                 raise _disk_full(error) from error
-            raise
-        except BaseException:
-            self._empty(entry)
             raise
 
     def _empty(self, entry: _Entry) -> None:

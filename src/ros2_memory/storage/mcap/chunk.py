@@ -214,10 +214,11 @@ def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, b
     return found
 
 
-class Extent(NamedTuple):
-    """How many messages of a channel a chunk has, and their earliest and latest log time."""
+@dataclass(slots=True)
+class Extent:
+    """Messages of one channel: how many, and the log times of the earliest and the latest."""
 
-    messages: int
+    count: int
     first: int
     last: int
 

@@ -16,7 +16,7 @@ from mcap.records import Metadata
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.records import MAGIC_SIZE
-from ros2_memory.storage.mcap.salvage import decode_records
+from ros2_memory.storage.mcap.salvage import decode_record
 from ros2_memory.storage.mcap.walk import file_records
 
 if TYPE_CHECKING:
@@ -32,9 +32,6 @@ _HUMBLE_KEYS: Final = frozenset({"ROS_DISTRO"})
 _NEXT_KEY: Final = re.compile(r"[a-z_]+:|\s*\Z")
 _MAX_BYTES: Final = 16 << 20
 """A longer record is not read. The metadata record grows by 180 bytes with each split."""
-_BEFORE: Final = frozenset(
-    {Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT}
-)
 _END: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END})
 # The text lists every split: to parse all of it as YAML takes a thousand times as long.
 _CUSTOM_DATA: Final = re.compile(r"^custom_data:[^\n]*\n(?: +[^\s#][^\n]*(?:\n|$))*", re.MULTILINE)
@@ -71,13 +68,11 @@ def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
     """
     for record in file_records(file):
         opcode, size = record.opcode, record.end - record.body_at
-        if (record.offset == MAGIC_SIZE) != (opcode == Opcode.HEADER):
-            raise UnreadableError("damaged: it does not begin with one header")
-        if opcode in _END:
+        begins_right = (record.offset == MAGIC_SIZE) == (opcode == Opcode.HEADER)
+        if begins_right and opcode in _END:
             return
-        if opcode not in _BEFORE or size > _MAX_BYTES:
-            raise UnreadableError("damaged: no such record stands before the first message")
-        read = next(decode_records([(opcode, file.read(record.body_at, size))]), None)
+        is_readable = begins_right and size <= _MAX_BYTES
+        read = decode_record(opcode, file.read(record.body_at, size)) if is_readable else None
         if read is None:
             raise UnreadableError("damaged: a record before the first message cannot be read")
         yield read

@@ -9,7 +9,6 @@ the messages themselves.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from operator import attrgetter, itemgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -69,15 +68,6 @@ _NEVER: Final = 1 << 64
 """Later than any time that a file can state."""
 
 
-@dataclass(slots=True)
-class Total:
-    """Messages of one channel: how many, and the log times of the earliest and the latest."""
-
-    count: int
-    first: Ns
-    last: Ns
-
-
 class McapIndex(NamedTuple):
     """What is known of a file without its payloads.
 
@@ -99,7 +89,7 @@ class McapIndex(NamedTuple):
     channels: Mapping[int, Channel]
     channel_bytes: int
     chunks: tuple[Chunk, ...]
-    totals: Mapping[int, Total]
+    totals: Mapping[int, Extent]
     loose: Mapping[int, Column] = MappingProxyType({})
     complete: bool = True
     notes: tuple[str, ...] = ()
@@ -146,8 +136,8 @@ def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
     offsets, base = chunk.index_offsets, chunk.offset + chunk.length
     extents = extents_from_index(_index_region(file, chunk), offsets, base)
     start, end = chunk.start, chunk.end
-    for _, first, last in extents.values():
-        if not start <= first <= last <= end:
+    for each in extents.values():
+        if not start <= each.first <= each.last <= end:
             raise UnreadableError(_OUTSIDE)
     return extents
 
@@ -167,10 +157,10 @@ def _set_back(file: OpenFile, chunks: Sequence[Chunk]) -> Ns:
     most: Ns = 0
     lasts: dict[int, Ns] = {}
     for chunk in chunks:
-        for channel, (_, first, last) in _chunk_extents(file, chunk).items():
-            before = lasts.get(channel, first)
-            most = max(most, before - first)
-            lasts[channel] = max(before, last)
+        for channel, extent in _chunk_extents(file, chunk).items():
+            before = lasts.get(channel, extent.first)
+            most = max(most, before - extent.first)
+            lasts[channel] = max(before, extent.last)
     return beyond_disorder(most)
 
 
@@ -310,7 +300,7 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]
 
 def _totals_of(
     file: OpenFile, chunks: Sequence[Chunk], counts: Mapping[int, int]
-) -> dict[int, Total]:
+) -> dict[int, Extent]:
     """Returns exact totals by channel, from the message indexes of chunks that hold messages.
 
     Reads the indexes of only those chunks that can hold the earliest or the latest message of a
@@ -321,7 +311,7 @@ def _totals_of(
         chunks: its chunks that hold messages.
         counts: the messages of each channel that has some.
     """
-    totals = {channel: Total(0, _NEVER, -1) for channel in counts}
+    totals = {channel: Extent(0, _NEVER, -1) for channel in counts}
     read: set[int] = set()
     unknown = list(counts)
     for chunk in sorted(chunks, key=attrgetter("start")):
@@ -343,33 +333,32 @@ def _totals_of(
     return totals
 
 
-def _add_extents(file: OpenFile, chunk: Chunk, totals: dict[int, Total]) -> None:
+def _add_extents(file: OpenFile, chunk: Chunk, totals: dict[int, Extent]) -> None:
     for channel, extent in _chunk_extents(file, chunk).items():
         _add(totals, channel, extent)
 
 
-def add_column(totals: dict[int, Total], channel: int, column: Column) -> None:
+def add_column(totals: dict[int, Extent], channel: int, column: Column) -> None:
     """Adds a column of one channel to the totals."""
     times = column.times
     if times.size:
         _add(totals, channel, Extent(times.size, int(times[0]), int(times[-1])))
 
 
-def _add(totals: dict[int, Total], channel: int, extent: Extent) -> None:
+def _add(totals: dict[int, Extent], channel: int, extent: Extent) -> None:
     total = totals.get(channel)
     if total is None:
-        totals[channel] = Total(*extent)
+        totals[channel] = extent
         return
-    messages, first, last = extent
-    total.count += messages
+    total.count += extent.count
     # Not by min() and max(), which take longer than all the rest.
-    if first < total.first:  # noqa: PLR1730
-        total.first = first
-    if last > total.last:  # noqa: PLR1730
-        total.last = last
+    if extent.first < total.first:  # noqa: PLR1730
+        total.first = extent.first
+    if extent.last > total.last:  # noqa: PLR1730
+        total.last = extent.last
 
 
-def disagreements(stated: Statistics, totals: Mapping[int, Total]) -> tuple[str, ...]:
+def disagreements(stated: Statistics, totals: Mapping[int, Extent]) -> tuple[str, ...]:
     """Returns a note if the messages contradict the statistics; else nothing."""
     every = totals.values()
     counts = {channel: total.count for channel, total in totals.items()}

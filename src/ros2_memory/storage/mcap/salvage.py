@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from io import BytesIO
+from itertools import starmap
 from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
@@ -22,7 +23,7 @@ from ros2_memory.storage.mcap.records import MAGIC_SIZE, section_records
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.walk import FileRecord
@@ -53,8 +54,10 @@ class Salvage:
         self._opener = ChunkOpener(file, max_chunk_bytes)
         self.lost_bytes = 0
 
-    def records(self, progress: Callable[[int], None] | None = None) -> Iterator[tuple[int, bytes]]:
-        """Yields opcode and body of each record that has content of its own, not of indexes.
+    def records(
+        self, progress: Callable[[int], None] | None = None
+    ) -> Iterator[mcap_records.McapRecord]:
+        """Yields each record that has content of its own, not of indexes; leaves out damaged ones.
 
         Args:
             progress: called with the number of bytes read so far, after each record of the file.
@@ -65,10 +68,8 @@ class Salvage:
         read_to, data_ended = MAGIC_SIZE, False
         for record in file_records(self._file):
             data_ended = data_ended or record.opcode == Opcode.DATA_END
-            if record.opcode == Opcode.CHUNK:
-                yield from self._chunk(record)
-            elif record.opcode in _CONTENT:
-                yield from self._whole(record)
+            within = self._chunk if record.opcode == Opcode.CHUNK else self._whole
+            yield from filter(None, starmap(decode_record, within(record)))
             read_to = min(record.end, self._file.size)
             if progress is not None:
                 progress(read_to)
@@ -76,6 +77,8 @@ class Salvage:
             self.lost_bytes += self._file.size - read_to
 
     def _whole(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+        if record.opcode not in _CONTENT:
+            return
         size = record.end - record.body_at
         if record.opcode == Opcode.MESSAGE:
             readable = record.end - record.offset <= self._max_chunk_bytes
@@ -97,29 +100,22 @@ class Salvage:
         usable = opened.content.usable
         is_cut = record.end > self._file.size
         self.lost_bytes += in_file if is_cut and not usable else len(opened.data) - usable
-        yield from _content_of(opened.data, usable)
+        for opcode, begin, end in section_records(opened.data[:usable]):
+            if opcode in _CONTENT:
+                yield opcode, opened.data[begin:end]
 
 
-def _content_of(data: bytes, usable: int) -> Iterator[tuple[int, bytes]]:
-    for opcode, begin, end in section_records(data[:usable]):
-        if opcode in _CONTENT:
-            yield opcode, data[begin:end]
-
-
-def decode_records(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRecord]:
-    """Decodes records by the `mcap` library; leaves out damaged ones, as readers do."""
-    for opcode, body in records:
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE_BODY.unpack_from(body)
-            data = body[_MESSAGE_BODY.size :]
-            yield mcap_records.Message(channel, log_time, data, publish_time, sequence)
-            continue
-        try:
-            with as_unreadable():
-                record = _READERS[opcode](ReadDataStream(BytesIO(body)))
-        except UnreadableError:
-            continue
-        yield record
+def decode_record(opcode: int, body: bytes) -> mcap_records.McapRecord | None:
+    """Returns a record with content of its own; None for any other, and for a damaged one."""
+    if opcode == Opcode.MESSAGE:
+        channel, sequence, log_time, publish_time = _MESSAGE_BODY.unpack_from(body)
+        data = body[_MESSAGE_BODY.size :]
+        return mcap_records.Message(channel, log_time, data, publish_time, sequence)
+    try:
+        with as_unreadable():
+            return _READERS[opcode](ReadDataStream(BytesIO(body)))
+    except UnreadableError:
+        return None
 
 
 class ContentDigest:

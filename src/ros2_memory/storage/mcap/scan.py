@@ -26,7 +26,6 @@ from ros2_memory.storage.mcap.chunk import column_of
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     McapIndex,
-    Total,
     add_column,
     beyond_disorder,
     disagreements,
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.chunk import ChunkContent
+    from ros2_memory.storage.mcap.chunk import ChunkContent, Extent
     from ros2_memory.storage.mcap.walk import FileRecord
 
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
@@ -83,7 +82,7 @@ class _Scan:
     in_chunks: Declarations = field(default_factory=Declarations)
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
-    totals: dict[int, Total] = field(default_factory=dict)
+    totals: dict[int, Extent] = field(default_factory=dict)
     loose: dict[int, tuple[array[int], array[int]]] = field(default_factory=dict)
     stated: Statistics | None = None
     messages: int = 0
@@ -204,7 +203,7 @@ class _Scan:
             set_back=beyond_disorder(back),
         )
 
-    def _notes(self, totals: dict[int, Total], *, complete: bool) -> list[str]:
+    def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
         notes = [] if complete else [self._end_note()]
         if self.damaged:
             notes.append(f"{len(self.damaged)} damaged records were left out ({self.damaged[0]})")

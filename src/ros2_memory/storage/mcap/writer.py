@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
@@ -15,7 +16,7 @@ from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
-from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, decode_records
+from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage
 from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
@@ -47,9 +48,19 @@ class McapWriter(BagWriter):
         with _written(path) as stream:
             writer = _writer(stream)
             writer.start(profile, LIBRARY)
-            channels = _Channels(writer)
+
+            @cache
+            def schema_id(schema: Schema) -> int:
+                number: int = writer.register_schema(schema.name, schema.encoding, schema.text)
+                return number
+
+            @cache
+            def channel_id(channel: Channel) -> int:
+                schema, metadata = schema_id(_exported(channel)), dict(channel.metadata)
+                return writer.register_channel(channel.topic, channel.encoding, schema, metadata)
+
             for record in records:
-                number = channels.id_of(record.channel)
+                number = channel_id(record.channel)
                 writer.add_message(number, record.log_time, record.payload, record.publish_time)
             writer.finish()
 
@@ -62,7 +73,7 @@ class McapWriter(BagWriter):
                 salvage = Salvage(file, self._max_chunk_mb << 20)
                 copy = _Copy(_writer(stream))
                 digest = ContentDigest()
-                for record in decode_records(salvage.records(progress)):
+                for record in salvage.records(progress):
                     if digest.add(record):
                         copy.put(record)
             copy.finish()
@@ -80,7 +91,7 @@ class McapWriter(BagWriter):
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
         again = ContentDigest()
         with OpenFile(target) as file:
-            for record in decode_records(Salvage(file, self._max_chunk_mb << 20).records()):
+            for record in Salvage(file, self._max_chunk_mb << 20).records():
                 again.add(record)
         if (after.topics, again.digests) != (before.topics, digest.digests):
             raise UnreadableError("what was written is not what could be read")
@@ -137,30 +148,6 @@ class _Copy:
         if not self._started:
             self._started = True
             self._writer.start(profile, library)
-
-
-class _Channels:
-    """Declares the channels of records in a writer, each once."""
-
-    def __init__(self, writer: Writer) -> None:
-        self._writer = writer
-        self._schemas: dict[Schema, int] = {}
-        self._channels: dict[Channel, int] = {}
-
-    def id_of(self, channel: Channel) -> int:
-        """Returns the id of the channel in the file."""
-        number = self._channels.get(channel)
-        if number is None:
-            schema = _exported(channel)
-            if schema not in self._schemas:
-                self._schemas[schema] = self._writer.register_schema(
-                    schema.name, schema.encoding, schema.text
-                )
-            number = self._writer.register_channel(
-                channel.topic, channel.encoding, self._schemas[schema], dict(channel.metadata)
-            )
-            self._channels[channel] = number
-        return number
 
 
 def _exported(channel: Channel) -> Schema:

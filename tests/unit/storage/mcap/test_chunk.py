@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.mcap.chunk import columns_from_index, extents_from_index
+from ros2_memory.storage.mcap.chunk import Extent, columns_from_index, extents_from_index
 
 PAIRS = st.lists(st.tuples(st.integers(0, MAX_NS - 1), st.integers(0, 2**20)), max_size=20)
 BASE = 1_000
@@ -31,7 +31,7 @@ def test_extents_are_what_the_columns_amount_to(indexes: dict[int, list[tuple[in
     region, offsets = region_of(indexes)
     columns = columns_from_index(region, offsets, BASE)
     expected = {
-        channel: (column.times.size, int(column.times[0]), int(column.times[-1]))
+        channel: Extent(column.times.size, int(column.times[0]), int(column.times[-1]))
         for channel, column in columns.items()
         if column.times.size
     }
