@@ -88,10 +88,9 @@ def _below(root: Path, directory: Path) -> Path:
     Raises:
         InvalidArgumentsError: it is not a directory below the bag directory, or behind a link.
     """
-    # `abspath` follows no link, unlike `resolve`.
-    base = Path(os.path.abspath(root))  # noqa: PTH100
+    base = Path(os.path.abspath(root))  # noqa: PTH100 - `resolve` would follow links
     for given in (directory, root / directory):
-        path = Path(os.path.abspath(given))  # noqa: PTH100
+        path = Path(os.path.abspath(given))  # noqa: PTH100 - as above
         if not path.is_dir() or not path.is_relative_to(base):
             continue
         inside = root / path.relative_to(base)

@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from enum import IntEnum
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -59,12 +60,6 @@ _RECENT_NS: Final[Ns] = 3600 * NS_PER_S
 """A topic without a message in the newest data of this length is not being recorded."""
 _HEALTH_TIMEOUT_S: Final = 5.0
 _MAX_HEALTH_BYTES: Final = 1 << 20
-_LOCAL_ADDRESSES: Final[Mapping[str, str]] = {
-    "0.0.0.0": "127.0.0.1",  # noqa: S104 - looked up, never bound
-    "::": "::1",
-    "": "127.0.0.1",
-}
-"""Where a server that listens on all interfaces is reached from its own machine."""
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
 _NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
 _NOT_REPAIRED: Final = "copy them anew from where they were recorded, or delete them"
@@ -93,16 +88,9 @@ class Finding:
     do: str | None = None
 
 
-def _ok(about: str, seen: str) -> Finding:
-    return Finding(Level.OK, about, seen)
-
-
-def _warning(about: str, seen: str, do: str) -> Finding:
-    return Finding(Level.WARNING, about, seen, do)
-
-
-def _error(about: str, seen: str, do: str) -> Finding:
-    return Finding(Level.ERROR, about, seen, do)
+_ok = partial(Finding, Level.OK)
+_warning = partial(Finding, Level.WARNING)
+_error = partial(Finding, Level.ERROR)
 
 
 def doctor(
@@ -489,7 +477,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     address = f"{server.host} port {server.port}"
     start = time.monotonic()
     try:
-        status, reply = _health(_LOCAL_ADDRESSES.get(server.host, server.host), server.port)
+        status, reply = _health(server.host, server.port)
     except (OSError, http.client.HTTPException) as error:
         do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
         yield _error("server", f"nothing answers on {address}: {error}", do)
@@ -513,6 +501,8 @@ def check_server(settings: Settings) -> Iterator[Finding]:
 
 def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
     """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
+
+    Linux connects to the loopback address where `host` is that of all interfaces.
 
     Raises:
         OSError: nothing answers.

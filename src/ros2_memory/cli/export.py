@@ -21,7 +21,7 @@ from ros2_memory.cli.options import (
     parse_window,
     print_line,
 )
-from ros2_memory.cli.progress import progress_bar
+from ros2_memory.cli.output import progress_bar
 from ros2_memory.core.errors import (
     BagError,
     ConfigError,

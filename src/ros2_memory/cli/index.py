@@ -24,7 +24,7 @@ from ros2_memory.cli.options import (
     load_for,
     open_memory,
 )
-from ros2_memory.cli.progress import progress_bar
+from ros2_memory.cli.output import progress_bar
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging

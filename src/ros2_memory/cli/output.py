@@ -1,4 +1,4 @@
-"""Prints replies for people: tables for lists, lines for the rest.
+"""Prints replies for people: tables for lists, lines for the rest; and a bar for what takes long.
 
 Recorded text comes from elsewhere: control characters in it never reach the terminal.
 """
@@ -10,13 +10,14 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rich.console import Console
+    from rich.progress import Progress
 
     from ros2_memory.core.model import JsonValue
 
@@ -246,4 +247,27 @@ def escape(text: str) -> str:
     """Returns the text with control characters spelled out, so that a terminal ignores them."""
     return "".join(
         each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
+    )
+
+
+def progress_bar(console: Console | None = None) -> Progress:
+    """Returns a progress bar that is shown on a terminal only, and removed when it ends.
+
+    Args:
+        console: where it is shown; stderr unless given.
+    """
+    # Imported here, since it takes a while, and few commands show one.
+    from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
+
+    console = console or Console(stderr=True)
+    return Progress(
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn("{task.description}", markup=False),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        # Otherwise what the command prints on stdout would go to the console, which is stderr.
+        redirect_stdout=False,
+        redirect_stderr=False,
     )

@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import EXIT_NEGATIVE, print_line
-from ros2_memory.cli.progress import progress_bar
+from ros2_memory.cli.output import progress_bar
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
 from ros2_memory.core.text import counted

@@ -17,7 +17,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
-import os
 import re
 import socket
 import stat
@@ -272,15 +271,12 @@ def take_token(env: MutableMapping[str, str], *, host: str, loopback: bool) -> S
 
 
 def _read_token(path: Path, source: str) -> str:
-    """Returns the file's text without the line's end; never blocks, as opening a pipe would."""
+    """Returns the file's text without the line's end; opens no pipe, which would block."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise ConfigError(f"{source}: {str(path)!r} is not a regular file")
-            data = os.read(descriptor, LONGEST_TOKEN + 3)
-        finally:
-            os.close(descriptor)
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise ConfigError(f"{source}: {str(path)!r} is not a regular file")
+        with path.open("rb") as file:
+            data = file.read(LONGEST_TOKEN + 3)
     except OSError as error:
         raise ConfigError(
             f"{source}: {str(path)!r} cannot be read: {error.strerror}; "

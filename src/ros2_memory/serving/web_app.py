@@ -150,20 +150,22 @@ class _OpenRequest:
         self._send = send
         self._is_stream = scope["path"] == STREAM_PATH
         self._has_begun = False
-        self._disconnected = anyio.Event()
+        self._is_ended = False
+        self._awaited = anyio.CancelScope()
         self._limit = anyio.CancelScope()
 
     def stop(self) -> None:
         """Ends an event stream at once, and another request after `GRACE_S`."""
         if self._is_stream:
-            self._disconnected.set()
+            self._is_ended = True
+            self._awaited.cancel()
         self._limit.deadline = anyio.current_time() + GRACE_S
 
     async def run(self, app: ASGIApp) -> None:
         """Runs the application, and completes a response that was stopped."""
         with self._limit:
             await app(self._scope, self.receive, self.send)
-        if not self._limit.cancelled_caught and not self._disconnected.is_set():
+        if not self._limit.cancelled_caught and not self._is_ended:
             return
         if self._has_begun:
             await self._send({"type": "http.response.body", "body": b"", "more_body": False})
@@ -173,24 +175,14 @@ class _OpenRequest:
 
     async def receive(self) -> Message:
         """Returns the client's next message, or a disconnect where the stream is to end."""
-        if not self._is_stream:
-            return await self._receive()
-        message: Message = {"type": "http.disconnect"}
-
-        async def forward() -> None:
-            nonlocal message
-            message = await self._receive()
-            tasks.cancel_scope.cancel()
-
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(forward)
-            await self._disconnected.wait()
-            tasks.cancel_scope.cancel()
-        return message
+        if not self._is_ended:
+            with anyio.CancelScope() as self._awaited:
+                return await self._receive()
+        return {"type": "http.disconnect"}
 
     async def send(self, message: Message) -> None:
         """Passes a message to the client, unless the stream was ended."""
-        if not self._disconnected.is_set():
+        if not self._is_ended:
             self._has_begun = True
             await self._send(message)
 
