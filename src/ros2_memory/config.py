@@ -25,6 +25,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import ListConfig, OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
+from pydantic.types import PathType
+from pydantic_core import to_jsonable_python
 
 from ros2_memory.config_errors import foreign_errors_as_config_error, validated
 from ros2_memory.config_sources import (
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
+    from ros2_memory.core.model import JsonValue
+
 EXIT_CODE: Final = 2
 
 
@@ -51,12 +55,6 @@ def _home_expanded(path: Path) -> Path:
         return path.expanduser()
     except RuntimeError as error:
         raise ValueError(f"must be a path that can be found: {error}") from error
-
-
-def _existing_folder(path: Path) -> Path:
-    if not path.is_dir():
-        raise ValueError("must be an existing folder")
-    return path
 
 
 def _in_config_dir(path: Path, info: ValidationInfo[Path]) -> Path:
@@ -86,7 +84,7 @@ Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
 Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
-Folder: TypeAlias = Annotated[AnyPath, AfterValidator(_existing_folder)]
+Folder: TypeAlias = Annotated[AnyPath, PathType("dir")]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
 MessageType: TypeAlias = Annotated[Text, AfterValidator(_message_type)]
 DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
@@ -327,6 +325,12 @@ def load_explained(
         Settings, data, config_dir=folder, source=sources, raw=raw, adapters=_NODES
     )
     return settings, sources
+
+
+def plain_values(settings: Settings) -> dict[str, JsonValue]:
+    """Returns the configuration as JSON values, under the names that the files have."""
+    values: dict[str, JsonValue] = to_jsonable_python(settings, by_alias=True)
+    return values
 
 
 def config_dir(env: Mapping[str, str]) -> Path:

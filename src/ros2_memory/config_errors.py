@@ -31,6 +31,7 @@ _FOREIGN: Final = (HydraException, OmegaConfBaseException, YAMLError, OSError, V
 _RULES: Final = {
     "tuple_type": "must be a list",
     "path_type": "must be a path",
+    "path_not_directory": "must be an existing folder",
     "string_too_short": "must not be empty",
 }
 

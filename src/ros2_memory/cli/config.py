@@ -2,8 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -18,8 +17,7 @@ from ros2_memory.cli.options import (
     print_line,
     reported_errors,
 )
-from ros2_memory.cli.output import escape
-from ros2_memory.config import AdapterNode, Settings
+from ros2_memory.config import Settings, plain_values
 from ros2_memory.config_sources import GROUPS, Sources
 from ros2_memory.core.model import JsonValue
 
@@ -48,7 +46,7 @@ def config_show(
             print_line(line)
         return
     sections: dict[str, dict[str, JsonValue]] = {}
-    for key, value in _keys(settings):
+    for key, value in _keys(plain_values(settings)):
         section, _, name = key.partition(".")
         sections.setdefault(section, {})[name] = value
     print_line(yaml.safe_dump(sections, sort_keys=False, allow_unicode=True).rstrip())
@@ -67,7 +65,7 @@ def _lines_with_sources(settings: Settings, source: Sources) -> Iterator[str]:
     for group in GROUPS:
         option, who = source.choice(group)
         rows.append((group, _shortened_source(who, source.folder), option or "null"))
-    for key, value in _keys(settings):
+    for key, value in _keys(plain_values(settings)):
         who = _shortened_source(source(key), source.folder)
         rows.append((key, who, value if isinstance(value, str) else json.dumps(value)))
     key_width, source_width = (max(len(row[column]) for row in rows) for column in (0, 1))
@@ -80,27 +78,11 @@ def _shortened_source(who: str, folder: Path) -> str:
     return f"as {other}" if link else file.replace(f"in {folder}/", "")
 
 
-def _keys(settings: object, prefix: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yields every key with its plain value, `_target_` under the name that the files have."""
-    if not is_dataclass(settings):
-        return
-    for each in fields(settings):
-        value: object = getattr(settings, each.name)
-        is_target = isinstance(settings, AdapterNode) and each.name == "target"
-        key = f"{prefix}{'_target_' if is_target else each.name}"
-        if is_dataclass(value):
-            yield from _keys(value, f"{key}.")
+def _keys(section: Mapping[str, JsonValue], prefix: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yields every key with its value, secrets masked."""
+    for name, value in section.items():
+        if isinstance(value, dict):
+            yield from _keys(value, f"{prefix}{name}.")
         else:
-            yield key, _plain_value(key, value)
-
-
-def _plain_value(key: str, value: object) -> JsonValue:
-    if value and any(word in key.rpartition(".")[2].lower() for word in _SECRETS):
-        return _MASK
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, tuple):
-        return [_plain_value("", each) for each in value]
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return escape(str(value))
+            is_secret = value and any(word in name.lower() for word in _SECRETS)
+            yield f"{prefix}{name}", _MASK if is_secret else value
