@@ -22,7 +22,6 @@ from ros2_memory.config_sources import GROUPS, Sources
 from ros2_memory.core.model import JsonValue
 
 _MASK: Final = "********"
-_SECRETS: Final = ("token", "password", "secret", "credential")
 
 config = typer.Typer(
     help="The configuration, as the programs see it.", no_args_is_help=True, rich_markup_mode=None
@@ -79,10 +78,9 @@ def _shortened_source(who: str, folder: Path) -> str:
 
 
 def _keys(section: Mapping[str, JsonValue], prefix: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yields every key with its value, secrets masked."""
+    """Yields every key with its value. None is a secret: the configuration holds no token."""
     for name, value in section.items():
         if isinstance(value, dict):
             yield from _keys(value, f"{prefix}{name}.")
         else:
-            is_secret = value and any(word in name.lower() for word in _SECRETS)
-            yield f"{prefix}{name}", _MASK if is_secret else value
+            yield f"{prefix}{name}", value

@@ -88,30 +88,25 @@ def _fill_for_server(settings: Settings, server: int) -> None:
     backfill = build_backfill(settings, build_memory(settings))
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
-    fill_catalogue(backfill, is_cancelled=lambda: os.getppid() != server)
+    fill_catalogue(backfill)
 
 
 def fill_catalogue(
-    backfill: Backfill,
-    show: Callable[[Progress], None] = lambda _: None,
-    is_cancelled: Callable[[], bool] = lambda: False,
+    backfill: Backfill, show: Callable[[Progress], None] = lambda _: None
 ) -> Progress:
     """Digests until no bag waits, the newest first, and returns the progress at the end.
 
     A bag that changed a few seconds ago is left for a later run.
     """
     done = 1
-    while done and not is_cancelled():
+    while done:
         done = 0
         progress = backfill.progress()
         for number, bag in enumerate(backfill.waiting()[:_BATCH]):
-            if is_cancelled():
-                break
             show(replace(progress, waiting=progress.waiting - number))
             done += backfill.digest(bag)
-    if not is_cancelled():
-        backfill.prune()
-        backfill.precompute()
+    backfill.prune()
+    backfill.precompute()
     return backfill.progress()
 
 
