@@ -10,27 +10,31 @@ import re
 import shlex
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import yaml
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import OverrideType, Quote, QuotedString
 from hydra.errors import HydraException
+from hydra.types import RunMode
+from yaml import YAMLError
 
 from ros2_memory.config_errors import reason_of
 from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
+
+    from hydra._internal.defaults_list import DefaultsList  # Hydra has no public name for it
 
 GROUPS: Final = ("deployment", "storage", "recorder")
 """The config groups: folders of files of which one each is chosen."""
 INTERFACES_VARIABLE: Final = "ROS_VISION_INTERFACES_PATH"
 
-_ADAPTERS: Final = ("storage", "recorder")
-"""Groups whose files hold the section of the same name; a preset may hold any."""
-_OVERRIDE: Final = "override /"
 _LAST_ROS_DOMAIN: Final = 232  # the highest whose DDS ports are below 65536
 
 
@@ -51,7 +55,7 @@ class Override:
     option: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Sources:
     """Returns, called with a key such as `server.port`, who set it: a phrase that follows "set".
 
@@ -80,41 +84,32 @@ class Sources:
         for override in reversed(self.overrides):
             if override.key == group:
                 return override.option, override.source
-        config = self.folder / "config.yaml"
-        presets = () if group == "deployment" else self._presets()
-        for path in (*presets, config):
-            for default in _defaults(path):
-                if group in default:
-                    return default[group], f"in {path}"
-        return None, f"in {config}"
+        if self._composed is None:
+            return None, f"in {self.folder / 'config.yaml'}"
+        composed = self._composed.overrides
+        chosen = composed.override_metadata.get(group)
+        file = "config" if chosen is None else chosen.containing_config_path
+        return composed.known_choices.get(group), f"in {self.folder / f'{file}.yaml'}"
 
     def _file(self, key: str) -> str:
-        for path in self._files(key.partition(".")[0]):
-            found, value = _lookup(_content(path), key)
+        for each in reversed(self._composed.defaults if self._composed else ()):
+            path = self.folder / f"{each.config_path}.yaml"
+            found, value = _lookup(path, each.package or "", key)
             if found:
                 link = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
                 return f"in {path}{f', as {link[1]}' if link else ''}"
         return f"in {self.folder}"
 
-    def _files(self, section: str) -> Iterator[Path]:
-        """Yields the files that may hold a section's keys, the strongest first."""
-        yield from self._presets()
-        yield self.folder / "config.yaml"
-        option = self.choice(section)[0] if section in GROUPS else None
-        if option is not None:
-            yield self.folder / section / f"{option}.yaml"
-
-    def _presets(self) -> Iterator[Path]:
-        """Yields the chosen preset and those that it builds on, the strongest first."""
-        names, seen = [self.choice("deployment")[0]], set[str]()
-        while names:
-            name = names.pop()
-            if name is None or name in seen:
-                continue
-            seen.add(name)
-            path = self.folder / "deployment" / f"{name}.yaml"
-            yield path
-            names += [each for default in _defaults(path) for each in default.get("", "").split()]
+    @cached_property
+    def _composed(self) -> DefaultsList | None:
+        """Returns the files that Hydra composes, later wins; None where it cannot."""
+        folder = initialize_config_dir(version_base="1.3", config_dir=str(self.folder))
+        texts = [each.text for each in self.overrides]
+        with suppress(HydraException, YAMLError, ValueError, RecursionError), folder:
+            loader = GlobalHydra.instance().config_loader()
+            composed: DefaultsList = loader.compute_defaults_list("config", texts, RunMode.RUN)
+            return composed
+        return None
 
 
 def quoted(value: str) -> str:
@@ -243,35 +238,15 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
     return Override(key, f"++{text}" if changes and not is_group else text, source, option)
 
 
-def _defaults(path: Path) -> Iterator[dict[str, str]]:
-    """Yields the choices in a file's defaults list; under "" the presets that it builds on."""
-    content = _content(path)
-    listed = content.get("defaults") if isinstance(content, dict) else None
-    for each in listed if isinstance(listed, list) else []:
-        if isinstance(each, dict):
-            yield {
-                str(group).removeprefix(_OVERRIDE): option
-                for group, option in each.items()
-                if isinstance(option, str)
-            }
-        elif isinstance(each, str) and each != "_self_":
-            yield {"": each}
-
-
-def _lookup(content: object, key: str) -> tuple[bool, object]:
-    """Returns whether a file sets a key, and to what."""
+def _lookup(path: Path, section: str, key: str) -> tuple[bool, object]:
+    """Returns whether a file, which holds the keys of a section, sets a key, and to what."""
+    try:
+        content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, YAMLError):
+        return False, None
+    content = {section: content} if section else content
     for part in key.split("."):
         if not isinstance(content, dict) or part not in content:
             return False, None
         content = content[part]
     return True, content
-
-
-def _content(path: Path) -> object:
-    """Returns what a file sets, from the root of the configuration; None if it is unreadable."""
-    try:
-        content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError):
-        return None
-    group = path.parent.name
-    return {group: content} if path.name != "config.yaml" and group in _ADAPTERS else content

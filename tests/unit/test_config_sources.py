@@ -22,13 +22,15 @@ def folder(tmp_path: Path) -> Path:
 def test_a_preset_that_builds_on_itself_ends(folder: Path) -> None:
     (folder / "config.yaml").write_text("defaults:\n  - deployment: loop\n")
     (folder / "deployment" / "loop.yaml").write_text("defaults: [loop]\ndata: {now: latest}\n")
-    assert Sources(folder, (), {})("data.now") == f"in {folder / 'deployment' / 'loop.yaml'}"
+    assert Sources(folder, (), {})("data.now") == f"in {folder}"
 
 
 def test_a_file_of_the_operators_stands_for_the_keys_that_it_sets(folder: Path) -> None:
     text = (folder / "config.yaml").read_text().replace("deployment: null", "deployment: mine")
     (folder / "config.yaml").write_text(text)
-    (folder / "deployment" / "mine.yaml").write_text("server:\n  name: robin\n")
+    (folder / "deployment" / "mine.yaml").write_text(
+        "# @package _global_\nserver:\n  name: robin\n"
+    )
     source = Sources(folder, (), {})
     assert source("server.name") == f"in {folder / 'deployment' / 'mine.yaml'}"
     assert source("server.port") == f"in {folder / 'config.yaml'}"
