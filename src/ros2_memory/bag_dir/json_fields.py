@@ -48,20 +48,18 @@ def validated(adapter: TypeAdapter[_T], fields: Mapping[object, object]) -> _T:
         raise ValueError(f"{key}: {first['msg']}") from error
 
 
-def is_integer(value: object, least: int = MIN_NS, most: int = MAX_NS) -> TypeGuard[int]:
-    """Returns whether a value is an integer in a range, 64 bits by default; a boolean is none."""
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= most
+def is_integer(value: object) -> TypeGuard[int]:
+    """Returns whether a value is an integer of 64 bits; a boolean is none."""
+    return isinstance(value, int) and not isinstance(value, bool) and MIN_NS <= value <= MAX_NS
 
 
-def integer(
-    fields: Mapping[object, object], key: str, least: int = MIN_NS, most: int = MAX_NS
-) -> int:
+def integer(fields: Mapping[object, object], key: str) -> int:
     """Returns the integer under a key.
 
     Raises:
-        ValueError: the value is not an integer in the range.
+        ValueError: the value is not an integer of 64 bits.
     """
     value = fields.get(key)
-    if not is_integer(value, least, most):
-        raise ValueError(f"{key} must be an integer from {least} to {most}")
+    if not is_integer(value):
+        raise ValueError(f"{key} must be an integer of 64 bits")
     return value

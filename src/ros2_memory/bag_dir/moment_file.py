@@ -15,10 +15,12 @@ import re
 import unicodedata
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
+
+from pydantic import AfterValidator, ConfigDict, Field, StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import integer, json_object
+from ros2_memory.bag_dir.json_fields import json_object, validated
 from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Ns
 
 FORMAT: Final = 1
 MAX_LABEL_CHARS: Final = 120
@@ -36,51 +37,6 @@ MAX_MOMENTS: Final = 1000
 _MAX_SLUG_CHARS: Final = 40
 _INVISIBLE: Final = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
 """Unicode categories of line ends, directions, surrogates and other controls."""
-
-
-class SaveRequest(NamedTuple):
-    """A request to save what was recorded from `start` to `end` (log times, inclusive).
-
-    `number` is its random id, `asked` the wall clock time of the request.
-    """
-
-    number: str
-    label: str
-    start: Ns
-    end: Ns
-    asked: Ns
-
-    def to_json(self) -> dict[str, object]:
-        """Returns the request as both kinds of file hold it."""
-        return {
-            "format": FORMAT,
-            "request": self.number,
-            "label": self.label,
-            "start_ns": self.start,
-            "end_ns": self.end,
-            "requested_ns": self.asked,
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class SavedMoment:
-    """A moment as its file describes it.
-
-    `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
-    were not saved. By default nothing is saved yet.
-    """
-
-    request: SaveRequest
-    pending: bool = True
-    missing: tuple[str, ...] = ()
-
-
-class StoredMoment(NamedTuple):
-    """A saved moment and its folder; `files` are the sizes of its bags by inode."""
-
-    folder: Path
-    moment: SavedMoment
-    files: Mapping[int, int]
 
 
 def fault_of_label(label: str) -> str | None:
@@ -92,6 +48,72 @@ def fault_of_label(label: str) -> str | None:
     if any(unicodedata.category(char) in _INVISIBLE for char in label):
         return "has characters that cannot be seen, such as line ends"
     return None
+
+
+def _checked_label(label: str) -> str:
+    if fault_of_label(label):
+        raise ValueError("it must be a text of one line")
+    return label
+
+
+_Number: TypeAlias = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+_Label: TypeAlias = Annotated[str, AfterValidator(_checked_label)]
+_Time: TypeAlias = Annotated[int, Field(strict=True, gt=MIN_NS, lt=MAX_NS)]
+_KEYS: Final = {"number": "request", "start": "start_ns", "end": "end_ns", "asked": "requested_ns"}
+
+
+@dataclass(frozen=True, slots=True)
+class SaveRequest:
+    """A request to save what was recorded from `start` to `end` (log times, inclusive).
+
+    `number` is its random id, `asked` the wall clock time of the request.
+    """
+
+    __pydantic_config__ = ConfigDict(alias_generator=lambda name: _KEYS.get(name, name))
+
+    number: _Number
+    label: _Label
+    start: _Time
+    end: _Time
+    asked: _Time
+
+    def to_json(self) -> dict[str, object]:
+        """Returns the request as both kinds of file hold it."""
+        return {"format": FORMAT, **REQUEST.dump_python(self, by_alias=True)}
+
+
+def _checked_request(request: SaveRequest) -> SaveRequest:
+    if request.end < request.start:
+        raise ValueError("end_ns must not be before start_ns")
+    return request
+
+
+_Request: TypeAlias = Annotated[SaveRequest, AfterValidator(_checked_request)]
+REQUEST: Final[TypeAdapter[SaveRequest]] = TypeAdapter(_Request)
+
+
+@dataclass(frozen=True, slots=True)
+class SavedMoment:
+    """A moment as its file describes it.
+
+    `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
+    were not saved. By default nothing is saved yet.
+    """
+
+    request: _Request
+    pending: StrictBool = True
+    missing: tuple[str, ...] = ()
+
+
+_MOMENT: Final = TypeAdapter(SavedMoment)
+
+
+class StoredMoment(NamedTuple):
+    """A saved moment and its folder; `files` are the sizes of its bags by inode."""
+
+    folder: Path
+    moment: SavedMoment
+    files: Mapping[int, int]
 
 
 def folder_name(request: SaveRequest) -> str:
@@ -146,15 +168,11 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
 
 def read_saved_moment(folder: Path) -> SavedMoment | None:
     """Returns the moment of a folder; None where there is no file, or no valid one."""
-    try:
+    with suppress(OSError, ValueError, RecursionError):
         fields = json_object(read_small_file(folder / MOMENT_FILE), FORMAT)
-        request = save_request_from(fields)
-        pending, missing = fields.get("pending"), fields.get("missing")
-        if not isinstance(pending, bool) or not isinstance(missing, list):
-            return None
-        return SavedMoment(request, pending, tuple(str(each) for each in missing))
-    except (OSError, ValueError, RecursionError):
-        return None
+        # The keys of the request lie among those of the moment.
+        return validated(_MOMENT, {**fields, "request": fields})
+    return None
 
 
 def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
@@ -174,26 +192,6 @@ def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
         moment = None if folder.is_symlink() else read_saved_moment(folder)
         if moment is not None:
             yield StoredMoment(folder, moment, _bag_sizes(folder))
-
-
-def save_request_from(fields: Mapping[object, object]) -> SaveRequest:
-    """Returns the request in an object.
-
-    Raises:
-        ValueError: a key is missing or wrong.
-    """
-    number, label = fields.get("request"), fields.get("label")
-    if not isinstance(number, str) or not re.fullmatch(r"[0-9a-f]{32}", number):
-        raise ValueError("request must be 32 hexadecimal digits")
-    if not isinstance(label, str) or fault_of_label(label):
-        raise ValueError("label must be a text of one line")
-    start, end, asked = (
-        integer(fields, f"{key}_ns", MIN_NS + 1, MAX_NS - 1)
-        for key in ("start", "end", "requested")
-    )
-    if end < start:
-        raise ValueError("end_ns must not be before start_ns")
-    return SaveRequest(number, label, start, end, asked)
 
 
 def _bag_sizes(folder: Path) -> dict[int, int]:

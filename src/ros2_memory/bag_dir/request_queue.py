@@ -17,14 +17,16 @@ import os
 import re
 import uuid
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final
 
 import structlog
+from pydantic import StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import json_object
+from ros2_memory.bag_dir.json_fields import Count, json_object, validated
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.bag_dir.moment_file import FORMAT, SaveRequest, save_request_from
+from ros2_memory.bag_dir.moment_file import FORMAT, REQUEST, SaveRequest
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import NS_PER_S
 
@@ -47,16 +49,20 @@ _OWN_NAME: Final = re.compile(r"\.?[0-9a-f]{32}\.(json|taken|answer)(\.tmp)?")
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Outcome:
     """The outcome of a request: the folder of its moment, or why it was refused.
 
     `pending`: bags of it are still being written.
     """
 
     moment: str | None = None
-    bags: int = 0
-    pending: bool = False
+    bags: Count = 0
+    pending: StrictBool = False
     refused: str | None = None
+
+
+_OUTCOME: Final = TypeAdapter(Outcome)
 
 
 class PendingRequest:
@@ -78,16 +84,9 @@ class PendingRequest:
 
     def outcome(self) -> Outcome | None:
         """Returns the outcome; None while there is none."""
-        try:
-            fields = json_object(read_small_file(self._path("answer")), FORMAT)
-        except (OSError, ValueError, RecursionError):
-            return None
-        moment, refused = (
-            None if fields.get(key) is None else str(fields[key]) for key in ("moment", "refused")
-        )
-        bags = fields.get("bags")
-        count = bags if isinstance(bags, int) else 0
-        return Outcome(moment, count, fields.get("pending") is True, refused)
+        with suppress(OSError, ValueError, RecursionError):
+            return validated(_OUTCOME, json_object(read_small_file(self._path("answer")), FORMAT))
+        return None
 
     def withdraw(self) -> bool:
         """Withdraws the request; False where the recorder has begun with it, or answered."""
@@ -151,7 +150,7 @@ class RequestQueue:
         Raises:
             OSError: it cannot be written.
         """
-        text = json.dumps({"format": FORMAT, **outcome._asdict()})
+        text = json.dumps({"format": FORMAT, **asdict(outcome)})
         write_durably(self._folder / f"{request.number}.answer", text, mode=_READABLE)
         self._delete(request.number)
 
@@ -203,7 +202,7 @@ def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:
     """
     if path.lstat().st_size > MAX_REQUEST_BYTES:
         raise ValueError(f"it is larger than {MAX_REQUEST_BYTES} bytes")
-    request = save_request_from(json_object(read_small_file(path), FORMAT))
+    request = validated(REQUEST, json_object(read_small_file(path), FORMAT))
     if request.number != number:
         raise ValueError("it has the number of another")
     if abs(now - request.asked) > STALE_NS:
