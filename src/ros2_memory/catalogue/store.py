@@ -40,7 +40,7 @@ from ros2_memory.catalogue.sql import (
 )
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.core.bag_summary import BagSummary
-from ros2_memory.index.file_state import KnownFile
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
 
 FOLDER: Final = ".episodic"
@@ -115,16 +114,18 @@ class Catalogue(CatalogueDatabase):
 
         return self.read(ask, 0)
 
-    def known_files(self, bag_dir: Path) -> dict[str, KnownFile]:
-        """Returns what is known of every file below the bag directory, by its whole path.
+    def known_files(self, bag_dir: Path) -> dict[str, BagFile]:
+        """Returns every file below the bag directory as it was read, by its whole path.
+
+        Start and end are 0 where it has no message.
 
         A start reads this for a week of bags, so the files of one summary schema, which are many,
         are read together.
         """
         root = f"{bag_dir}{os.sep}"
 
-        def ask(connection: sqlite3.Connection) -> dict[str, KnownFile]:
-            found: dict[str, KnownFile] = {}
+        def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
+            found: dict[str, BagFile] = {}
             for number, text in connection.execute("SELECT id, text FROM shapes").fetchall():
                 schema = decode_schema(text)
                 cursor = connection.execute(
@@ -137,8 +138,10 @@ class Catalogue(CatalogueDatabase):
                     for row, start, end in zip(rows, starts, ends, strict=True):
                         path, size, mtime, sidecar, counts = row
                         summary = BagSummary.decoded(schema, counts)
-                        file = KnownFile(size, mtime, sidecar, summary, start, end)
-                        found[root + path] = file
+                        file = root + path
+                        found[file] = BagFile(
+                            file, size, mtime, BagState.CLOSED, summary, start, end, sidecar
+                        )
             return found
 
         return self.read(ask, {})

@@ -7,6 +7,7 @@ paths: where it was recorded, and hard links in saved moments. Of all these one 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -24,12 +25,14 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import Classification, KnownFile, ScanContext
+    from ros2_memory.index.file_state import Classification, ScanContext
     from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader
 
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
+
+_FILE: Final = attrgetter("size", "mtime_ns", "inode")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +83,7 @@ class BagTable:
         bag_dir: Path,
         reader: BagReader,
         *,
-        known: Callable[[], Mapping[str, KnownFile]] | None,
+        known: Callable[[], Mapping[str, BagFile]] | None,
         keep_all_notes: bool,
     ) -> None:
         self._reader = reader
@@ -154,13 +157,13 @@ class BagTable:
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._unchanged]
 
-    def _known_at_first(self) -> Mapping[str, KnownFile]:
+    def _known_at_first(self) -> Mapping[str, BagFile]:
         """Returns the files that were read earlier, for the first scan."""
         is_first = not (self._files or self._unchanged)
         return self._known() if self._known is not None and is_first else {}
 
     def _restore(
-        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], context: ScanContext
+        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
     ) -> list[BagFile]:
         """Returns the bags of files that are unchanged, which need no examination."""
         if self._keep_all_notes or not known:
@@ -202,7 +205,7 @@ class BagTable:
         return forgotten
 
     def _examine(
-        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], context: ScanContext
+        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
     ) -> set[str]:
         """Classifies files; returns those whose classification changed."""
         changed = set()
@@ -213,7 +216,7 @@ class BagTable:
                 self._files[path] = notes
                 self._links.add(path)
                 file = known.get(path)
-                if file is not None and notes.trusted and file.matches(stamp):
+                if file is not None and notes.trusted and stamp.is_of(file):
                     notes.restore(file.summary)
             elif not notes.update(stamp, context.now) and path not in self._watched:
                 continue
@@ -284,11 +287,7 @@ class BagTable:
         stamp = self._unchanged.stamp(link) if notes is None else notes.stamp
         if stamp is None or own is None:
             return False
-        return (own.stamp.size, own.stamp.mtime_ns, own.stamp.inode) == (
-            stamp.size,
-            stamp.mtime_ns,
-            stamp.inode,
-        )
+        return _FILE(own.stamp) == _FILE(stamp)
 
 
 def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:

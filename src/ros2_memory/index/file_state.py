@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
@@ -121,24 +121,6 @@ class ScanContext:
         if folder not in self._finished:
             self._finished[folder] = files_in_metadata(folder / "metadata.yaml")
         return path.name in self._finished[folder]
-
-
-class KnownFile(NamedTuple):
-    """A closed file as it was when it was read, and its content then.
-
-    `start` and `end` are log times (inclusive); 0 where it holds no message.
-    """
-
-    size: int
-    mtime_ns: Ns
-    sidecar_ns: Ns
-    summary: BagSummary
-    start: Ns
-    end: Ns
-
-    def matches(self, stamp: Stamp) -> bool:
-        """Returns whether a file is as it was."""
-        return self[:3] == stamp.content
 
 
 @dataclass(slots=True)

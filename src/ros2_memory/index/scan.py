@@ -26,6 +26,8 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from ros2_memory.core.model import BagFile
+
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a young one proves nothing."""
 
@@ -68,6 +70,10 @@ class Stamp(NamedTuple):
     def content(self) -> tuple[int, Ns, Ns]:
         """What changes when other messages count: size, mtime and mtime of the sidecar."""
         return self.size, self.mtime_ns, self.sidecar_ns
+
+    def is_of(self, bag: BagFile) -> bool:
+        """Returns whether a bag is as it was when it was read."""
+        return self.content == (bag.size, bag.mtime_ns, bag.sidecar_ns)
 
     def matches(self, before: Stamp) -> bool:
         """Returns whether the file is as before, but for the ctime, which permissions change."""
@@ -162,12 +168,10 @@ class Tree:
 
     def _leave_out_second_links(self, before: dict[str, _Folder], result: ScanResult) -> None:
         """Keeps one hard link of each file: the others are gone, until the first one is."""
-        if all(self._folders.get(path) is folder for path, folder in before.items()) and len(
-            before
-        ) == len(self._folders):
-            second = self._second
-        else:
-            second = self._second_links()
+        is_same = len(before) == len(self._folders) and all(
+            self._folders.get(path) is folder for path, folder in before.items()
+        )
+        second = self._second if is_same else self._second_links()
         for path in second:
             result.stamps.pop(path, None)
         result.gone.update(second - self._second)

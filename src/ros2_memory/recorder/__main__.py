@@ -87,7 +87,10 @@ def _record(settings: Settings) -> None:
     own = OwnRecordings(bag_dir)
     housekeeper = build_housekeeper(settings, bag_dir, reader, own)
     clear = settings.recording.clear_on_startup
-    lock = _lock_bag_dir(bag_dir, clear=clear)
+    if clear:
+        refuse_homes(bag_dir)
+    make_bag_dir(bag_dir)
+    lock = BagDirLock.acquire(bag_dir)
     try:
         recorder = build_recorder(
             settings,
@@ -106,19 +109,6 @@ def _record(settings: Settings) -> None:
         _log.info("stopped")
     finally:
         lock.release()
-
-
-def _lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
-    """Makes the bag directory where it does not exist, and locks it.
-
-    Raises:
-        RecorderError: another recorder has locked it, it cannot be written to, or it is to be
-            cleared and contains a home directory.
-    """
-    if clear:
-        refuse_homes(bag_dir)
-    make_bag_dir(bag_dir)
-    return BagDirLock.acquire(bag_dir)
 
 
 def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:

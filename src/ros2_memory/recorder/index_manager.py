@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from structlog.typing import FilteringBoundLogger
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.bag_table import TableChange
-    from ros2_memory.index.file_state import KnownFile
     from ros2_memory.retention.collect import GarbageCollector
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.storage.base import BagReader
@@ -77,7 +77,7 @@ class IndexManager:
         refresh_s: float,
         split_duration_s: float,
         collector: GarbageCollector | None = None,
-        known: Callable[[], Mapping[str, KnownFile]] | None = None,
+        known: Callable[[], Mapping[str, BagFile]] | None = None,
         include_active: bool = False,
         trusts_mtime: bool = True,
     ) -> None:

@@ -126,7 +126,7 @@ class RecordingSessions:
         try:
             new = self._launch(name, now)
         except RecorderError:
-            HandoverTransfer.withdraw(old)
+            HandoverTransfer.announce(old, None)
             raise
         orders = self._orders
         plan = HandoverPlan(now, subscribe_timeout_s=orders.subscribe_timeout_s)

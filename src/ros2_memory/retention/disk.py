@@ -73,12 +73,10 @@ class HomeDisk:
             self._recordings = frozenset(recordings)
         try:
             device = self._device_of(self._bag_dir)
-            if device != self._device and self._has_recordings():
+            is_other = device != self._device
+            if is_other and any((self._bag_dir / name).is_dir() for name in self._recordings):
                 self._device = device
         except OSError:
             return self.away
         self.away = device != self._device
         return self.away
-
-    def _has_recordings(self) -> bool:
-        return any((self._bag_dir / name).is_dir() for name in self._recordings)

@@ -43,7 +43,6 @@ OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
 COMPLETE_AFTER_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that has not changed for so long is complete."""
 _BLOCK: Final = 4096
-_WHOLE: Final = frozenset({FileState.CLOSED, FileState.EMPTY})
 
 
 class Deletable(Enum):
@@ -57,7 +56,9 @@ class Deletable(Enum):
     SAVED = auto()  # no; a file of a moment, which counts with the others there
 
 
-_OTHERS: Final = {
+_BY_STATE: Final = {
+    FileState.CLOSED: Deletable.YES,
+    FileState.EMPTY: Deletable.YES,
     FileState.INCOMPLETE: Deletable.IF_UNNAMED,
     FileState.DAMAGED: Deletable.DAMAGED,
     FileState.UNREAD: Deletable.UNREAD,
@@ -175,7 +176,11 @@ class Inventory:
 
     def _entry(self, path: str, classification: Classification, known: KnownBags) -> _Entry:
         bag = self._stored(path, classification, known)
-        deletable = Deletable.SAVED if path in known.saved else _deletable(classification, bag)
+        deletable = _BY_STATE.get(classification.state, Deletable.NO)
+        if path in known.saved:
+            deletable = Deletable.SAVED
+        elif deletable is Deletable.YES and is_carried(Path(path)):
+            deletable = Deletable.NO
         return _Entry(classification, known.files[path].stamp, bag, deletable)
 
     def _saved(self, known: KnownBags) -> tuple[StoredFile, ...]:
@@ -253,13 +258,6 @@ class Inventory:
             with suppress(OSError):
                 own += (self._root / folder).iterdir()
         return sum(map(size_of, own))
-
-
-def _deletable(classification: Classification, bag: StoredBag) -> Deletable:
-    state = classification.state
-    if state in _WHOLE:
-        return Deletable.NO if is_carried(Path(bag.path)) else Deletable.YES
-    return _OTHERS.get(state, Deletable.NO)
 
 
 def _on_disk(size: int) -> int:

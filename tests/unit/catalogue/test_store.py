@@ -16,6 +16,7 @@ from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue, relative
+from ros2_memory.core.model import BagFile, BagState
 from tests.support.bags import boolean, detections, odom, tf, transform
 from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
@@ -74,9 +75,10 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     [number] = again.find([KEY])
     assert number is not None
     path = str(tmp_path / KEY.path)
-    assert again.known_files(tmp_path) == {
-        path: (*KEY[1:], DIGEST.summary, DIGEST.summary.start, DIGEST.summary.end)
-    }
+    summary, (_, size, mtime_ns, sidecar_ns) = DIGEST.summary, KEY
+    content = (summary, summary.start, summary.end)
+    file = BagFile(path, size, mtime_ns, BagState.CLOSED, *content, sidecar_ns)
+    assert again.known_files(tmp_path) == {path: file}
     for held in DIGEST.topics:
         evidence = again.zone_maps(held.topic, [number])[number]
         assert set(evidence.numbers or ()) == set(held.zone_map.numbers or ())

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.index.file_state import KnownFile
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.clocks import FixedClock
 from tests.support.plain_text_bags import PlainReader, plain
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from ros2_memory.core.model import BagFile
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -28,7 +29,7 @@ class Start:
 
     def __init__(self, bag_dir: Path) -> None:
         self.bag_dir = bag_dir
-        self.known: dict[str, KnownFile] = {}
+        self.known: dict[str, BagFile] = {}
         for split in range(6):
             plain(bag_dir / "rec" / f"rec_{split}.mcap", [split * 10, split * 10 + 9])
         self.age()
@@ -41,12 +42,7 @@ class Start:
     def remember(self) -> None:
         """Knows from then on all bags as they are."""
         index, _ = self.index(knowing=False)
-        self.known = {
-            bag.file: KnownFile(
-                bag.size, bag.mtime_ns, bag.sidecar_ns, bag.summary, bag.start, bag.end
-            )
-            for bag in index.refresh().bags
-        }
+        self.known = {bag.file: bag for bag in index.refresh().bags}
 
     def index(self, *, knowing: bool = True) -> tuple[IndexManager, PlainReader]:
         """An index that has scanned nothing yet, and its reader."""

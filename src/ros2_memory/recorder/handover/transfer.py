@@ -63,25 +63,17 @@ class HandoverTransfer:
         self._closed_before = old.splits.closed_names
 
     @staticmethod
-    def announce(old: RecordingSession, new_name: str) -> None:
+    def announce(old: RecordingSession, new_name: str | None) -> None:
         """Writes the name of the new recording, which is about to be started, into the old sidecar.
 
-        Raises:
-            RecorderError: it cannot be written.
-        """
-        directory = old.splits.directory
-        write_handover(directory, intended(handover_to_change(directory), new_name))
-
-    @staticmethod
-    def withdraw(old: RecordingSession) -> None:
-        """Removes the name of the next recording from the old sidecar, if its directory exists.
+        None in place of the name withdraws it, if the old directory still exists.
 
         Raises:
             RecorderError: it cannot be written.
         """
         directory = old.splits.directory
-        if _is_there(directory):
-            write_handover(directory, intended(handover_to_change(directory), None))
+        if new_name is not None or _is_there(directory):
+            write_handover(directory, intended(handover_to_change(directory), new_name))
 
     @property
     def missing(self) -> frozenset[str]:
@@ -135,7 +127,7 @@ class HandoverTransfer:
         """
         if _is_there(self.new.splits.directory):
             write_handover(self.new.splits.directory, void(self.old.name))
-        self.withdraw(self.old)
+        self.announce(self.old, None)
 
     def add_late_splits(self) -> None:
         """Adds the splits that the old recorder opened after the cut, while it was ending.

@@ -63,9 +63,7 @@ class Child:
             that waits for a disk.
     """
 
-    def __init__(
-        self, process: subprocess.Popen[bytes], output: IO[bytes], patience: Patience
-    ) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], patience: Patience) -> None:
         self._process = process
         self._patience = patience
         self.pid = process.pid
@@ -75,7 +73,10 @@ class Child:
         self._ending_since: float | None = None
         self._sent: signal.Signals | None = None
         self._reader = threading.Thread(
-            target=_read, args=(output, self._lines), name=f"output of {process.pid}", daemon=True
+            target=_read,
+            args=(process.stdout, self._lines),
+            name=f"output of {process.pid}",
+            daemon=True,
         )
         self._reader.start()
 
@@ -102,16 +103,8 @@ class Child:
         if threading.current_thread() is not threading.main_thread():
             raise RecorderError("a recorder must be started from the main thread: it dies with it")
         launched = [sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid()), *argv]
-        readable, writable = os.pipe()
-        output = os.fdopen(readable, "rb")
-        try:
-            process = _spawn(launched, env, writable, writable, keep_open)
-        except RecorderError:
-            output.close()
-            raise
-        finally:
-            os.close(writable)
-        return cls(process, output, patience or Patience())
+        process = _spawn(launched, env, subprocess.PIPE, subprocess.STDOUT, keep_open)
+        return cls(process, patience or Patience())
 
     def take_lines(self) -> list[str]:
         """Returns what it printed since the last call, oldest first."""

@@ -97,7 +97,8 @@ def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
     env = {name: value for name, value in inherited.items() if name not in _OURS}
     for name in ("PATH", "PYTHONPATH"):
         if name in env:
-            kept = [part for part in env[name].split(os.pathsep) if not _below(part, prefixes)]
+            parts = env[name].split(os.pathsep)
+            kept = [part for part in parts if not any(map(Path(part).is_relative_to, prefixes))]
             env[name] = os.pathsep.join(kept)
     if not env.get("PYTHONPATH"):
         env.pop("PYTHONPATH", None)
@@ -147,7 +148,3 @@ def _failure(begun: str, status: int, errors: str) -> str:
         f"{name} failed with status {status}"
         f"{f' ({printed})' if printed else ''}; correct it, or recorder.setup_files"
     )
-
-
-def _below(entry: str, prefixes: Sequence[str]) -> bool:
-    return any(Path(entry).is_relative_to(prefix) for prefix in prefixes)
