@@ -27,6 +27,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby, takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -162,18 +164,13 @@ class StandstillDigest:
 
 
 class _Slot:
-    """The poses of one slot of time."""
+    """The poses of one slot of time; none is added once `mean` or `bends` were asked for."""
 
-    __slots__ = ("_bends", "_mean", "number", "poses")
-
-    def __init__(self, pose: TimedPosition) -> None:
-        self.number = pose.time // SLOT_NS
-        self.poses = [pose]
-        self._mean: Vector3 | None = None
-        self._bends: list[float] | None = None
+    def __init__(self, poses: list[TimedPosition]) -> None:
+        self.number = poses[0].time // SLOT_NS
+        self.poses = poses
 
     def add(self, pose: TimedPosition) -> None:
-        self._mean = self._bends = None
         if len(self.poses) < _MAX_IN_SLOT:
             self.poses.append(pose)
         else:
@@ -187,26 +184,20 @@ class _Slot:
     def last(self) -> Ns:
         return self.poses[-1].time
 
-    @property
+    @cached_property
     def mean(self) -> Vector3:
-        if self._mean is None:
-            x, y, z = zip(*(position for _, position in self.poses), strict=True)
-            many = len(self.poses)
-            self._mean = (math.fsum(x) / many, math.fsum(y) / many, math.fsum(z) / many)
-        return self._mean
+        x, y, z = zip(*(position for _, position in self.poses), strict=True)
+        many = len(self.poses)
+        return (math.fsum(x) / many, math.fsum(y) / many, math.fsum(z) / many)
 
-    @property
+    @cached_property
     def bends(self) -> list[float]:
         """Squares of the second differences of its positions (m2)."""
-        if self._bends is None:
-            places = [position for _, position in self.poses]
-            self._bends = [
-                (a - 2 * b + c) ** 2 + (d - 2 * e + f) ** 2 + (g - 2 * h + i) ** 2
-                for (a, d, g), (b, e, h), (c, f, i) in zip(
-                    places, places[1:], places[2:], strict=False
-                )
-            ]
-        return self._bends
+        places = [position for _, position in self.poses]
+        return [
+            (a - 2 * b + c) ** 2 + (d - 2 * e + f) ** 2 + (g - 2 * h + i) ** 2
+            for (a, d, g), (b, e, h), (c, f, i) in zip(places, places[1:], places[2:], strict=False)
+        ]
 
     def reach(self) -> float:
         """Returns how far (m) from its mean a pose may be and still be at the same place."""
@@ -242,30 +233,22 @@ def _follows(slot: _Slot, after: _Slot) -> bool:
 
 def _begin(before: _Slot | None, first: _Slot, inside: _Slot) -> Ns:
     """Returns the first pose of a chain's standstill; `inside` is the second slot of the chain."""
-    slots = [inside, first]
-    if before is not None and _follows(before, first):
-        slots.append(before)
-    return _last_there(
-        inside, (pose for slot in slots for pose in reversed(slot.poses)), inside.last
-    )
+    beyond = [before] if before is not None and _follows(before, first) else []
+    slots = (inside, first, *beyond)
+    return _last_there(inside, (pose for slot in slots for pose in reversed(slot.poses)))
 
 
 def _end(inside: _Slot, last: _Slot, after: _Slot | None) -> Ns:
     """Returns the last pose of a chain's standstill; `inside` is the last slot but one."""
-    slots = [inside, last]
-    if after is not None and _follows(last, after):
-        slots.append(after)
-    return _last_there(inside, (pose for slot in slots for pose in slot.poses), inside.first)
+    beyond = [after] if after is not None and _follows(last, after) else []
+    return _last_there(inside, _poses((inside, last, *beyond)))
 
 
-def _last_there(inside: _Slot, poses: Iterable[TimedPosition], until: Ns) -> Ns:
-    """Returns the last of the poses up to which all are at the place of a slot."""
-    place, reach = inside.mean, inside.reach()
-    for time, position in poses:
-        if math.dist(position, place) > reach:
-            break
-        until = time
-    return until
+def _last_there(inside: _Slot, poses: Iterable[TimedPosition]) -> Ns:
+    """Returns the last of the poses up to which all are at the place of the slot they begin in."""
+    reach = inside.reach()
+    *_, last = takewhile(lambda pose: math.dist(pose.position, inside.mean) <= reach, poses)
+    return last.time
 
 
 class _Chain:
@@ -424,7 +407,7 @@ class StandstillCollector:
             return
         if len(self._slots) > 1:
             self._take(self._slots[-1])
-        self._slots.append(_Slot(pose))
+        self._slots.append(_Slot([pose]))
         if len(self._slots) > 2 * _EDGE_SLOTS:
             del self._slots[_EDGE_SLOTS]
 
@@ -577,12 +560,11 @@ class StandstillBuilder:
         self._tail = None
 
     def _add(self, pose: TimedPosition) -> None:
-        if self._open is None:
-            self._open = _Slot(pose)
-        elif pose.time // SLOT_NS == self._open.number:
+        if self._open is not None and pose.time // SLOT_NS == self._open.number:
             self._open.add(pose)
-        else:
-            slot, self._open = self._open, _Slot(pose)
+            return
+        slot, self._open = self._open, _Slot([pose])
+        if slot is not None:
             self._close(self._linking.take(slot))
 
     def _close(self, chain: _Chain | None) -> None:
@@ -672,10 +654,5 @@ def _columns(packed: bytes, columns: int) -> NDArray[np.int64]:
 
 def _slots(poses: Iterable[TimedPosition]) -> list[_Slot]:
     """Returns the slots of poses in order."""
-    slots: list[_Slot] = []
-    for pose in poses:
-        if slots and slots[-1].number == pose.time // SLOT_NS:
-            slots[-1].add(pose)
-        else:
-            slots.append(_Slot(pose))
-    return slots
+    numbered = groupby(poses, key=lambda pose: pose.time // SLOT_NS)
+    return [_Slot([*inside]) for _, inside in numbered]
