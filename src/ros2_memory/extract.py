@@ -26,6 +26,7 @@ from ros2_memory.core.model import (
     Transform,
     Twist,
 )
+from ros2_memory.core.text import listed
 from ros2_memory.messages.conversions import (
     Metric,
     ValueKind,
@@ -420,14 +421,13 @@ def _plain(node: object) -> object:
 
 def _no_such_field(type_name: str, path: str, plan: _Plan, message: object) -> str:
     names = names_of(message)
-    more = len(names) - _LISTED_NAMES
-    listed = ", ".join(names[:_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
+    known = listed(names, at_most=_LISTED_NAMES)
     if not plan.fields:
-        there = f"its fields are: {listed}" if listed else "it has no fields"
+        there = f"its fields are: {known}" if names else "it has no fields"
         return f"{type_name} has no field {path!r}; {there}"
     return (
         f"{type_name} has no field {path!r}; its fields are: {', '.join(plan.fields)}; "
-        f"or give a full path in the message, which begins with one of: {listed}"
+        f"or give a full path in the message, which begins with one of: {known}"
     )
 
 

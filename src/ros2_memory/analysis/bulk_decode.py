@@ -169,19 +169,15 @@ class _Marked:
         marks: tuple[float, int],
     ) -> None:
         payload = bytearray(record.payload)
-        self._doubles = {offset: marks[0] + n for n, offset in enumerate(layout.doubles)}
-        singles = {
-            offset: marks[0] + n for n, offset in enumerate(layout.singles, len(layout.doubles))
-        }
-        times = {offset: marks[1] + n for n, offset in enumerate(layout.times)}
-        for offset, mark in self._doubles.items():
-            struct.pack_into("<d", payload, offset, mark)
-        for offset, mark in singles.items():
-            struct.pack_into("<f", payload, offset, mark)
-        for offset, second in times.items():
+        self.offset_of: dict[float, int] = {}
+        self.time_of: dict[float, int] = {}
+        for mark, offset in enumerate((*layout.doubles, *layout.singles)):
+            number_format = "<d" if offset in layout.doubles else "<f"
+            struct.pack_into(number_format, payload, offset, marks[0] + mark)
+            self.offset_of[marks[0] + mark] = offset
+        for second, offset in enumerate(layout.times, marks[1]):
             struct.pack_into("<iI", payload, offset, second, 0)
-        self.offset_of = {mark: offset for offset, mark in (self._doubles | singles).items()}
-        self.time_of = {float(second): offset for offset, second in times.items()}
+            self.time_of[float(second)] = offset
         type_name = record.channel.type
         message = reader.decode(record._replace(payload=bytes(payload)))
         self.value = extractor.exact(message, type_name)
@@ -193,8 +189,9 @@ class _Marked:
         """Returns the offset of the pose's quaternion; None where it has no orientation."""
         if self.pose is None or self.pose.orientation is None:
             return None
-        for offset in self._doubles:
-            x, y, z, w = (self._doubles.get(offset + 8 * part, math.nan) for part in range(4))
+        mark_at = {offset: mark for mark, offset in self.offset_of.items()}
+        for offset in mark_at:
+            x, y, z, w = (mark_at.get(offset + 8 * part, math.nan) for part in range(4))
             if unit((x, y, z, w)) == self.pose.orientation:
                 return offset
         raise _NoTemplateError

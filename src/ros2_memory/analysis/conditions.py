@@ -88,7 +88,7 @@ class Contains:
 
         Elements of nested lists count too, fields of objects in them do not.
         """
-        return any(self.equal.is_leaf(each) for each in elements(target))
+        return any(self.equal.is_leaf(each) for each in leaves(target, in_objects=False))
 
     def can_match(self, zone_map: ZoneMap) -> bool:
         """Returns whether some value of this zone map may contain the needle."""
@@ -381,27 +381,20 @@ def _step(node: JsonValue, segment: str) -> Iterator[JsonValue]:
                 yield from _step(element, segment)
 
 
-def leaves(value: JsonValue) -> Iterator[JsonValue]:
-    """Yields everything at any depth that is neither a list nor an object."""
+def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
+    """Yields everything at any depth that is neither a list nor an object.
+
+    Without `in_objects` nothing inside an object: the value itself, or the elements of a list.
+    """
     waiting = [value]
     while waiting:
         node = waiting.pop()
         if isinstance(node, dict):
-            waiting.extend(node.values())
+            if in_objects:
+                waiting.extend(node.values())
         elif isinstance(node, list):
             waiting.extend(node)
         else:
-            yield node
-
-
-def elements(value: JsonValue) -> Iterator[JsonValue]:
-    """Yields the value itself or, where it is a list, its elements and those of the lists in it."""
-    waiting = [value]
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, list):
-            waiting.extend(node)
-        elif not isinstance(node, dict):
             yield node
 
 
@@ -494,7 +487,9 @@ def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> s
     test = condition.test
     if not isinstance(test, Contains) or not test.is_number:
         return None
-    if condition.field is not None and any(True for each in targets for _ in elements(each)):
+    if condition.field is not None and any(
+        True for each in targets for _ in leaves(each, in_objects=False)
+    ):
         return None
     kinds = {type(leaf) for each in targets for leaf in leaves(each)}
     if str in kinds or not kinds & {int, float}:

@@ -25,12 +25,12 @@ class Approach(NamedTuple):
 class Unread(NamedTuple):
     """A time in which every pose is within the radius, and none is closer than the bound.
 
-    `here` is the point (m) in the frame of these poses.
+    `target` is the point (m) in the frame of these poses.
     """
 
     bound: Approach
     window: TimeWindow
-    here: tuple[float, float]
+    target: tuple[float, float]
 
 
 @dataclass(slots=True)

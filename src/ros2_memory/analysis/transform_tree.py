@@ -36,6 +36,7 @@ from ros2_memory.core.geometry import (
     normalised,
 )
 from ros2_memory.core.model import StampedTransform, Transform
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_S,
@@ -144,18 +145,6 @@ class _History:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Walk:
-    """The path up from one frame: the frames passed, and the pose of the first in each.
-
-    `stopped` is why the path ends where it does, if that is for lack of a transform.
-    """
-
-    frames: list[str]
-    poses: list[Transform]
-    stopped: NoDataError | None = None
-
-
 class FrameGraph:
     """Looks up transforms between any two frames that the given transforms connect.
 
@@ -189,15 +178,14 @@ class FrameGraph:
         for name in (target, source):
             if name not in self._neighbours:
                 raise self._unknown(name)
-        up, down = self._walk(source, time), self._walk(target, time)
-        target_in = dict(zip(down.frames, down.poses, strict=True))
-        for frame, pose in zip(up.frames, up.poses, strict=True):
+        source_in, source_end = self._walk(source, time)
+        target_in, target_end = self._walk(target, time)
+        for frame, pose in source_in.items():
             if frame in target_in:
                 return compose(invert(target_in[frame]), pose)
-        if source in self._tree_of(target):
-            stopped = up.stopped or down.stopped
-            if stopped is not None:
-                raise stopped
+        lack = source_end or target_end
+        if lack is not None and source in self._tree_of(target):
+            raise lack
         raise self._not_connected(target, source, time)
 
     def _histories_of(self, transforms: Iterable[StampedTransform]) -> dict[str, _History]:
@@ -221,21 +209,23 @@ class FrameGraph:
             history.times, history.edges = list(newest), list(newest.values())
         return histories
 
-    def _walk(self, frame: str, time: Ns) -> _Walk:
-        """Walks up to the root, the first edge without a transform at `time`, or into a loop."""
-        walk = _Walk([frame], [IDENTITY])
-        seen = {frame}
-        while (history := self._histories.get(walk.frames[-1])) is not None:
+    def _walk(self, frame: str, time: Ns) -> tuple[dict[str, Transform], NoDataError | None]:
+        """Walks up to the root, the first edge without a transform at `time`, or into a loop.
+
+        Returns the pose of the frame in each frame passed, itself first, and which transform is
+        lacking, if that is why the walk ends.
+        """
+        poses = {frame: IDENTITY}
+        while (history := self._histories.get(frame)) is not None:
             try:
                 edge = history.at(time)
             except NoDataError as nothing:
-                return _Walk(walk.frames, walk.poses, nothing)
-            if edge.parent in seen:
+                return poses, nothing
+            if edge.parent in poses:
                 break
-            seen.add(edge.parent)
-            walk.frames.append(edge.parent)
-            walk.poses.append(compose(edge.transform, walk.poses[-1]))
-        return walk
+            poses[edge.parent] = compose(edge.transform, poses[frame])
+            frame = edge.parent
+        return poses, None
 
     def _tree_of(self, frame: str) -> set[str]:
         """Returns every frame that some transform, at whatever time, connects to this one."""
@@ -260,20 +250,21 @@ class FrameGraph:
         if not known:
             detail = f"frame '{name}' is not known: no transform at all is recorded there"
         elif similar := _similar(name, known):
-            detail = f"no transform names a frame '{name}'; similar: {_listed(similar)}"
+            detail = f"no transform names a frame '{name}'; similar: {listed(similar)}"
         else:
-            detail = f"no transform names a frame '{name}'; there are: {_listed(known)}"
+            names = listed(known, at_most=_MAX_NAMES)
+            detail = f"no transform names a frame '{name}'; there are: {names}"
         return NoDataError(NoDataReason.FRAME_UNKNOWN, detail)
 
     def _not_connected(self, target: str, source: str, time: Ns) -> NoDataError:
         roots = self._root_of(target), self._root_of(source)
         tree = self._tree_of(target)
         if source not in tree:
-            others = sorted(self._tree_of(source) - {source})
+            others = listed(sorted(self._tree_of(source) - {source}), at_most=_MAX_NAMES)
             detail = (
                 f"frames '{target}' and '{source}' are not connected: '{target}' stands in the"
                 f" tree of '{roots[0]}', '{source}' in that of '{roots[1]}', and no recorded"
-                f" transform joins them; connected to '{source}': {_listed(others)}"
+                f" transform joins them; connected to '{source}': {others}"
             )
         else:
             detail = (
@@ -316,11 +307,6 @@ def _similar(name: str, known: Sequence[str]) -> list[str]:
     parts = [frame for fold, frame in by_fold.items() if asked and (asked in fold or fold in asked)]
     alike = difflib.get_close_matches(asked, list(by_fold), n=3, cutoff=0.6)
     return list(dict.fromkeys([*parts[:3], *(by_fold[fold] for fold in alike)]))[:3]
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return ", ".join(names[:_MAX_NAMES]) + more
 
 
 def _unix(moment: Ns) -> str:

@@ -99,8 +99,10 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     )
 
 
-def encode_topic_events(events: TopicEvents) -> bytes:
-    """Encodes the events of a topic."""
+def encode_topic_events(events: TopicEvents | None) -> bytes:
+    """Encodes the events of a topic; None, where no message can be decoded, as no bytes."""
+    if events is None:
+        return b""
     counts = (events.first, events.last, events.left_out, events.undecodable, events.beyond)
     # Paths, and times relative to the first message, are equal in many bags: _decode_text caches
     # them.
@@ -121,12 +123,14 @@ def encode_topic_events(events: TopicEvents) -> bytes:
     return _EVENTS.pack(*counts, len(rows)) + rows + shorter
 
 
-def decode_topic_events(packed: bytes) -> TopicEvents:
-    """Decodes the events of a topic.
+def decode_topic_events(packed: bytes) -> TopicEvents | None:
+    """Decodes the events of a topic; None where no message can be decoded.
 
     Raises:
         ValueError: the bytes are not those of any.
     """
+    if not packed:
+        return None
     try:
         first, last, left_out, undecodable, beyond, size = _EVENTS.unpack_from(packed)
         end = _EVENTS.size + size

@@ -147,14 +147,12 @@ def _insert_events(
     quiet = TopicEvents(min(first for first, _ in spans), max(last for _, last in spans))
     if topic.standstills is None and topic.events == quiet:
         return
-    # Empty bytes stand for messages that cannot be decoded, NULL for messages without an event.
-    events = b"" if topic.events is None else encode_topic_events(topic.events)
     connection.execute(
         "INSERT INTO tales VALUES (?, ?, ?, ?)",
         (
             *key,
             None if topic.standstills is None else encode_standstills(topic.standstills),
-            None if topic.events == quiet else events,
+            None if topic.events == quiet else encode_topic_events(topic.events),
         ),
     )
 
@@ -164,20 +162,13 @@ def _insert_record(
 ) -> None:
     """Inserts a message; equal channels and payloads of all bags are stored once."""
     channel, schema = record.channel, record.channel.schema
-    described = repr((channel.topic, channel.encoding, channel.latched, schema)).encode()
-    channel_hash = hashlib.sha256(described).digest()
+    described_schema = (schema.name, schema.encoding, schema.text)
+    described = (channel.topic, channel.encoding, channel.latched, *described_schema)
+    channel_hash = hashlib.sha256(repr(described).encode()).digest()
     connection.execute(
         "INSERT OR IGNORE INTO channels (hash, topic, encoding, latched, schema_name,"
         " schema_encoding, schema_text) VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (
-            channel_hash,
-            channel.topic,
-            channel.encoding,
-            channel.latched,
-            schema.name,
-            schema.encoding,
-            schema.text,
-        ),
+        (channel_hash, *described),
     )
     payload_hash = hashlib.sha256(record.payload).digest()
     connection.execute(

@@ -184,10 +184,7 @@ class Catalogue(CatalogueDatabase):
         """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""
 
         def decode(row: sqlite3.Row) -> TopicEvents | None:
-            packed: object = row[1]
-            if packed == QUIET:
-                return NO_EVENTS
-            return decode_topic_events(row[1]) if packed else None
+            return NO_EVENTS if row[1] == QUIET else decode_topic_events(row[1])
 
         return self._of_topic(topic, numbers, EVENTS, decode)
 

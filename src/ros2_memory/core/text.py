@@ -27,10 +27,10 @@ def counted(count: int, singular: str, plural: str | None = None) -> str:
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
 
 
-def listed(names: Sequence[str], count: int | None = None) -> str:
+def listed(names: Sequence[str], count: int | None = None, at_most: int = MAX_NAMED) -> str:
     """Returns the first few names, and how many more there are of `count` (or of the names)."""
-    more = (len(names) if count is None else count) - min(len(names), MAX_NAMED)
-    shown = ", ".join(shortened(name) for name in names[:MAX_NAMED])
+    more = (len(names) if count is None else count) - min(len(names), at_most)
+    shown = ", ".join(shortened(name) for name in names[:at_most])
     return f"{shown} and {more} more" if more > 0 else shown
 
 

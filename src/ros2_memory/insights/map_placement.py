@@ -139,13 +139,10 @@ class MapPlacement:
         if graph is None:
             if session not in self._moving:
                 self._moving[session] = moving_in(self.view, self._window, session)
-            static = static_at(known.static, known.changes[number - 1] if number else MIN_NS)
-            graph = graph_of(self.view, static, self._moving[session])
+            valid_then = static_at(known.static, known.changes[number - 1] if number else MIN_NS)
+            graph = graph_of(self.view, valid_then, self._moving[session])
             self._graphs[session, number] = graph
-        try:
-            return graph.lookup(self.frame_id, self.pose_frame, time)
-        except NoDataError:
-            return None
+        return self._placed_by(graph, time)
 
     def _session(self, recording: Path, at: Ns) -> Session:
         """Returns the session that places a recording's poses; a note says if none does."""
@@ -156,19 +153,18 @@ class MapPlacement:
 
     def _transforms_of(self, session: Session) -> _SessionTransforms:
         if session not in self._known:
-            static = static_transforms(self.view, session)
-            changes = _change_times(static)
+            recorded = static_transforms(self.view, session)
+            changes = _change_times(recorded)
             fixed = None
-            children = {each.child.lstrip("/") for each in static}
+            children = {each.child.lstrip("/") for each in recorded}
             if not changes and children.isdisjoint(children_moving(self.view, session)):
-                fixed = self._fixed_pose(static)
-            self._known[session] = _SessionTransforms(static, changes, fixed)
+                fixed = self._placed_by(graph_of(self.view, static_at(recorded, MIN_NS), ()), 0)
+            self._known[session] = _SessionTransforms(recorded, changes, fixed)
         return self._known[session]
 
-    def _fixed_pose(self, static: list[StampedTransform]) -> Transform | None:
-        graph = graph_of(self.view, static_at(static, MIN_NS), ())
+    def _placed_by(self, graph: FrameGraph, time: Ns) -> Transform | None:
         try:
-            return graph.lookup(self.frame_id, self.pose_frame, 0)
+            return graph.lookup(self.frame_id, self.pose_frame, time)
         except NoDataError:
             return None
 
@@ -204,11 +200,11 @@ def _map_or_own(view: View, topic: str, own: MapPlacement) -> MapPlacement:
     return own
 
 
-def _change_times(static: list[StampedTransform]) -> list[Ns]:
-    """Returns the log times at which a child's static transform differs from the one before."""
+def _change_times(transforms: list[StampedTransform]) -> list[Ns]:
+    """Returns the log times at which a child's transform differs from the one before."""
     changes: dict[Ns, None] = {}
     latest: dict[str, StampedTransform] = {}
-    for each in static:
+    for each in transforms:
         child = each.child.lstrip("/")
         before = latest.get(child)
         if before is not None and not (

@@ -294,8 +294,8 @@ _STANDSTILLS: Final = DigestKind(
 _TOPIC_EVENTS: Final = DigestKind(
     "story",
     look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
-    encode=lambda events: b"" if events is None else encode_topic_events(events),
-    decode=lambda stored: decode_topic_events(stored) if stored else None,
+    encode=encode_topic_events,
+    decode=decode_topic_events,
 )
 
 

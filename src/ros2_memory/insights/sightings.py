@@ -354,8 +354,8 @@ def _spot(
             )
         except NoDataError:
             continue
-        place = transform_point(found_transform.transform, thing.place)
-        return LabelledPlace(thing.label, place, target)
+        in_target = transform_point(found_transform.transform, thing.place)
+        return LabelledPlace(thing.label, in_target, target)
     return LabelledPlace(thing.label, thing.place, thing.frame_id)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import listed
 from ros2_memory.history.view import open_view
 from ros2_memory.results import TypeFields
 
@@ -30,11 +31,9 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     topics = [topic for topic, types in timeline.types.items() if type_name in types]
     if not topics:
         known = sorted(set(chain.from_iterable(timeline.types.values())))
-        more = f" and {len(known) - MAX_FIELDS} more" if len(known) > MAX_FIELDS else ""
-        names = ", ".join(known[:MAX_FIELDS]) + more
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
-            f"no topic was recorded under this type; there are {names}",
+            f"no topic was recorded under this type; there are {listed(known, at_most=MAX_FIELDS)}",
         )
     failure = ""
     for topic in topics:

@@ -6,6 +6,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import Ns, unix_rounded_up
 from ros2_memory.tools.reply_json import (
     metres,
@@ -86,9 +87,7 @@ def _topic_range(answer: results.TopicRange) -> JsonObject:
     values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
     if not zeros:
         return reply
-    more = len(zeros) - _MAX_ZEROS_NAMED
-    named = ", ".join(zeros[:_MAX_ZEROS_NAMED]) + (f" and {more} more" if more > 0 else "")
-    note = f"0 in every sample and left out: {named}"
+    note = f"0 in every sample and left out: {listed(zeros, at_most=_MAX_ZEROS_NAMED)}"
     return _range_of(answer, values, (*answer.notes, note))
 
 
