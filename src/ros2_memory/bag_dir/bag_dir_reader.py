@@ -3,8 +3,8 @@
 - It stays inside the directory. The index follows no symbolic link, but seconds pass between a scan
   and a query, in which a folder can be replaced by a link to somewhere else. `O_NOFOLLOW` protects
   the last part of a path; this reader checks the parts before it.
-- It leaves out messages that count in another recording, as `handover.json` says, so that no count,
-  sum, search or answer has to consider them.
+- It leaves out messages that count in another recording, by `handover.json`, so that no count, sum,
+  search or answer has to consider them.
 - It finds the messages of a bag under another hard link when retention deleted the path that the
   index knows, and a saved moment still has the bag.
 """
@@ -54,9 +54,9 @@ class BagDirReader(BagReader):
     publish time and payload.
 
     Args:
-        reader: the adapter; it alone decides what a message says.
+        reader: the adapter, which alone decodes messages.
         bag_dir: the directory that paths must lie in, which may be a link itself; None allows any.
-        every_message: ignores `handover.json`, for whoever compares counts with the files.
+        every_message: ignores `handover.json`, to compare counts with the files.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> 
     So a full disk leaves all of them as they are; a power cut may come between two of them.
 
     Raises:
-        OSError: a text cannot be written; `filename` says which.
+        OSError: a text cannot be written; `filename` is its file.
     """
     temporary = {target: target.with_name(f".{target.name}.tmp") for target in texts}
     try:

@@ -4,8 +4,8 @@ The bags of a saved moment are hard links: retention may delete the paths where 
 and their content stays until somebody deletes the moment's folder. Each lies under the path that it
 has in the bag directory (`rec_A/rec_A_7.mcap`), beside a link to the sidecar of its recording.
 
-`moment.json` exists before the first link. While bags of the moment are still being written it says
-`pending`, so that a restarted recorder goes on with it.
+`moment.json` exists before the first link. While bags of the moment are still being written it is
+marked as `pending`, so that a restarted recorder continues it.
 """
 
 from __future__ import annotations

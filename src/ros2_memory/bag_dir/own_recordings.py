@@ -492,8 +492,7 @@ def _find_former(
         for each in sorted(bag_dir.iterdir())
         if has_own_name(each.name) and not each.is_symlink() and each.is_dir()
     ]
-    heartbeat = read_heartbeat(bag_dir).heartbeat
-    named = set(heartbeat.recordings if heartbeat else ())
+    named = set(read_heartbeat(bag_dir).recordings)
     for folder in folders:
         handover = read_handover(folder).handover
         named.update(name for name in (handover.previous, handover.next) if name)

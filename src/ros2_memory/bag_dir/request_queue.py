@@ -7,7 +7,7 @@ The programs share only a directory, and this is the one folder of it that the s
     <number>.answer    its outcome; the server reads and deletes it
 
 A request that is still `.json` can be withdrawn, and then has no effect. The recorder trusts
-nothing here: whoever can write here can only ask.
+nothing here: a program that can write here can only make requests.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class KnownBags:
         counted: classifications of files, of all forms and links of a bag only the one that counts.
         hidden: files whose other form counts.
         files: notes on all files.
-        named: recordings that the recorder last said it is writing.
+        named: recordings that the last heartbeat names as being written.
         now: when the directory was scanned.
         saved: all files in saved moments, whether they count or not.
     """
@@ -75,7 +75,7 @@ class BagTable:
         reader: reads its bags.
         known: returns, by path, closed files that were read earlier: they are not read again while
             they are unchanged.
-        keep_all_notes: keeps notes on every file, for who needs more than answers.
+        keep_all_notes: keeps notes on every file, which retention needs.
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class BagTable:
         """Returns a file's classification; None where there is none, or another file counts.
 
         While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
-        complete ones that have been there for three splits are two files that somebody keeps.
+        complete ones that have been there for three splits are kept on purpose: both count.
         """
         self._hidden.discard(path)
         if any(self._is_same_file(path, link) for link in self._links.before(path)):

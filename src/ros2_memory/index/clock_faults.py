@@ -9,7 +9,7 @@ them; but the span of the memory, and its newest moment, are computed without th
     set back by a day    of the two sides the one with fewer bags around it; of equals the earlier
 
 A clock that is set back by less is listed and leaves the span as it is. Where this machine's own
-clock is before 2017 nothing can be said about the future.
+clock is before 2017 no date counts as being in the future.
 """
 
 from __future__ import annotations

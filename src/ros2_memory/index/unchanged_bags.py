@@ -65,8 +65,8 @@ class UnchangedBags:
             file = known.get(path)
             if (
                 file is not None
-                and (file.size, file.mtime_ns, file.sidecar_ns) == (size, mtime_ns, sidecar_ns)
-                and mtime_ns < last
+                and file.mtime_ns == mtime_ns < last
+                and (file.size, file.sidecar_ns) == (size, sidecar_ns)
                 and path.endswith(kinds)
                 and (schema := file.summary.schema).complete
                 and schema.topics

@@ -39,8 +39,9 @@ _REPORTED: Final = frozenset(LineKind) - {LineKind.OTHER, LineKind.FLUSHING}
 class SplitChanges:
     """What changed since the last observation.
 
-    `closed` and `empty` name splits. `gone`: the directory existed and does not any more. `faults`
-    are sentences about what could not be read.
+    `closed` names splits, and `empty` all those that are empty though a newer one was seen. `gone`:
+    the directory existed and does not any more. `faults` are sentences about what could not be
+    read.
     """
 
     closed: tuple[str, ...] = ()
@@ -54,7 +55,6 @@ class _Split:
     first_seen_s: float
     size: int = 0
     closed: bool = False
-    reported_empty: bool = False
 
 
 @dataclass(slots=True)
@@ -94,7 +94,9 @@ class Splits:
         newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
         overdue = now_s - newest_s >= EMPTY_GRACE_S
         empty = tuple(
-            name for name, size in sizes.items() if overdue and self._is_empty(name, size, newest_s)
+            name
+            for name, size in sizes.items()
+            if overdue and not size and newest_s > self._files[name].first_seen_s
         )
         return SplitChanges(closed, empty, faults=tuple(faults))
 
@@ -144,14 +146,6 @@ class Splits:
         self.messages += summary.count
         return True
 
-    def _is_empty(self, name: str, size: int, newest_s: float) -> bool:
-        """Whether the split is empty though a newer one was seen; True only once."""
-        split = self._files[name]
-        if size > 0 or split.reported_empty or newest_s <= split.first_seen_s:
-            return False
-        split.reported_empty = True
-        return True
-
 
 class SessionState(Enum):
     """How far a session has come."""
@@ -167,6 +161,7 @@ class RecordingSession:
 
     Attributes:
         state: how far it has come.
+        is_listed: whether it is in the list of the recorder's own recordings, as a directory.
         has_recorded: whether its child ever reported that it records.
         subscribed: the topics that its child reported as subscribed, which does not mean that it
             receives any of them.
@@ -178,6 +173,7 @@ class RecordingSession:
         self.splits = splits
         self.began = began
         self.state = SessionState.STARTING
+        self.is_listed = False
         self.has_recorded = False
         self.subscribed: set[str] = set()
         self._reported: set[tuple[str | None, str]] = set()

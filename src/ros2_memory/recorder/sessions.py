@@ -88,7 +88,6 @@ class RecordingSessions:
         self._start_child = start_child
         self._announce = announce
         self._own = own
-        self._unlisted: set[str] = set()
         self._reader = reader
         self._events = events
         self.current: RecordingSession | None = None
@@ -225,7 +224,6 @@ class RecordingSessions:
             child = self._start_child(name, directory)
         except OSError as error:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
-        self._unlisted.add(name)
         self._events.info("recorder_started", recording=name, pid=child.pid)
         session = RecordingSession(name, child, Splits(directory, self._reader), now)
         self.running += (session,)
@@ -233,11 +231,10 @@ class RecordingSessions:
 
     def _list_own(self, session: RecordingSession) -> None:
         """Lists the directory that the child made, as soon as it exists; a fault is retried."""
-        if session.name not in self._unlisted:
+        if session.is_listed:
             return
         try:
-            if self._own.complete(session.name):
-                self._unlisted.remove(session.name)
+            session.is_listed = self._own.complete(session.name)
         except RecorderError as error:
             self._events.fail_once("recording_not_listed", session.name, str(error))
         else:
@@ -251,8 +248,9 @@ class RecordingSessions:
         if changes.closed:
             self._flush(session, session.splits.directory, changes.closed)
         for name in changes.empty:
-            sentence = f"{session.name}/{name} is empty although a newer split was begun"
-            self._events.fail("split_empty", sentence, recording=session.name)
+            file = f"{session.name}/{name}"
+            sentence = f"{file} is empty although a newer split was begun"
+            self._events.fail_once("split_empty", file, sentence, recording=session.name)
         for fault in changes.faults:
             self._events.fail_once("unreadable", session.name, fault, recording=session.name)
         return changes
@@ -318,7 +316,6 @@ class RecordingSessions:
             with self._reported(session):
                 completed.add_late_splits()
         self._list_own(session)
-        self._unlisted.discard(session.name)
         splits = session.splits
         if remove_if_empty(splits.directory):
             self._events.info("recording_empty", recording=session.name)

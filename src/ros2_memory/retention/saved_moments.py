@@ -1,7 +1,7 @@
 """Saves the moments that were asked for: hard links in `moments/`, which retention never deletes.
 
 The recorder alone does this, while nothing is deleted. A crash between two steps does no harm: a
-moment's file says that it is pending before its first link is made, and a request stays in the
+moment's file marks it as pending before its first link is made, and a request stays in the
 queue until it is answered. What a moment needs and whether it fits are decided by pure functions.
 """
 
@@ -228,7 +228,7 @@ class MomentKeeper:
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
-            return "nothing was recorded then: ask for a time of which the memory knows"
+            return "nothing was recorded then: ask for a time at which something was"
         files = filter(None, map(_file_of, need.bags))
         expected = self._open_bytes(request, snapshot) if need.waits else 0
         return no_room(files, _all_files(stored), self._share, expected)

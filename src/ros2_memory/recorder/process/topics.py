@@ -120,7 +120,7 @@ def _fault_of_part(part: str) -> str | None:
     if not part:
         return "a part of the name is empty: no // and no / at the end"
     if "**" in part:
-        return "a glob's * stands inside one part of the name; write one * for each part"
+        return "a glob's * matches inside one part of the name; write one * for each part"
     if part[0].isdigit():
         return f"the part {part!r} begins with a digit"
     if not _PART.fullmatch(part):
