@@ -126,7 +126,7 @@ def _refusal(path: Path, pid: int | None, host: str | None, *, alive: bool) -> s
 
 
 def _write_holder(descriptor: int) -> None:
-    """Writes into the file who holds the lock; a full disk must not stop a recorder, which frees space."""
+    """Writes into the file who holds the lock; a full disk must not stop a recorder."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
     with suppress(OSError):
         # Written in place and truncated afterwards: existing blocks need no free space.
