@@ -44,7 +44,7 @@ def questions(count: int) -> list[tuple[str, dict[str, Any]]]:
 
 @dataclass
 class Running:
-    """One run of the server: from its start until it is killed or told to end."""
+    """One run of the server: from its start until it is killed or stopped."""
 
     process: subprocess.Popen[bytes]
     port: int
@@ -167,7 +167,7 @@ def load(running: Running, count: int, clients: int = 3) -> Iterator[list[str]]:
 
 
 def children_of(bag_dir: Path) -> list[int]:
-    """Processes that index this bag directory, whoever started them."""
+    """All processes that index this bag directory."""
     found = []
     for entry in Path("/proc").iterdir():
         with suppress(OSError, ValueError):

@@ -48,8 +48,8 @@ def test_a_catalogue_that_cannot_be_written_costs_no_answer_and_is_filled_later(
         assert "cannot be used" in (trouble_of(filler) or "")
         assert filler.progress().waiting == 3
         assert told(memory, count=6) == right
-    said = [each["event"] for each in logs if each["event"].startswith("catalogue")]
-    assert said == ["catalogue_failed"]
+    events = [each["event"] for each in logs if each["event"].startswith("catalogue")]
+    assert events == ["catalogue_failed"]
     filler.look_after(thorough=True)
     fill_up(filler)
     assert (trouble_of(filler), filler.progress().waiting) == (None, 0)

@@ -33,10 +33,10 @@ FAULTS = (
 
 def is_ready(running: Running, bags: int) -> bool:
     """Whether nothing is amiss, and all these bags are in the catalogue."""
-    told = running.health()
-    catalogue = told.get("catalogue", {})
+    reply = running.health()
+    catalogue = reply.get("catalogue", {})
     known = (catalogue.get("bags"), catalogue.get("waiting"), catalogue.get("state"))
-    return told["status"] == "ok" and known == (bags, 0, "ready")
+    return reply["status"] == "ok" and known == (bags, 0, "ready")
 
 
 def holds(path: Path, bags: int) -> bool:
@@ -55,9 +55,9 @@ def recovers(running: Running, bags: int) -> None:
 
 def problem(running: Running, words: str) -> str | None:
     """The problem in `/health` that has these words."""
-    told = running.health()
-    assert told["status"] == ("degraded" if told.get("problems") else "ok")
-    return next((each for each in told.get("problems", ()) if words in each), None)
+    reply = running.health()
+    assert reply["status"] == ("degraded" if reply.get("problems") else "ok")
+    return next((each for each in reply.get("problems", ()) if words in each), None)
 
 
 def says(running: Running, words: str) -> None:
@@ -66,8 +66,8 @@ def says(running: Running, words: str) -> None:
 
 def is_honest(answer: str) -> bool:
     """Whether an answer claims nothing of what cannot be seen: it is an error, or has a note."""
-    told: Any = json.loads(answer)
-    return isinstance(told, dict) and ("error" in told or bool(told.get("notes")))
+    reply: Any = json.loads(answer)
+    return isinstance(reply, dict) and ("error" in reply or bool(reply.get("notes")))
 
 
 def test_the_catalogue_comes_back_whatever_becomes_of_it(tmp_path: Path) -> None:

@@ -209,6 +209,6 @@ def _is(stated: object, times: list[int]) -> bool:
 
 
 def _excused(notes: object) -> bool:
-    """Whether it is told that messages are missing."""
+    """Whether the reply reports that messages are missing."""
     told = notes if isinstance(notes, (list, tuple)) else ()
     return any(excuse in str(note) for note in told for excuse in _EXCUSES)

@@ -251,7 +251,7 @@ def _look_for(memory: Memory, bag: Path, told: Any, verdict: Verdict, *, trapped
 
 
 def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) -> None:
-    """Whether a bag of which nothing is said holds what its summary states."""
+    """Whether a bag without a note contains what its summary states."""
     summary = memory.reader.summarize(bag)
     if notes or not summary.complete or summary.count > _MOST_COUNTED:
         return

@@ -59,11 +59,11 @@ def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
     """The memory is asked about 20 s ago where the judge holds it to 10 s ago."""
     position = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
     falsified = replace(position, arguments={"seconds_ago": 20})
-    said: list[str] = []
-    code = run_demo(DemoOptions(once=True, port=0), said.append, [position, falsified])
+    output: list[str] = []
+    code = run_demo(DemoOptions(once=True, port=0), output.append, [position, falsified])
     assert code == 1
-    assert "WRONG: expected the message of" in said[2]
-    assert said[-1] == "1 of 2 answers are right."
+    assert "WRONG: expected the message of" in output[2]
+    assert output[-1] == "1 of 2 answers are right."
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -139,11 +139,11 @@ def test_it_says_so_when_its_server_is_ended_by_someone_else(scratch: Path) -> N
             _invited(demo)
             children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
             os.kill(int(children[0]), signal.SIGKILL)
-            _, said = demo.communicate(timeout=PATIENCE_S)
+            _, output = demo.communicate(timeout=PATIENCE_S)
         finally:
             demo.kill()
     assert demo.returncode == 2
-    assert "the server ended by itself" in said
+    assert "the server ended by itself" in output
     assert list(scratch.iterdir()) == []
 
 

@@ -122,12 +122,12 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
             asker.join()
     finally:
         stop.touch()
-        said, _ = house.communicate(timeout=60)
-    assert house.returncode == 0, said
-    assert "Traceback" not in said
+        output, _ = house.communicate(timeout=60)
+    assert house.returncode == 0, output
+    assert "Traceback" not in output
     # That the budget is not held is right: moments are more than it.
     wrong = [
-        line for line in said.splitlines() if "[error" in line and "budget_not_held" not in line
+        line for line in output.splitlines() if "[error" in line and "budget_not_held" not in line
     ]
     assert wrong == []
     assert robot.faults == []

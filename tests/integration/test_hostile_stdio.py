@@ -55,8 +55,8 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
         process.kill()
         process.wait()
         process.stdout.close()
-    told = json.loads(replies[-1]["result"]["content"][0]["text"])
-    assert told["earliest"] == T0_S
+    reply = json.loads(replies[-1]["result"]["content"][0]["text"])
+    assert reply["earliest"] == T0_S
     errors = [
         json.loads(each["result"]["content"][0]["text"])["error"]
         for each in replies[1:-1]

@@ -55,7 +55,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 @pytest.fixture(scope="module")
 def robot(site: Machine) -> Iterator[Robot]:
-    """It drives all the time, whoever records it."""
+    """It drives all the time, recorded or not."""
     with publishing_robot(site.env, site.folder / "truth.json", "--hz", f"{HZ:g}") as robot:
         yield robot
 
@@ -106,8 +106,8 @@ def fill_up(site: Machine, robot: Robot, folder: Path, least: str) -> None:
             recorder.wait_for("split_closed")
             full_at = time.time_ns()
             ballast = fill(disk)
-            told = wait_for_error(recorder)
-            assert moment_of(told) - full_at <= TOLD_WITHIN_S * NS_PER_S
+            status = wait_for_error(recorder)
+            assert moment_of(status) - full_at <= TOLD_WITHIN_S * NS_PER_S
             if guarded:
                 recorder.wait_for("recording_paused")
             ballast.unlink()
@@ -223,14 +223,14 @@ def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
         recorder.wait_for("split_closed")
 
         def is_told() -> bool:
-            told = beat(recorder)
-            return set(told.silent) == {"/bumper", "/clock"} and told.last_error is not None
+            status = beat(recorder)
+            return set(status.silent) == {"/bumper", "/clock"} and status.last_error is not None
 
         wait_for(is_told, "it in the heartbeat", alive=recorder.process)
-        told = beat(recorder)
+        status = beat(recorder)
         health = json.loads(served.get("/health")[1])["recorder"]
         recorder.stop()
-    assert set(told.subscribed) == HEARD
+    assert set(status.subscribed) == HEARD
     assert health["silent_topics"] == ["/bumper", "/clock"]
     assert health["last_error"]
 

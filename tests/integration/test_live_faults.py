@@ -89,7 +89,7 @@ def campaign(campaigns: Campaigns, request: pytest.FixtureRequest) -> Campaign:
 
 def test_every_closed_split_answers_right_after_the_kill(campaign: Campaign) -> None:
     for fault in campaign.faults:
-        counts = {row["topic"]: row["count"] for row in fault.topics.told if "topic" in row}
+        counts = {row["topic"]: row["count"] for row in fault.topics.reply if "topic" in row}
         assert counts.get("/odom", 0) >= len(fault.closed)
         assert place_is_right(fault), fault
 

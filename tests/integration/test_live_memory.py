@@ -156,14 +156,14 @@ def _look_back(drive: Drive, served: dict[str, Served]) -> None:
     """Asks about the whole drive after its end."""
     found = ("find_last_match", {"topic": "/vision/*/scene_objects"} | _contains("scissors"))
     for name in ("rotating", "killed"):
-        drive.scissors[name] = answers(served[name], found)[0].told
+        drive.scissors[name] = answers(served[name], found)[0].reply
     span = {"start": drive.t0 / NS_PER_S - 60, "end": drive.t0 / NS_PER_S + 600, "max_samples": 2}
     totals = [("get_topic_in_range", {"topic": topic, **span}) for topic in RECORDED_TOPICS]
     listed, *counted = answers(served["rotating"], ("list_recorded_topics", {}), *totals)
-    drive.topics = listed.told
-    drive.totals = {reply.told["topic"]: reply.told["total"] for reply in counted}
+    drive.topics = listed.reply
+    drive.totals = {reply.reply["topic"]: reply.reply["total"] for reply in counted}
     for name, server in served.items():
-        drive.after[name] = answers(server, ("data_time_range", {}))[0].told
+        drive.after[name] = answers(server, ("data_time_range", {}))[0].reply
 
 
 def _contains(label: str) -> dict[str, Any]:
@@ -183,7 +183,7 @@ def _cups(drive: Drive, server: Served) -> tuple[int, Any, int]:
     before = by_the_bags()
     found = ("find_last_match", {"topic": "/vision/*/scene_objects"} | _contains("cup"))
     (reply,) = answers(server, found)
-    return before, reply.told, by_the_bags()
+    return before, reply.reply, by_the_bags()
 
 
 def _stamp(told: Any) -> int:

@@ -299,9 +299,9 @@ def killed_at_a_rotation(step: str, site: Site) -> None:
 
 def test_a_second_recorder_is_refused_and_told_who_records(site: Site) -> None:
     daemon = site.run()
-    code, said = site.refusal()
+    code, message = site.refusal()
     assert code == 1
-    assert f"process {daemon.process.pid} on {socket.gethostname()}" in said
+    assert f"process {daemon.process.pid} on {socket.gethostname()}" in message
     assert daemon.stop() == 0
 
 
@@ -415,9 +415,9 @@ def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:
 class TestRefusals:
     def test_an_invalid_topic_stops_it_with_exit_code_2(self, site: Site) -> None:
         site.topics.write_text("topics: [odom]\n")
-        code, said = site.refusal()
+        code, message = site.refusal()
         assert code == 2
-        assert f"{site.topics}: 'odom' cannot be recorded" in said
+        assert f"{site.topics}: 'odom' cannot be recorded" in message
 
     def test_a_refused_list_of_topics_touches_no_bag(self, site: Site) -> None:
         old = site.bag_dir / "rec_old" / "rec_old_0.mcap"
@@ -431,16 +431,16 @@ class TestRefusals:
     def test_nothing_is_written_where_clearing_is_refused(self, site: Site) -> None:
         site.bag_dir.mkdir(parents=True)
         site.env["HOME"] = str(site.bag_dir)
-        code, said = site.refusal("recording.clear_on_startup=true")
+        code, message = site.refusal("recording.clear_on_startup=true")
         assert code == 1
-        assert "refuses to delete bags" in said
+        assert "refuses to delete bags" in message
         assert list(site.bag_dir.iterdir()) == []
 
     def test_without_a_ros2_it_says_what_to_do(self, site: Site) -> None:
         site.env["PATH"] = os.defpath
-        code, said = site.refusal()
+        code, message = site.refusal()
         assert code == 1
-        assert "recorder.setup_files" in said
+        assert "recorder.setup_files" in message
 
     @pytest.mark.parametrize("cause", ["no ros2", "no setup file"])
     def test_a_start_that_is_refused_clears_nothing(self, site: Site, cause: str) -> None:
@@ -452,20 +452,20 @@ class TestRefusals:
             site.env["PATH"] = os.defpath
         else:
             setup = [f"recorder.setup_files=[{site.folder}/none.bash]"]
-        code, said = site.refusal("recording.clear_on_startup=true", *setup)
-        assert (code, "recorder.setup_files" in said) == (1, True)
+        code, message = site.refusal("recording.clear_on_startup=true", *setup)
+        assert (code, "recorder.setup_files" in message) == (1, True)
         assert old.read_bytes() == b"old"
 
     def test_a_setup_file_that_is_missing_is_named(self, site: Site) -> None:
-        code, said = site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
+        code, message = site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
         assert code == 1
-        assert f"{site.folder}/none.bash is not there" in said
+        assert f"{site.folder}/none.bash is not there" in message
 
     def test_a_bag_directory_that_cannot_be_made_is_named(self, site: Site) -> None:
         site.bag_dir.write_text("a file")
-        code, said = site.refusal()
+        code, message = site.refusal()
         assert code == 1
-        assert "recording.bag_dir" in said
+        assert "recording.bag_dir" in message
 
     def test_a_refused_start_leaves_nothing_running_and_no_lock(self, site: Site) -> None:
         site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
@@ -477,9 +477,9 @@ def test_recorder_none_says_so_and_touches_nothing(site: Site) -> None:
     (site.bag_dir / "rec_0.mcap").write_bytes(b"kept")
     site.bag_dir.chmod(0o555)
     before = {path: path.stat() for path in site.folder.rglob("*") if path.name != "log0"}
-    code, said = site.refusal("recorder=none", "recording.clear_on_startup=true")
+    code, message = site.refusal("recorder=none", "recording.clear_on_startup=true")
     assert code == 0
-    assert "recorder=none" in said
+    assert "recorder=none" in message
     after = {path: path.stat() for path in site.folder.rglob("*") if path.name != "log0"}
     assert {p: s.st_mtime_ns for p, s in after.items() if p != site.folder} == {
         p: s.st_mtime_ns for p, s in before.items() if p != site.folder

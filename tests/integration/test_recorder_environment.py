@@ -85,17 +85,17 @@ class TestSetupFiles:
         assert [each["text"] for each in logs] == ["WAY=wrong", "oh"]
 
     def test_one_that_is_missing_is_named(self, tmp_path: Path) -> None:
-        said = refusal(setup_file(tmp_path, "a.bash", ""), tmp_path / "gone.bash")
-        assert str(tmp_path / "gone.bash") in said
-        assert "recorder.setup_files" in said
+        message = refusal(setup_file(tmp_path, "a.bash", ""), tmp_path / "gone.bash")
+        assert str(tmp_path / "gone.bash") in message
+        assert "recorder.setup_files" in message
 
     @pytest.mark.parametrize("end", ["exit 3", "return 3", "( exit 3 )"])
     def test_one_that_fails_is_named_with_what_it_said(self, tmp_path: Path, end: str) -> None:
         good = setup_file(tmp_path, "good.bash", "export A=1\n")
         bad = setup_file(tmp_path, "bad.bash", f"echo 'no such distribution' >&2\n{end}\n")
-        said = refusal(good, bad, good)
-        assert said.startswith(f"{bad} failed with status 3")
-        assert "no such distribution" in said
+        message = refusal(good, bad, good)
+        assert message.startswith(f"{bad} failed with status 3")
+        assert "no such distribution" in message
 
     def test_one_that_exits_as_if_all_were_well_is_named(self, tmp_path: Path) -> None:
         bad = setup_file(tmp_path, "bad.bash", "exit 0\n")

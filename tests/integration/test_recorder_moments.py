@@ -58,10 +58,10 @@ def originals(held: StoredMoment, bag_dir: Path) -> list[Path]:
     return [bag_dir / path.relative_to(held.folder) for path in held.folder.rglob("*.mcap")]
 
 
-def about(served: Served, told: dict[str, Any]) -> list[Any]:
+def about(served: Served, reply: dict[str, Any]) -> list[Any]:
     """Answers about the time of a moment; without the notes, which say what is open just now."""
-    given = {"topic": "/odom", "start": told["start"], "end": told["end"], "max_samples": 7}
-    middle = (told["start"] + told["end"]) / 2
+    given = {"topic": "/odom", "start": reply["start"], "end": reply["end"], "max_samples": 7}
+    middle = (reply["start"] + reply["end"]) / 2
     answers = [
         answer(served, "get_topic_in_range", **given),
         answer(served, "get_topic_at_time", topic="/tf", timestamp=middle),
@@ -82,16 +82,16 @@ def moment_outlives_its_bags(site: Site) -> None:
 def keeps_a_moment(site: Site, served: Served) -> None:
     daemon = site.run("retention.max_age_h=0.003")
     daemon.wait_for("split_closed", 4)
-    told = answer(served, "remember_moment", label="Küche", seconds_before=2.5)
-    assert (told["label"], told["bags"] >= 2) == ("Küche", True), told
+    reply = answer(served, "remember_moment", label="Küche", seconds_before=2.5)
+    assert (reply["label"], reply["bags"] >= 2) == ("Küche", True), reply
     held = complete(site.bag_dir)
-    assert (held.folder.name, held.moment.missing) == (told["moment"], ())
+    assert (held.folder.name, held.moment.missing) == (reply["moment"], ())
     recorded = originals(held, site.bag_dir)
     assert len(recorded) >= 3
-    before = until(lambda: _whole(about(served, told)))
+    before = until(lambda: _whole(about(served, reply)))
     assert all(path.exists() for path in recorded)
     until(lambda: not any(path.exists() for path in recorded))
-    assert about(served, told) == before
+    assert about(served, reply) == before
     [listed] = answer(served, "list_moments")["moments"]
     assert (listed["label"], listed["bags"], listed["complete"]) == ("Küche", len(recorded), True)
     assert list((site.bag_dir / REQUESTS_FOLDER).iterdir()) == []
@@ -103,8 +103,8 @@ def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_
 ) -> None:
     daemon = site.run()
     daemon.wait_for("split_closed", 2)
-    told = answer(served, "remember_moment", label="fall", seconds_before=1, seconds_after=1)
-    assert told["pending"], told
+    reply = answer(served, "remember_moment", label="fall", seconds_before=1, seconds_after=1)
+    assert reply["pending"], reply
     child = daemon.child
     daemon.stop(signal.SIGKILL)
     until(lambda: not Path(f"/proc/{child}").exists())
@@ -114,7 +114,7 @@ def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_
     held = complete(site.bag_dir)
     assert held.moment.missing == ()
     kept = {path.name for path in held.folder.rglob("*.mcap")}
-    assert len(kept) == len(held.files) > told["bags"]
+    assert len(kept) == len(held.files) > reply["bags"]
     assert following.stop() == 0
 
 

@@ -113,14 +113,14 @@ class Asker:
             raise
 
     def _is_docked(self, moment: AtTime) -> None:
-        told = queries.topic_value(self.memory, Call(), DOCK, moment)
-        if (told.sample.time, told.sample.value) != (self.begin + 1, {"value": "home"}):
-            self.wrong.append(f"{told.sample}")
+        reply = queries.topic_value(self.memory, Call(), DOCK, moment)
+        if (reply.sample.time, reply.sample.value) != (self.begin + 1, {"value": "home"}):
+            self.wrong.append(f"{reply.sample}")
 
     def _is_placed(self, moment: AtTime) -> None:
-        told = queries.transform(self.memory, Call(), "base_link", "laser", moment)
-        if told.transform.translation != (0.1, 0.0, 0.2):
-            self.wrong.append(f"{told.transform}")
+        reply = queries.transform(self.memory, Call(), "base_link", "laser", moment)
+        if reply.transform.translation != (0.1, 0.0, 0.2):
+            self.wrong.append(f"{reply.transform}")
 
 
 @contextmanager
@@ -137,8 +137,8 @@ def writer(bag_dir: Path, begin: int) -> Iterator[Callable[[], dict[str, Any]]]:
         def step() -> dict[str, Any]:
             orders.write("\n")
             orders.flush()
-            told: dict[str, Any] = json.loads(answers.readline())
-            return told
+            reply: dict[str, Any] = json.loads(answers.readline())
+            return reply
 
         try:
             yield step

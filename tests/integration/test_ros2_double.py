@@ -362,5 +362,5 @@ def fields(schema: Schema) -> list[str]:
 
 
 def spoken(log: str) -> list[str]:
-    """What was said, without times."""
+    """The log lines, without times."""
     return re.findall(r"\[[A-Z]+\] \[[0-9.]+\] (\[\w+\]: .*)", log)

@@ -139,8 +139,8 @@ async def test_each_call_is_one_span_at_the_collector(bag_dir: Path, tmp_path: P
             for scope in resource.scope_spans:
                 for span in scope.spans:
                     if span.name.startswith("tools/call"):
-                        told = {each.key: each.value.string_value for each in span.attributes}
-                        outcomes.append((span.name, told.get("ros2_memory.outcome")))
+                        output = {each.key: each.value.string_value for each in span.attributes}
+                        outcomes.append((span.name, output.get("ros2_memory.outcome")))
     assert outcomes == [
         ("tools/call data_time_range", "ok"),
         ("tools/call data_time_range", "ok"),
@@ -173,16 +173,16 @@ def test_without_the_extra_it_does_not_start_and_says_what_to_install(
         f"import sys; sys.modules[{absent!r}] = None; from ros2_memory.server import main; "
         f"sys.exit(main(['server.transport=sse', 'server.port=0', '{key}=true']))"
     )
-    told = refused(bag_dir, [sys.executable, "-c", hidden])
-    assert len(told.splitlines()) == 2
-    assert f"{key}: true needs the optional part of this package" in told
-    assert "pip install 'ros2-memory[observability]'" in told
+    output = refused(bag_dir, [sys.executable, "-c", hidden])
+    assert len(output.splitlines()) == 2
+    assert f"{key}: true needs the optional part of this package" in output
+    assert "pip install 'ros2-memory[observability]'" in output
 
 
 def test_there_are_no_metrics_over_stdio(bag_dir: Path) -> None:
-    told = refused(bag_dir, command("server.metrics=true"))
-    assert len(told.splitlines()) == 2
-    assert "server.transport=sse" in told
+    output = refused(bag_dir, command("server.metrics=true"))
+    assert len(output.splitlines()) == 2
+    assert "server.transport=sse" in output
 
 
 def test_a_server_that_is_not_observed_loads_nothing_for_it(bag_dir: Path) -> None:

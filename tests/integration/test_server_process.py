@@ -43,7 +43,7 @@ def command(*overrides: str) -> list[str]:
 
 
 def environment(bag_dir: Path, **more: str) -> dict[str, str]:
-    """This test's environment, without settings of whoever runs it."""
+    """This test's environment, without the user's own settings."""
     ours = ("MEMORY_", "MCP_", "ROS_")
     kept = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
     return kept | {"MEMORY_BAG_DIR": str(bag_dir)} | more
@@ -125,8 +125,8 @@ async def test_several_clients_are_served_at_once(bag_dir: Path, tmp_path: Path)
     async def one(transport: Any) -> None:
         async with Client(transport) as client:
             for _ in range(5):
-                told, _ = await ask(client, "get_position_seconds_ago", {"seconds_ago": 1})
-                assert told["topic"] == "/odom"
+                reply, _ = await ask(client, "get_position_seconds_ago", {"seconds_ago": 1})
+                assert reply["topic"] == "/odom"
 
     with serving(bag_dir, tmp_path / "log") as served:
         async with anyio.create_task_group() as tasks:
@@ -141,8 +141,8 @@ async def test_an_empty_memory_answers_and_a_directory_that_comes_later_is_found
     later = tmp_path / "later"
     with serving(later, tmp_path / "log", "reader.index_refresh_s=0.05") as served:
         async with Client(served.url("/mcp")) as client:
-            told, is_error = await ask(client, "get_position_seconds_ago", {"seconds_ago": 1})
-            assert (told["error"], told["reason"], is_error) == ("no_data", "empty_memory", False)
+            reply, is_error = await ask(client, "get_position_seconds_ago", {"seconds_ago": 1})
+            assert (reply["error"], reply["reason"], is_error) == ("no_data", "empty_memory", False)
             span, _ = await ask(client, "data_time_range", {})
             assert span["earliest"] is None
             bag_dir.rename(later)
@@ -158,17 +158,17 @@ async def test_a_question_that_takes_too_long_is_answered_with_timeout(
 ) -> None:
     with serving(bag_dir, tmp_path / "log", "server.call_timeout_s=0.000001") as served:
         async with Client(served.url("/mcp")) as client:
-            told, is_error = await ask(client, "trajectory_summary", {"start": 0, "end": 2e9})
-            assert (told["error"], is_error) == ("timeout", True)
+            reply, is_error = await ask(client, "trajectory_summary", {"start": 0, "end": 2e9})
+            assert (reply["error"], is_error) == ("timeout", True)
             assert len((await client.list_tools()).tools) >= 17
 
 
 def test_health_tells_what_there_is(bag_dir: Path, tmp_path: Path) -> None:
     with serving(bag_dir, tmp_path / "log") as served:
         status, body = served.get("/health")
-        told = json.loads(body)
-        assert (status, told["status"], told["bags"]) == (200, "ok", 1)
-        assert told["earliest"] == T0_S
+        reply = json.loads(body)
+        assert (status, reply["status"], reply["bags"]) == (200, "ok", 1)
+        assert reply["earliest"] == T0_S
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -240,12 +240,12 @@ def test_a_refused_configuration_is_told_on_stderr(bag_dir: Path) -> None:
     assert "server.prot" in ended.stderr
 
 
-@pytest.mark.parametrize(("option", "told"), [("--version", "0.1"), ("--help", "key=value")])
-def test_version_and_help_are_printed(bag_dir: Path, option: str, told: str) -> None:
+@pytest.mark.parametrize(("option", "reply"), [("--version", "0.1"), ("--help", "key=value")])
+def test_version_and_help_are_printed(bag_dir: Path, option: str, reply: str) -> None:
     ended = subprocess.run(
         command(option), env=environment(bag_dir), capture_output=True, text=True, check=True
     )
-    assert told in ended.stdout
+    assert reply in ended.stdout
 
 
 def stdio_process(bag_dir: Path) -> subprocess.Popen[bytes]:

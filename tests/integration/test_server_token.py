@@ -60,10 +60,10 @@ def status(served: Served, method: str, path: str, headers: dict[str, str]) -> t
 def test_it_does_not_start_without_a_token_where_others_can_reach_it(
     bag_dir: Path, host: str
 ) -> None:
-    told = refused(bag_dir, MCP_HOST=host)
-    assert "MEMORY_API_TOKEN: missing" in told
-    assert repr(host) in told
-    assert len(told.splitlines()) == 2
+    output = refused(bag_dir, MCP_HOST=host)
+    assert "MEMORY_API_TOKEN: missing" in output
+    assert repr(host) in output
+    assert len(output.splitlines()) == 2
 
 
 def test_it_does_not_start_with_one_that_is_empty_or_cannot_be_used(
@@ -71,12 +71,12 @@ def test_it_does_not_start_with_one_that_is_empty_or_cannot_be_used(
 ) -> None:
     assert "missing" in refused(bag_dir, MCP_HOST=EVERYWHERE, MEMORY_API_TOKEN="")
     for token in ("sEcReT7", "sEcReT7 sEcReT7 sEcReT7"):
-        told = refused(bag_dir, MEMORY_API_TOKEN=token)
-        assert told.splitlines()[1].startswith("MEMORY_API_TOKEN: the API token")
-        assert "sEcReT7" not in told
+        output = refused(bag_dir, MEMORY_API_TOKEN=token)
+        assert output.splitlines()[1].startswith("MEMORY_API_TOKEN: the API token")
+        assert "sEcReT7" not in output
     (tmp_path / "token").touch()
-    told = refused(bag_dir, MEMORY_API_TOKEN_FILE=str(tmp_path / "token"))
-    assert "is empty" in told
+    output = refused(bag_dir, MEMORY_API_TOKEN_FILE=str(tmp_path / "token"))
+    assert "is empty" in output
 
 
 async def test_whoever_shows_the_token_is_answered_and_nobody_else(
@@ -102,10 +102,10 @@ async def test_whoever_shows_the_token_is_answered_and_nobody_else(
         assert json.loads(served.get("/health")[1]) == {"status": "ok"}
         assert json.loads(status(served, "GET", "/health", SHOWN)[1])["bags"] == 1
         _leave_traces(served)
-    told = (tmp_path / "log").read_text(encoding="utf-8")
-    assert '"event": "tool_call"' in told
+    output = (tmp_path / "log").read_text(encoding="utf-8")
+    assert '"event": "tool_call"' in output
     for secret in (GOOD, GOOD[:-2], "in-a-query"):
-        assert secret not in told
+        assert secret not in output
 
 
 def _leave_traces(served: Served) -> None:
@@ -127,5 +127,5 @@ async def test_a_token_is_demanded_on_the_loopback_address_too(
         async with Client(
             sse_client(served.url("/sse"), headers=SHOWN, timeout=PATIENCE_S)
         ) as client:
-            told, _ = await ask(client, "data_time_range", {})
-            assert told["bags"] == 1
+            output, _ = await ask(client, "data_time_range", {})
+            assert output["bags"] == 1

@@ -1,4 +1,4 @@
-"""The conformance run: what it is said to ask is what it asks, of versions that stay."""
+"""The conformance run asks what its description lists, of pinned versions."""
 
 from __future__ import annotations
 

@@ -58,11 +58,11 @@ def test_a_unit_is_exposed_by_less_than_its_limit(unit: Path, limit: float) -> N
 
 @BOTH
 def test_a_unit_is_ready_when_it_says_so_and_is_started_again_when_it_fails(unit: Path) -> None:
-    said = settings_of(unit)
-    assert (said["Type"], said["NotifyAccess"]) == (["notify"], ["main"])
-    assert said["Restart"] == ["on-failure"]
-    assert said["MemoryMax"]
-    assert said["TasksMax"]
+    settings = settings_of(unit)
+    assert (settings["Type"], settings["NotifyAccess"]) == (["notify"], ["main"])
+    assert settings["Restart"] == ["on-failure"]
+    assert settings["MemoryMax"]
+    assert settings["TasksMax"]
 
 
 @BOTH
@@ -73,25 +73,25 @@ def test_a_unit_takes_the_settings_of_the_machine_over_its_own(unit: Path) -> No
 
 
 def test_the_recorder_is_watched_and_tried_for_ever() -> None:
-    said = settings_of(RECORDER)
-    assert said["WatchdogSec"] == ["90"]
-    assert said["StartLimitIntervalSec"] == ["0"]
+    settings = settings_of(RECORDER)
+    assert settings["WatchdogSec"] == ["90"]
+    assert settings["StartLimitIntervalSec"] == ["0"]
 
 
 def test_the_recorder_ends_its_child_in_order() -> None:
-    said = settings_of(RECORDER)
-    assert said["KillMode"] == ["control-group"]
+    settings = settings_of(RECORDER)
+    assert settings["KillMode"] == ["control-group"]
     # A child's patience is 15 s, and two of them are ended at once.
-    assert int(said["TimeoutStopSec"][0]) >= 30
+    assert int(settings["TimeoutStopSec"][0]) >= 30
 
 
 def test_the_recorder_writes_where_it_records_and_nowhere_else() -> None:
-    said = settings_of(RECORDER)
-    assert said["ReadWritePaths"] == ["/var/lib/ros2-memory/bags"]
-    assert f"MEMORY_BAG_DIR={said['ReadWritePaths'][0]}" in said["Environment"]
+    settings = settings_of(RECORDER)
+    assert settings["ReadWritePaths"] == ["/var/lib/ros2-memory/bags"]
+    assert f"MEMORY_BAG_DIR={settings['ReadWritePaths'][0]}" in settings["Environment"]
     # Not below the mount point of a disk that is not there.
-    assert said["RequiresMountsFor"] == said["ReadWritePaths"]
-    assert said["MemoryDenyWriteExecute"] == ["yes"]
+    assert settings["RequiresMountsFor"] == settings["ReadWritePaths"]
+    assert settings["MemoryDenyWriteExecute"] == ["yes"]
 
 
 def test_the_recorder_hears_publishers_of_another_user() -> None:
@@ -114,25 +114,25 @@ def test_the_environment_file_is_understood_by_the_program() -> None:
 
 
 def test_the_server_listens_on_the_loopback_address_unless_it_is_given_a_token() -> None:
-    said = settings_of(SERVER)
-    assert said["IPAddressAllow"] == ["localhost"]
-    assert not [line for line in said["Environment"] if "MCP_HOST" in line]
+    settings = settings_of(SERVER)
+    assert settings["IPAddressAllow"] == ["localhost"]
+    assert not [line for line in settings["Environment"] if "MCP_HOST" in line]
     # The lines that are commented out are to be right when they are not.
     (credential,) = re.findall(r"^#LoadCredential=(\w+):", SERVER.read_text(), re.MULTILINE)
     assert credential == CREDENTIAL
 
 
 def test_the_server_writes_where_it_asks_the_recorder_and_nowhere_else_in_the_bags() -> None:
-    said = settings_of(SERVER)
+    settings = settings_of(SERVER)
     asks = f"/var/lib/ros2-memory/bags/{REQUESTS_FOLDER}"
-    assert said["ReadWritePaths"] == [f"-{asks}"]
-    assert said["ReadOnlyPaths"] == ["-/var/lib/ros2-memory"]
+    assert settings["ReadWritePaths"] == [f"-{asks}"]
+    assert settings["ReadOnlyPaths"] == ["-/var/lib/ros2-memory"]
     assert f"d {asks} " in (DEPLOY / "ros2-memory.tmpfiles.conf").read_text()
 
 
 def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() -> None:
-    told = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
-    (service,) = told["services"].values()
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    (service,) = compose["services"].values()
     assert service["ports"] == ["127.0.0.1:9203:9203"]
     assert service["environment"]["MEMORY_API_TOKEN"].startswith("${MEMORY_API_TOKEN:?")
     assert all(volume.endswith(":ro") for volume in service["volumes"])

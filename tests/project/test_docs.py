@@ -38,10 +38,10 @@ def keys(cls: type, prefix: str = "") -> Iterator[str]:
 @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
 def test_readme_names_every_tool_with_all_its_arguments(tool: Tool) -> None:
     row = next(line for line in README.splitlines() if line.startswith(f"| `{tool.name}` |"))
-    told = set(re.findall(r"(\w+)[?=,`]", row.split("|")[2]))
+    documented = set(re.findall(r"(\w+)[?=,`]", row.split("|")[2]))
     properties = tool.schema.get("properties")
     assert isinstance(properties, dict)
-    assert set(properties) - told == set()
+    assert set(properties) - documented == set()
 
 
 def test_readme_lists_no_tool_that_does_not_exist() -> None:
@@ -65,10 +65,10 @@ def test_readme_names_every_environment_variable(variable: str) -> None:
 
 def test_every_key_that_readme_tells_of_exists() -> None:
     sections = {each.name for each in fields(Settings)}
-    told = set(re.findall(r"`(\w+\.\w+)(?:=[^`]*)?`", README))
+    documented = set(re.findall(r"`(\w+\.\w+)(?:=[^`]*)?`", README))
     known = set(keys(Settings)) | {f"recorder.{each.name}" for each in fields(Ros2BagNode)}
     known.add("recorder.json")  # a file
-    assert {key for key in told if key.split(".")[0] in sections} <= known
+    assert {key for key in documented if key.split(".")[0] in sections} <= known
 
 
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])

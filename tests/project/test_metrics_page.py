@@ -1,4 +1,4 @@
-"""docs/how-to/metrics.md speaks of figures that the server shows, and of what its spans say."""
+"""docs/how-to/metrics.md lists the figures that the server shows, and what its spans contain."""
 
 from __future__ import annotations
 

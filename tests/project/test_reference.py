@@ -71,27 +71,29 @@ def test_every_call_that_is_shown_has_an_answer(name: str, answers: Mapping[str,
 
 
 def test_every_key_stands_there_with_its_default_and_what_it_may_hold() -> None:
-    told = reference.told_configuration()
-    named = set(re.findall(r"^\| `([\w.]+)` \|", told, re.MULTILINE))
+    documented = reference.told_configuration()
+    named = set(re.findall(r"^\| `([\w.]+)` \|", documented, re.MULTILINE))
     assert named == reference.configured_keys(), "each key in config/ has a comment on its line"
-    compare("configuration", "keys", told)
+    compare("configuration", "keys", documented)
 
 
 def test_every_preset_and_every_variable_stands_there() -> None:
     presets = {path.stem for path in (ROOT / "config" / "deployment").glob("*.yaml")}
-    told = set(re.findall(r"^\| `(\w+)` \|", page("configuration"), re.MULTILINE))
-    assert presets <= told
+    documented = set(re.findall(r"^\| `(\w+)` \|", page("configuration"), re.MULTILINE))
+    assert presets <= documented
     example = (ROOT / ".env.example").read_text(encoding="utf-8")
     for variable in re.findall(r"^([A-Z_]+)=", example, re.MULTILINE):
         assert f"`{variable}`" in page("configuration")
 
 
 def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
-    told = dict(re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE))
-    assert set(told) == {TOPICS.uri, STATUS.uri, SCHEMA.uri_template}
+    documented = dict(
+        re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE)
+    )
+    assert set(documented) == {TOPICS.uri, STATUS.uri, SCHEMA.uri_template}
     assert set(TOOLS_OF_RESOURCES) == {TOPICS.uri, STATUS.uri}
     for uri, tool in TOOLS_OF_RESOURCES.items():
-        assert told[uri] == f"`{tool}`"
+        assert documented[uri] == f"`{tool}`"
 
 
 def test_every_command_stands_there_with_its_exit_codes() -> None:

@@ -40,7 +40,7 @@ UNCHANGED = {
     # Mozilla's list of certificates, which its licence has nobody open more than.
     "certifi": "MPL-2.0",
 }
-"""What comes along with an extra: whoever ships it unchanged owes its notice alone."""
+"""What comes along with an extra: shipped unchanged, it requires its notice alone."""
 READ_BY_HAND = {
     # Its LICENSE file: any licence that the Open Source Initiative approved, at one's choice.
     "apsw": "any-OSI",

@@ -54,7 +54,7 @@ class Layout:
 
 
 class _BlockFile:
-    """A file that gets whole blocks as they fill up. A full disk is not told to anyone."""
+    """A file that gets whole blocks as they fill up. A full disk is not reported."""
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)

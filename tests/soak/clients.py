@@ -49,7 +49,7 @@ async def all_tools(port: int) -> Seen:
 
 
 async def many_calls_at_once(port: int) -> Seen:
-    """64 calls by one client; all are answered, or told that they cannot be."""
+    """64 calls by one client; all are answered, or refused with a reason."""
     seen: Seen = Counter()
 
     async def one(client: Client, number: int) -> None:
@@ -118,10 +118,10 @@ async def hostile(port: int) -> Seen:
         if "result" in reply:
             assert len(told) < 4_000, (body[:80], len(told))
             [block] = reply["result"]["content"]
-            said = json.loads(block["text"])
-            assert said["error"] in {"invalid_arguments", "no_data"}, (body[:200], said)
-            assert wrong in said["detail"], (body[:200], said)
-            seen[said["error"]] += 1
+            payload = json.loads(block["text"])
+            assert payload["error"] in {"invalid_arguments", "no_data"}, (body[:200], payload)
+            assert wrong in payload["detail"], (body[:200], payload)
+            seen[payload["error"]] += 1
         else:
             # The protocol's own errors repeat the name of a method.
             assert len(told) < len(body) + 1_000, (body[:80], len(told))
@@ -241,7 +241,7 @@ async def coming_and_going(port: int) -> Seen:
 
 
 async def slow_loris(port: int) -> Seen:
-    """Requests that never come to their end, some of them byte by byte: each is told so."""
+    """Requests that never end, some of them sent byte by byte: each gets an error reply."""
     seen: Seen = Counter()
 
     async def one(*parts: bytes, trickle: bytes = b"") -> None:
@@ -265,7 +265,7 @@ async def slow_loris(port: int) -> Seen:
 
 
 async def endless_bodies(port: int) -> Seen:
-    """Bodies that come byte by byte: each is told so."""
+    """Bodies sent byte by byte: each gets an error reply."""
     seen: Seen = Counter()
 
     async def one() -> None:
@@ -283,7 +283,7 @@ async def endless_bodies(port: int) -> Seen:
 
 
 async def crowd(port: int) -> Seen:
-    """More connections than are served: those too many are told so, the others answered."""
+    """More connections than are served: those too many get an error reply, the others an answer."""
     seen: Seen = Counter()
     here = asyncio.Event()
 

@@ -80,7 +80,7 @@ async def posted(port: int, body: bytes, path: str = "/mcp", more: str = "") -> 
 
 
 async def asked(port: int, name: str, arguments: str) -> Any:
-    """What a tool told: the JSON of its one text, or the JSON-RPC error."""
+    """What a tool returned: the JSON of its one text, or the JSON-RPC error."""
     status, body = await posted(port, call(name, arguments))
     reply = json.loads(body)
     if "error" in reply:

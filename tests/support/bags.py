@@ -262,7 +262,7 @@ def odom(
     topic: str = "/odom",
     log_time: int | None = None,
 ) -> Msg:
-    """An Odometry message (odom -> base_link) stamped and, unless said, logged at `ns`."""
+    """An Odometry message (odom -> base_link) stamped and, by default, logged at `ns`."""
     covariance = np.zeros(36)
     pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(yaw))
     body = make(

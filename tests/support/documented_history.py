@@ -1,4 +1,4 @@
-"""The fixed history that the documentation speaks of, and the parts of pages that are made of code.
+"""The fixed history that the documentation uses, and the parts of pages that are made of code.
 
 a drive of one minute, from 08:00:00 UTC on 20 November 2026, in six splits of 10 s:
   0 to 20 s   along x at 0.5 m/s, to (10, 0)

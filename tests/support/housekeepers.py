@@ -54,7 +54,7 @@ def keeper_of(
     is_synchronised: Callable[[], bool] = lambda: True,
     keeps_foreign: bool = False,
 ) -> Housekeeping:
-    """A housekeeper, mostly of all bags, whoever made them (retention.foreign=delete).
+    """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
 
     Its clock is right, and an hour later unless one is given.
     """

@@ -245,8 +245,8 @@ def _look_back(campaign: Campaign, site: Machine, served: Served) -> None:
         started = recorder.events("recorder_started")
         campaign.started |= {event["recording"]: moment_of(event) for event in started}
     listed, after = answers(served, ("list_recorded_topics", {}), ("data_time_range", {}))
-    campaign.counted_by_server = {row["topic"]: row["count"] for row in listed.told}["/odom"]
-    campaign.after = after.told
+    campaign.counted_by_server = {row["topic"]: row["count"] for row in listed.reply}["/odom"]
+    campaign.after = after.reply
 
 
 def _missing(numbers: set[int]) -> list[int]:
@@ -270,5 +270,5 @@ def place_is_right(fault: Fault) -> bool:
     if fault.place is None:
         return True
     x, y = position(fault.place_t)
-    told = fault.place.told
+    told = fault.place.reply
     return "x" in told and math.hypot(told["x"] - x, told["y"] - y) < 0.05

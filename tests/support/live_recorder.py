@@ -264,7 +264,7 @@ def answering(bag_dir: Path, log: Path, *overrides: str) -> Iterator[Served]:
 class Answer(NamedTuple):
     """A reply, and between which moments (Unix s) it was asked for and came."""
 
-    told: Any
+    reply: Any
     asked: float
     answered: float
 
@@ -277,8 +277,8 @@ def answers(served: Served, *questions: tuple[str, dict[str, Any]]) -> list[Answ
         async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
             for tool, given in questions:
                 asked = time.time_ns()
-                told, _ = await ask(client, tool, given)
-                found.append(Answer(told, asked / NS_PER_S, time.time_ns() / NS_PER_S))
+                reply, _ = await ask(client, tool, given)
+                found.append(Answer(reply, asked / NS_PER_S, time.time_ns() / NS_PER_S))
         return found
 
     return anyio.run(go)
@@ -286,7 +286,7 @@ def answers(served: Served, *questions: tuple[str, dict[str, Any]]) -> list[Answ
 
 def answer(served: Served, tool: str, **given: object) -> Any:
     """The reply to one question."""
-    return answers(served, (tool, given))[0].told
+    return answers(served, (tool, given))[0].reply
 
 
 def await_answerable(served: Served, moment: int) -> None:

@@ -26,7 +26,7 @@ FOOTER: Final = struct.Struct("<BQQQI")
 
 
 def chatter(count: int, size: int = 100, start: int = 0) -> list[Msg]:
-    """Messages of one topic, at 0, 1, 2 ... ns unless said, each with a text of `size`."""
+    """Messages of one topic, at 0, 1, 2 ... ns by default, each with a text of `size`."""
     return [text(time, f"{time:0{size}d}") for time in range(start, start + count)]
 
 

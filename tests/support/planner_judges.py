@@ -143,18 +143,18 @@ def only(judge: judges.Judge) -> Judge:
     return lambda replies, asked: judge(replies[-1], asked)
 
 
-def _sighting(told: JsonValue, row: Sequence[Message]) -> None:
+def _sighting(found: JsonValue, row: Sequence[Message]) -> None:
     """A row of messages as a sighting."""
     first, last = row[0], row[-1]
-    one_of("first seen", number(told, "first_seen"), [first.log_time])
-    one_of("last seen", number(told, "last_seen"), [last.log_time])
-    near("how long", number(told, "duration_s"), (last.log_time - first.log_time) / 1e9, SAME_S)
-    near("how long ago", number(told, "ago_s"), _ago(last.log_time), SAME_S)
-    same("count", number(told, "count"), len(row))
+    one_of("first seen", number(found, "first_seen"), [first.log_time])
+    one_of("last seen", number(found, "last_seen"), [last.log_time])
+    near("how long", number(found, "duration_s"), (last.log_time - first.log_time) / 1e9, SAME_S)
+    near("how long ago", number(found, "ago_s"), _ago(last.log_time), SAME_S)
+    same("count", number(found, "count"), len(row))
     here = robot.pose(last.t)
-    near("x", number(told, "robot", "x"), here.x, PLACE_M)
-    near("y", number(told, "robot", "y"), here.y, PLACE_M)
-    same("frame", text(told, "robot", "frame_id"), "odom")
+    near("x", number(found, "robot", "x"), here.x, PLACE_M)
+    near("y", number(found, "robot", "y"), here.y, PLACE_M)
+    same("frame", text(found, "robot", "frame_id"), "odom")
 
 
 def sighting_of(
@@ -167,13 +167,13 @@ def sighting_of(
     """The newest sighting, or the nth from the start or (negative) the end."""
 
     def judge(replies: Replies, asked: CallContext) -> None:
-        told = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
-        same("topic", text(told, "topic"), stream.topic)
-        _sighting(told, _rows(asked, stream, holds)[nth])
+        found = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
+        same("topic", text(found, "topic"), stream.topic)
+        _sighting(found, _rows(asked, stream, holds)[nth])
         if place is not None:
             for axis, expected in zip("xyz", THINGS[place], strict=True):
-                near(f"{axis} of the {place}", number(told, "place", axis), expected, PLACE_M)
-            same("frame", text(told, "place", "frame_id"), "map")
+                near(f"{axis} of the {place}", number(found, "place", axis), expected, PLACE_M)
+            same("frame", text(found, "place", "frame_id"), "map")
 
     return judge
 
@@ -193,21 +193,21 @@ def visited(place: Planar | tuple[float, float], radius: float = 0.5) -> Judge:
         rows = _rows(asked, ODOM, _near(place, radius))
         newest = _messages(asked, ODOM)[-1]
         there = rows[-1][-1].log_time == newest.log_time
-        told = at(replies[-1], "visits", 0)
+        found = at(replies[-1], "visits", 0)
         same("frame", text(replies[-1], "frame_id"), "map")
         same("there now", at(replies[-1], "there_now"), there)
         same("visits", number(replies[-1], "total"), len(rows))
-        one_of("arrival", number(told, "arrived"), [rows[-1][0].log_time])
+        one_of("arrival", number(found, "arrived"), [rows[-1][0].log_time])
         if there:
-            same("departure", at(told, "departed"), None)
+            same("departure", at(found, "departed"), None)
         else:
-            one_of("departure", number(told, "departed"), [rows[-1][-1].log_time])
-            near("how long ago", number(told, "ago_s"), _ago(rows[-1][-1].log_time), SAME_S)
+            one_of("departure", number(found, "departed"), [rows[-1][-1].log_time])
+            near("how long ago", number(found, "ago_s"), _ago(rows[-1][-1].log_time), SAME_S)
         stayed = (rows[-1][-1].log_time - rows[-1][0].log_time) / 1e9
-        near("how long", number(told, "duration_s"), stayed, SAME_S)
+        near("how long", number(found, "duration_s"), stayed, SAME_S)
         here = [robot.pose_in_map(message.t) for message in rows[-1]]
         closest = min(math.hypot(each.x - place[0], each.y - place[1]) for each in here)
-        near("how near", number(told, "closest_m"), closest, PLACE_M)
+        near("how near", number(found, "closest_m"), closest, PLACE_M)
 
     return judge
 
@@ -219,9 +219,9 @@ def never(replies: Replies, _asked: CallContext) -> None:
 
 
 def no_error(replies: Replies, _asked: CallContext) -> None:
-    told = [text(event, "text") for event in items(replies[-1], "events")]
-    same("errors", [each for each in told if each.startswith("error")], [])
-    same("gaps", [each for each in told if each == "nothing was recorded"], [])
+    found = [text(event, "text") for event in items(replies[-1], "events")]
+    same("errors", [each for each in found if each.startswith("error")], [])
+    same("gaps", [each for each in found if each == "nothing was recorded"], [])
 
 
 def pose_at(moment_s: float) -> Judge:
@@ -265,11 +265,11 @@ def stopped(last_s: float) -> Judge:
     """Every stop of a recap: when, where, how long, and whether it goes on."""
 
     def judge(replies: Replies, asked: CallContext) -> None:
-        told = _of_kind(replies[-1], "stood at")
-        same("number of stops", number(replies[-1], "counts", "stops"), len(told))
+        found = _of_kind(replies[-1], "stood at")
+        same("number of stops", number(replies[-1], "counts", "stops"), len(found))
         stops = _stops(asked, ASKED_AT_S - last_s)
-        same("stops", len(told), len(stops))
-        for event, row in zip(told, stops, strict=True):
+        same("stops", len(found), len(stops))
+        for event, row in zip(found, stops, strict=True):
             _stop(event, row)
 
     return judge
@@ -300,7 +300,7 @@ def came_into_view(last_s: float) -> Judge:
     """What was seen, by the names of things, and when each came into view."""
 
     def judge(replies: Replies, asked: CallContext) -> None:
-        told = [
+        found = [
             (text(event, "text").removesuffix(" in view"), number(event, "timestamp"))
             for event in items(replies[-1], "events")
             if text(event, "text").endswith(" in view")
@@ -309,7 +309,7 @@ def came_into_view(last_s: float) -> Judge:
         for label in THINGS:
             rows = _rows(asked, SEEN, sees(label), since)
             moments = [row[0].log_time for row in rows]
-            mine = [moment for name, moment in told if name == label]
+            mine = [moment for name, moment in found if name == label]
             same(f"whether the {label} was in view", bool(mine), bool(moments))
             for moment in mine:
                 one_of(f"the {label} in view at", moment, moments)
@@ -328,18 +328,18 @@ def seen_there(place: Planar) -> Judge:
             if row[0].log_time <= message.log_time <= row[-1].log_time
         ]
         expected = {thing.label for message in there for thing in robot.seen(message.t)}
-        told = {
+        found = {
             text(event, "text").removesuffix(" in view")
             for event in items(replies[-1], "events")
             if text(event, "text").endswith(" in view")
         }
-        same("things", told, expected)
+        same("things", found, expected)
 
     return judge
 
 
 def flips_of_path(replies: Replies, asked: CallContext) -> None:
-    told = [
+    found = [
         (number(event, "timestamp"), text(event, "text").rsplit(" ", 1)[1] == "true")
         for event in _of_kind(replies[-1], published_topics.PATH_CLEAR)
     ]
@@ -350,7 +350,7 @@ def flips_of_path(replies: Replies, asked: CallContext) -> None:
         for before, after in pairs
         if robot.path_clear(before.t) != robot.path_clear(after.t)
     ]
-    same("flips", told, flips)
+    same("flips", found, flips)
 
 
 def later(first: str, second: str) -> Judge:
@@ -394,18 +394,18 @@ def last_stay(replies: Replies) -> Arguments:
 
 def said_last(replies: Replies, asked: CallContext) -> None:
     newest = _messages(asked, SAID)[-1]
-    told = at(replies[-1], "samples", -1)
-    one_of("the words at", number(told, "timestamp"), [newest.log_time])
-    same("words", text(told, "value", "value"), description(newest.t))
+    found = at(replies[-1], "samples", -1)
+    one_of("the words at", number(found, "timestamp"), [newest.log_time])
+    same("words", text(found, "value", "value"), description(newest.t))
 
 
 def commanded(seconds_ago: float) -> Judge:
     def judge(replies: Replies, _asked: CallContext) -> None:
         forward, turning = robot.twist(_t(number(replies[-1], "timestamp")))
         near("time", number(replies[-1], "timestamp"), ASKED_AT_S - seconds_ago, 0.2)
-        told = at(replies[-1], "value")
-        near("forward", number(told, "linear_velocity", "x"), forward, 5e-3)
-        near("turning", number(told, "angular_velocity", "z"), turning, 5e-3)
+        found = at(replies[-1], "value")
+        near("forward", number(found, "linear_velocity", "x"), forward, 5e-3)
+        near("turning", number(found, "angular_velocity", "z"), turning, 5e-3)
 
     return judge
 
@@ -414,9 +414,9 @@ def lowest_charge(last_s: float) -> Judge:
     def judge(replies: Replies, asked: CallContext) -> None:
         known = _messages(asked, BATTERY, ASKED_AT_S - last_s)
         least = min(known, key=lambda message: robot.battery(message.t))
-        told = at(replies[-1], "extremes", "percentage")
-        near("charge", number(told, "min"), robot.battery(least.t), 2e-6)
-        one_of("lowest at", number(told, "min_at"), [least.log_time])
+        found = at(replies[-1], "extremes", "percentage")
+        near("charge", number(found, "min"), robot.battery(least.t), 2e-6)
+        one_of("lowest at", number(found, "min_at"), [least.log_time])
 
     return judge
 

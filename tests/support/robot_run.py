@@ -117,11 +117,11 @@ async def ask_everything(client: Client) -> None:
     tools = (await client.list_tools()).tools
     assert {tool.name for tool in tools} == {name for name, _, _ in ANSWERED}
     for name, given, key in ANSWERED:
-        told, is_error = await ask(client, name, given)
-        assert key in (told[0] if isinstance(told, list) else told), (name, told)
+        reply, is_error = await ask(client, name, given)
+        assert key in (reply[0] if isinstance(reply, list) else reply), (name, reply)
         assert not is_error
     for name, given, code, expected in REFUSED:
-        told, is_error = await ask(client, name, given)
-        assert told["error"] == code, (name, told)
-        assert told["detail"]
+        reply, is_error = await ask(client, name, given)
+        assert reply["error"] == code, (name, reply)
+        assert reply["detail"]
         assert is_error == expected

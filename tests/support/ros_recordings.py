@@ -51,7 +51,7 @@ class Recording:
         return self._log.read_text()
 
     def await_said(self, *texts: str) -> None:
-        """Returns once it said all of these."""
+        """Returns once it has logged all of these."""
         wanted = ", ".join(texts)
         wait_for(lambda: all(text in self.said for text in texts), wanted, alive=self.process)
 

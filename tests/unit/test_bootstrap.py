@@ -98,12 +98,12 @@ async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:
     chosen = settings(tmp_path)
     async with Client(build_server(chosen, build_memory(chosen))) as client:
         for name, given, _ in ANSWERED:
-            told, is_error = await ask(client, name, given)
+            reply, is_error = await ask(client, name, given)
             assert not is_error
             if name == "list_recorded_topics":
-                assert told == []
+                assert reply == []
             elif name not in {"data_time_range", "memory_status", "list_moments"}:
-                assert told["reason"] == "empty_memory", (name, told)
+                assert reply["reason"] == "empty_memory", (name, reply)
 
 
 @pytest.mark.parametrize(("pattern", "count"), [("/vision/*", 1), ("/*", 5), ("/odom", 1)])
@@ -113,8 +113,8 @@ async def test_recorded_topics_are_narrowed_by_a_glob(
     write_run(tmp_path)
     chosen = settings(tmp_path)
     async with Client(build_server(chosen, build_memory(chosen))) as client:
-        told, _ = await ask(client, "list_recorded_topics", {"pattern": pattern})
-        assert len(told) == count
+        reply, _ = await ask(client, "list_recorded_topics", {"pattern": pattern})
+        assert len(reply) == count
         none, is_error = await ask(client, "list_recorded_topics", {"pattern": "/visoin/*"})
     assert (none["reason"], is_error) == ("topic_not_recorded", False)
 
@@ -124,5 +124,5 @@ async def test_the_size_of_replies_is_as_configured(tmp_path: Path) -> None:
     chosen = settings(tmp_path, "server.max_reply_chars=1000")
     async with Client(build_server(chosen, build_memory(chosen))) as client:
         for name, given, _ in ANSWERED:
-            told, _ = await ask(client, name, given)
-            assert len(to_json_text(told)) <= 1000
+            reply, _ = await ask(client, name, given)
+            assert len(to_json_text(reply)) <= 1000

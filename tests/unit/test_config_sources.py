@@ -1,4 +1,4 @@
-"""Who set a key, told from the files of a configuration directory."""
+"""Which file of a configuration directory set a key."""
 
 from __future__ import annotations
 

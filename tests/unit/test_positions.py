@@ -172,10 +172,10 @@ def test_whatever_carries_a_velocity_answers_how_fast(
     tmp_path: Path, recalls: bool, topic: str
 ) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", driven(topic))
-    told = ask(tmp_path, recalls, "get_velocity_at", topic=topic, timestamp=T0_S + 10)
-    assert told["linear"] == {"x": 0.5, "y": 0.0, "z": 0.0}
-    assert told["angular"] == {"x": 0.0, "y": 0.0, "z": -0.25}
-    assert told["frame_id"] == ("body FRD" if "vehicle" in topic else None)
+    reply = ask(tmp_path, recalls, "get_velocity_at", topic=topic, timestamp=T0_S + 10)
+    assert reply["linear"] == {"x": 0.5, "y": 0.0, "z": 0.0}
+    assert reply["angular"] == {"x": 0.0, "y": 0.0, "z": -0.25}
+    assert reply["frame_id"] == ("body FRD" if "vehicle" in topic else None)
 
 
 def test_fields_of_a_vehicles_odometry_read_as_a_point_and_angles(tmp_path: Path) -> None:
@@ -230,12 +230,12 @@ def test_where_the_pose_topic_is_not_recorded_the_one_with_poses_is_named(
 ) -> None:
     others = [text(T0, "up", "/rosout"), boolean(T0, True)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*others, pose_stamped(T0 + S, 1.0, 2.0, "/pose")])
-    told = ask(tmp_path, recalls, tool, **given)
-    assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")
-    assert "no topic /odom is recorded, which data.pose_topic names" in told["detail"]
-    assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in told["detail"]
-    assert "set data.pose_topic=/pose" in told["detail"]
-    assert "/rosout" not in told["detail"]
+    reply = ask(tmp_path, recalls, tool, **given)
+    assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
+    assert "no topic /odom is recorded, which data.pose_topic names" in reply["detail"]
+    assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in reply["detail"]
+    assert "set data.pose_topic=/pose" in reply["detail"]
+    assert "/rosout" not in reply["detail"]
 
 
 @each_way
@@ -252,8 +252,8 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
 ) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(9)])
-    told = ask(tmp_path, recalls, tool, **given)
-    detail = told["notes"][0] if tool == "recap" else told["detail"]
+    reply = ask(tmp_path, recalls, tool, **given)
+    detail = reply["notes"][0] if tool == "recap" else reply["detail"]
     assert "data.pose_topic=/fix" not in detail
     assert "give topic" not in detail
     in_degrees = "(sensor_msgs/msg/NavSatFix): get_position_at answers them by topic"
@@ -263,19 +263,19 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
 
 def test_recap_names_the_topic_with_poses(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [pose_stamped(T0, 1.0, 2.0, "/pose")])
-    told = ask(tmp_path, False, "recap", start=T0_S, end=T0_S + 1)
-    assert any("set data.pose_topic=/pose" in note for note in told["notes"])
+    reply = ask(tmp_path, False, "recap", start=T0_S, end=T0_S + 1)
+    assert any("set data.pose_topic=/pose" in note for note in reply["notes"])
 
 
 def test_of_several_topics_with_poses_each_is_named(tmp_path: Path) -> None:
     messages = [pose_stamped(T0, 1.0, 2.0, name) for name in ("/a", "/b")]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    told = ask(tmp_path, False, "get_position_at", timestamp=T0_S)
-    assert "set data.pose_topic to one of them" in told["detail"]
+    reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S)
+    assert "set data.pose_topic to one of them" in reply["detail"]
 
 
 def test_a_topic_without_a_position_is_refused_with_those_that_have_one(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(T0, 1.0, 2.0), boolean(T0, True)])
-    told = ask(tmp_path, False, "get_position_at", topic="/bumper", timestamp=T0_S)
-    assert told["error"] == "invalid_arguments"
-    assert "carries no position; give a topic that does, such as /odom" in told["detail"]
+    reply = ask(tmp_path, False, "get_position_at", topic="/bumper", timestamp=T0_S)
+    assert reply["error"] == "invalid_arguments"
+    assert "carries no position; give a topic that does, such as /odom" in reply["detail"]

@@ -1,4 +1,4 @@
-"""A condition that no value of a topic can meet is told from one that none has met."""
+"""A condition that no value of a topic can meet is distinguished from one that none has met."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def test_a_field_that_values_have_or_may_have_is_no_fault(value: JsonValue, fiel
 
 @pytest.mark.parametrize("field", ["data", "position.w", "pose.pose.position", "nope"])
 def test_a_field_that_values_lack_is_refused_with_those_they_have(field: str) -> None:
-    told = refusal(ODOM, "equals", 1, field)
-    assert told is not None
-    assert repr(field) in told
-    assert "position, orientation, position.x" in told
+    refused = refusal(ODOM, "equals", 1, field)
+    assert refused is not None
+    assert repr(field) in refused
+    assert "position, orientation, position.x" in refused
 
 
 def test_nearness_is_asked_of_values_with_positions_only() -> None:
@@ -51,16 +51,16 @@ def test_nearness_is_asked_of_values_with_positions_only() -> None:
     assert refusal(ODOM, "near_position", here) is None
     assert refusal(SEEN, "near_position", here) is None
     assert refusal(NOTHING_SEEN, "near_position", here) is None
-    told = refusal({"percentage": 0.5}, "near_position", here)
-    assert told is not None
-    assert "no position" in told
+    refused = refusal({"percentage": 0.5}, "near_position", here)
+    assert refused is not None
+    assert "no position" in refused
 
 
 @pytest.mark.parametrize("wanted", [3, "3", 2.5])
 def test_a_number_is_contained_in_a_text_or_in_what_a_field_names(wanted: JsonValue) -> None:
-    told = refusal(ODOM, "contains", wanted)
-    assert told is not None
-    assert "ask with equals" in told
+    refused = refusal(ODOM, "contains", wanted)
+    assert refused is not None
+    assert "ask with equals" in refused
     assert refusal(ODOM, "contains", wanted, "position") is not None
     assert refusal(ODOM, "contains", wanted, "position.x") is None
     assert refusal(SEEN, "contains", wanted) is None

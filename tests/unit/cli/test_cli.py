@@ -137,11 +137,11 @@ class TestTopics:
 class TestInfo:
     def test_it_shows_the_range_the_gaps_and_the_bags(self, capsys: Capture) -> None:
         assert cli.main(["info", "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert told["data_time_range"]["earliest"] == 1_700_000_000.0
-        assert told["data_time_range"]["bags"] == 2
-        assert len(told["data_time_range"]["gaps"]) == 1
-        assert told["memory_status"]["budget"]["max_gb"] is None
+        output = json.loads(capsys.readouterr().out)
+        assert output["data_time_range"]["earliest"] == 1_700_000_000.0
+        assert output["data_time_range"]["bags"] == 2
+        assert len(output["data_time_range"]["gaps"]) == 1
+        assert output["memory_status"]["budget"]["max_gb"] is None
 
     @pytest.mark.parametrize("there", [True, False])
     def test_of_a_memory_without_bags_the_exit_code_is_1(
@@ -271,8 +271,8 @@ class TestTheProgram:
         (line,) = capsys.readouterr().err.splitlines()
         assert "2 warnings logged (2 x bag_damaged); -v shows" in line
         assert cli.main(["topics", "-v", "logging.level=warning"]) == 0
-        told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-        assert [each["event"] for each in told] == ["bag_damaged", "bag_damaged"]
+        output = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+        assert [each["event"] for each in output] == ["bag_damaged", "bag_damaged"]
 
     @pytest.mark.parametrize("command", COMMANDS)
     def test_the_help_of_every_command_says_what_its_exit_codes_mean(

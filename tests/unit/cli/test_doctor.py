@@ -107,9 +107,9 @@ def test_where_all_is_well_the_exit_code_is_0(robot: Path, capsys: Capture) -> N
 
 def test_people_read_a_line_for_each_concern(robot: Path, capsys: Capture) -> None:
     assert cli.main(["doctor"]) == 0
-    told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    output = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
     about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics", "extras"]
-    assert told == [["ok", each] for each in [*about, "server"]]
+    assert output == [["ok", each] for each in [*about, "server"]]
 
 
 def test_a_refused_configuration_is_an_error(capsys: Capture) -> None:
@@ -206,9 +206,9 @@ def test_msg_folders_are_advised_for_what_they_would_mend_alone(
         writer.add_message(channel, now, b"\x08\x01", now)
         writer.finish()
     _, wrong = examined(capsys)
-    [told] = wrong["bags"]
-    assert "/keelson (its message encoding 'protobuf' is not read" in told["seen"]
-    assert ".msg" not in told["do"]
+    [output] = wrong["bags"]
+    assert "/keelson (its message encoding 'protobuf' is not read" in output["seen"]
+    assert ".msg" not in output["do"]
     foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", now, b"\x00\x01\x00\x00abc")
     write_mcap(robot / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
     _, wrong = examined(capsys)

@@ -84,9 +84,9 @@ def test_what_reaches_beyond_the_window_is_kept_and_named(bag_dir: Path, capsys:
 
 def test_a_dry_run_only_reports(bag_dir: Path, capsys: Capture) -> None:
     assert forget(20, 35, "--dry-run") == 0
-    told = capsys.readouterr().out
-    assert "would be deleted: 1 bag" in told
-    assert "rec_0/rec_1.mcap" in told
+    output = capsys.readouterr().out
+    assert "would be deleted: 1 bag" in output
+    assert "rec_0/rec_1.mcap" in output
     assert len(bags(bag_dir)) == 4
 
 
@@ -220,10 +220,10 @@ class TestForeignBags:
             "rec_2.mcap",
             "rec_3.mcap",
         ]
-        told = capsys.readouterr().out
-        assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in told
-        assert "`ros2-memory adopt session` first" in told
-        assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in told
+        output = capsys.readouterr().out
+        assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in output
+        assert "`ros2-memory adopt session` first" in output
+        assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in output
 
     def test_one_that_was_adopted_goes(self, bag_dir: Path) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
@@ -325,9 +325,9 @@ class TestMetadata:
         metadata.write_text(metadata.read_text().replace("message_count: 12", "message_count: 13"))
         before = metadata.read_text()
         assert forget(0, 15, "--yes") == 0
-        told = capsys.readouterr().out
-        assert "rec_0/metadata.yaml still lists what was deleted (its numbers" in told
-        assert f"ros2 bag reindex {metadata.parent}" in told
+        output = capsys.readouterr().out
+        assert "rec_0/metadata.yaml still lists what was deleted (its numbers" in output
+        assert f"ros2 bag reindex {metadata.parent}" in output
         assert metadata.read_text() == before
 
     def test_that_of_a_recording_that_is_being_written_is_its_recorders(

@@ -25,7 +25,7 @@ def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
 
 
 @pytest.mark.parametrize(
-    ("value", "told"),
+    ("value", "output"),
     [
         ({"x": 1.5, "y": 2, "z": 0.0}, "x 1.5, y 2"),
         ({"x": 1.5, "y": 2, "z": 0.4, "yaw_deg": 90.0}, "x 1.5, y 2, z 0.4, yaw_deg 90"),
@@ -39,15 +39,15 @@ def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
         ({}, "-"),
     ],
 )
-def test_objects_in_a_cell_are_words(value: JsonValue, told: str) -> None:
-    assert format_value(value) == told
+def test_objects_in_a_cell_are_words(value: JsonValue, output: str) -> None:
+    assert format_value(value) == output
 
 
 def test_a_moment_has_its_local_time_and_its_age() -> None:
-    told = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
-    assert told.splitlines()[0].split(maxsplit=1) == ["timestamp", format_time(T0)]
-    assert f"{format_time(T0 - 7200)} (2.0 h ago)" in told
-    assert f"{format_time(T0 + 60)} (in 60.0 s)" in told
+    output = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
+    assert output.splitlines()[0].split(maxsplit=1) == ["timestamp", format_time(T0)]
+    assert f"{format_time(T0 - 7200)} (2.0 h ago)" in output
+    assert f"{format_time(T0 + 60)} (in 60.0 s)" in output
 
 
 def test_ages_count_from_the_now_that_a_reply_states() -> None:
@@ -55,16 +55,16 @@ def test_ages_count_from_the_now_that_a_reply_states() -> None:
 
 
 def test_moments_in_notes_are_local_times() -> None:
-    told = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
-    assert f"the memory ends at {format_time(T0)}" in told
-    assert "1300000000 samples" in told
+    output = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
+    assert f"the memory ends at {format_time(T0)}" in output
+    assert "1300000000 samples" in output
 
 
 def test_long_times_are_in_a_unit_that_suits_them() -> None:
     rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
-    told = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
-    assert told[:4] == ["duration_s", "2.1", "h", "total"]
-    assert told[-3:] == ["days", "/b", "12.25"]
+    output = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
+    assert output[:4] == ["duration_s", "2.1", "h", "total"]
+    assert output[-3:] == ["days", "/b", "12.25"]
 
 
 def test_what_there_is_not_is_reported_in_words() -> None:
@@ -74,21 +74,21 @@ def test_what_there_is_not_is_reported_in_words() -> None:
 
 def test_a_table_for_which_there_is_room_has_a_row_for_each() -> None:
     rows: JsonValue = [{"topic": "/odom", "last": T0, "count": n} for n in range(3)]
-    told = shown({"topics": rows})
-    assert told.count(format_time(T0)) == 3
+    output = shown({"topics": rows})
+    assert output.count(format_time(T0)) == 3
 
 
 def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
     rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
-    told = shown(rows)
+    output = shown(rows)
     day, _, time = format_time(T0).partition(" ")
-    assert [line.count(day) for line in told.splitlines() if day in line] == [2]
-    assert [line.count(time) for line in told.splitlines() if time in line] == [2]
-    assert "12345" in told
+    assert [line.count(day) for line in output.splitlines() if day in line] == [2]
+    assert [line.count(time) for line in output.splitlines() if time in line] == [2]
+    assert "12345" in output
 
 
 def test_rows_that_are_too_wide_for_a_table_stand_one_below_the_other() -> None:
     row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(6)}
-    told = shown([row, row])
-    assert told.count("a_key_with_a_long_name_5  5") == 2
+    output = shown([row, row])
+    assert output.count("a_key_with_a_long_name_5  5") == 2
     assert shown([row, row], width=200).count("a_key_with_a_long_name_5") == 1

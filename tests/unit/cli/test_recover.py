@@ -35,9 +35,9 @@ def left_open(path: Path) -> Path:
 def recovered(
     path: Path, *, seconds_later: int = 60, force: bool = False
 ) -> tuple[RecoveryOutcome, list[str]]:
-    said: list[str] = []
-    outcome = recover_files(path, said.append, force=force, clock=later(seconds_later))
-    return outcome, said
+    printed: list[str] = []
+    outcome = recover_files(path, printed.append, force=force, clock=later(seconds_later))
+    return outcome, printed
 
 
 def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     (tmp_path / "b/b_0.mcap").write_bytes(b"")
     before = whole.stat(), whole.read_bytes()
     count = McapReader().summarize(cut).count
-    outcome, said = recovered(tmp_path)
+    outcome, printed = recovered(tmp_path)
     assert outcome == RecoveryOutcome(whole=1, repaired=1, removed=1, failed=0, messages=count)
     assert McapReader().summarize(cut).complete
     stat, content = before
@@ -55,10 +55,10 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert (after.st_ino, after.st_mtime_ns) == (stat.st_ino, stat.st_mtime_ns)
     assert whole.read_bytes() == content
     assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
-    assert said[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
-    assert said[1] == "b/b_0.mcap: empty, removed"
-    assert said[2] == f"{tmp_path / 'a/metadata.yaml'}: written anew, with what the files hold"
-    assert said[-1] == str(outcome)
+    assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
+    assert printed[1] == "b/b_0.mcap: empty, removed"
+    assert printed[2] == f"{tmp_path / 'a/metadata.yaml'}: written anew, with what the files hold"
+    assert printed[-1] == str(outcome)
 
 
 class TestMetadata:
@@ -83,8 +83,8 @@ class TestMetadata:
         cut = left_open(tmp_path / "rec/rec.mcap")
         os.truncate(cut, cut.stat().st_size - 3000)
         (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
-        _, said = recovered(tmp_path / "rec")
-        assert any("metadata.yaml: written anew" in line for line in said)
+        _, printed = recovered(tmp_path / "rec")
+        assert any("metadata.yaml: written anew" in line for line in printed)
         held = McapReader().summarize(tmp_path / "rec/rec.mcap")
         assert 0 < held.count < 100
         assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}
@@ -96,9 +96,9 @@ class TestMetadata:
         left_open(tmp_path / "rec/rec_0.mcap")
         (tmp_path / "rec/rec_1.mcap").write_bytes(b"a letter")
         (tmp_path / "rec/metadata.yaml").write_text("as it was\n")
-        _, said = recovered(tmp_path)
+        _, printed = recovered(tmp_path)
         assert any(
-            "metadata.yaml NOT CORRECTED: " in line and "rec_1.mcap" in line for line in said
+            "metadata.yaml NOT CORRECTED: " in line and "rec_1.mcap" in line for line in printed
         )
         assert (tmp_path / "rec/metadata.yaml").read_text() == "as it was\n"
 
@@ -117,14 +117,14 @@ class TestMetadata:
     def test_of_another_form_is_kept(self, tmp_path: Path, text: str, reason: str) -> None:
         left_open(tmp_path / "rec/rec_0.mcap")
         (tmp_path / "rec/metadata.yaml").write_text(text)
-        _, said = recovered(tmp_path)
-        assert any("NOT CORRECTED" in line and reason in line for line in said)
+        _, printed = recovered(tmp_path)
+        assert any("NOT CORRECTED" in line and reason in line for line in printed)
         assert (tmp_path / "rec/metadata.yaml").read_text() == text
 
     def test_of_files_with_other_names_is_not_made(self, tmp_path: Path) -> None:
         left_open(tmp_path / "rec/field trip.mcap")
-        _, said = recovered(tmp_path)
-        assert any("ros2 bag reindex" in line for line in said)
+        _, printed = recovered(tmp_path)
+        assert any("ros2 bag reindex" in line for line in printed)
         assert files_in(tmp_path) == ["rec", "rec/field trip.mcap"]
 
     @needs_recorded
@@ -169,26 +169,26 @@ def test_a_single_file_is_repaired_whatever_its_name(tmp_path: Path) -> None:
 
 def test_a_whole_file_is_reported_to_be(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
-    outcome, said = recovered(path)
+    outcome, printed = recovered(path)
     assert outcome == RecoveryOutcome(whole=1)
-    assert said[0].endswith("whole already: there is nothing to repair")
+    assert printed[0].endswith("whole already: there is nothing to repair")
 
 
 def test_what_is_no_mcap_file_is_reported_to_be_none_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "a_0.mcap"
     path.write_bytes(b"a letter")
-    outcome, said = recovered(tmp_path)
+    outcome, printed = recovered(tmp_path)
     assert outcome == RecoveryOutcome(failed=1)
-    assert said[0] == "a_0.mcap: NOT REPAIRED: not an MCAP file: it does not begin as one"
+    assert printed[0] == "a_0.mcap: NOT REPAIRED: not an MCAP file: it does not begin as one"
     assert path.read_bytes() == b"a letter"
 
 
 def test_an_empty_file_that_may_be_anything_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_bytes(b"")
-    outcome, said = recovered(path)
+    outcome, printed = recovered(path)
     assert outcome.failed == 1
-    assert "its name does not end in .mcap" in said[0]
+    assert "its name does not end in .mcap" in printed[0]
     assert path.exists()
 
 
@@ -196,34 +196,34 @@ def test_what_a_recorder_is_writing_is_left_alone(tmp_path: Path) -> None:
     path = left_open(tmp_path / "rec/rec_0.mcap")
     recording_now(tmp_path, "rec", clock=later(60))
     for asked in (tmp_path, path.parent, path):
-        outcome, said = recovered(asked, force=True)
+        outcome, printed = recovered(asked, force=True)
         assert outcome.failed == 1
-        assert "the recorder (process 1) is writing it" in said[0]
+        assert "the recorder (process 1) is writing it" in printed[0]
     assert not McapReader().summarize(path).complete
 
 
 def test_what_a_process_has_open_is_left_alone(tmp_path: Path) -> None:
     path = left_open(tmp_path / "rec/rec_0.mcap")
     with path.open("rb"):
-        outcome, said = recovered(path, force=True)
+        outcome, printed = recovered(path, force=True)
     assert outcome.failed == 1
-    assert "a process has it open" in said[0]
+    assert "a process has it open" in printed[0]
 
 
 def test_what_changed_a_moment_ago_is_left_alone_unless_that_is_forced(tmp_path: Path) -> None:
     path = left_open(tmp_path / "rec/rec_0.mcap")
-    outcome, said = recovered(path, seconds_later=3)
+    outcome, printed = recovered(path, seconds_later=3)
     assert outcome.failed == 1
-    assert "--force" in said[0]
+    assert "--force" in printed[0]
     outcome, _ = recovered(path, seconds_later=3, force=True)
     assert outcome.repaired == 1
 
 
 def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     write_db3(tmp_path / "a/a_0.db3", MESSAGES)
-    outcome, said = recovered(tmp_path)
+    outcome, printed = recovered(tmp_path)
     assert outcome == RecoveryOutcome()
-    assert said[0].startswith("1 bag file of another kind was left alone")
+    assert printed[0].startswith("1 bag file of another kind was left alone")
 
 
 def test_what_is_not_there_cannot_be_repaired(tmp_path: Path) -> None:
@@ -235,9 +235,9 @@ def test_on_a_full_disk_the_original_is_kept(tmp_path: Path) -> None:
     path = left_open(tmp_path / "a_0.mcap")
     before = path.read_bytes()
     with files_limited_to(1000):
-        outcome, said = recovered(path)
+        outcome, printed = recovered(path)
     assert outcome.failed == 1
-    assert "cannot be written" in said[0]
+    assert "cannot be written" in printed[0]
     assert path.read_bytes() == before
 
 

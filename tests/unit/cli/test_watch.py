@@ -110,9 +110,9 @@ def test_restarts_and_topics_that_nobody_offers_are_reported(
     )
     write_heartbeat(bag_dir, beat)
     assert cli.main(["watch", "--count", "1"]) == 0
-    told = capsys.readouterr().out
-    assert "recorder: recording, restarted 2 times;" in told
-    assert "offered by no publisher: /gone, /lost" in told
+    output = capsys.readouterr().out
+    assert "recorder: recording, restarted 2 times;" in output
+    assert "offered by no publisher: /gone, /lost" in output
 
 
 class TestOldData:
@@ -126,20 +126,20 @@ class TestOldData:
 
     def test_is_not_judged_by_what_is_usual(self, old: Path, capsys: Capture) -> None:
         assert cli.main(["watch", "--count", "1", "--bag-dir", str(old)]) == 0
-        told = capsys.readouterr().out
-        assert "as usual" not in told
-        assert "days old; nothing comes in: 1 topic not judged" in told
+        output = capsys.readouterr().out
+        assert "as usual" not in output
+        assert "days old; nothing comes in: 1 topic not judged" in output
 
     def test_is_as_old_as_the_tools_say(self, old: Path, capsys: Capture) -> None:
         words = ["watch", "--count", "1", "--bag-dir", str(old), "data.now=latest"]
         assert cli.main(words) == 0
-        told = capsys.readouterr().out
-        assert "which is now (data.now=latest); nothing comes in" in told
-        assert "days old" not in told
+        output = capsys.readouterr().out
+        assert "which is now (data.now=latest); nothing comes in" in output
+        assert "days old" not in output
 
 
 @pytest.mark.parametrize(
-    ("seconds", "told"),
+    ("seconds", "output"),
     [
         (0.04, "0.0 s"),
         (119.0, "119.0 s"),
@@ -149,5 +149,5 @@ class TestOldData:
         (-30.0, "-30.0 s"),
     ],
 )
-def test_a_duration_has_the_unit_that_suits_it(seconds: float, told: str) -> None:
-    assert format_duration(seconds) == told
+def test_a_duration_has_the_unit_that_suits_it(seconds: float, output: str) -> None:
+    assert format_duration(seconds) == output

@@ -1,4 +1,4 @@
-"""What observers are told of each call."""
+"""What observers receive for each call."""
 
 from __future__ import annotations
 

@@ -115,8 +115,8 @@ def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
 def test_a_topic_is_rare_by_its_pace_over_its_recording(
     messages: int, span_s: float, length_s: float, rare: bool
 ) -> None:
-    said = TopicTotals(T0, T0 + round(span_s * S), messages)
-    assert Pace(said, T0, T0 + round(length_s * S)).is_rare is rare
+    latched = TopicTotals(T0, T0 + round(span_s * S), messages)
+    assert Pace(latched, T0, T0 + round(length_s * S)).is_rare is rare
 
 
 @each_way
@@ -135,10 +135,10 @@ def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls
 def test_what_is_published_every_five_seconds_or_less_often_holds(
     tmp_path: Path, period_s: float, holds: bool, recalls: bool
 ) -> None:
-    said = every(period_s, 120, MAP)
-    record(tmp_path / "rec", [*said, *drive(T0, T0 + 130 * S)])
+    latched = every(period_s, 120, MAP)
+    record(tmp_path / "rec", [*latched, *drive(T0, T0 + 130 * S)])
     memory = remembered(tmp_path, recalls=recalls)
-    at = said[-1].log_time + 3 * S
+    at = latched[-1].log_time + 3 * S
     found = reply(memory, MAP, at)
     assert ("error" not in found) is holds
     if holds:
@@ -182,8 +182,8 @@ def test_static_transforms_hold_in_bags_without_qos(tmp_path: Path) -> None:
 def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) -> None:
     telemetry = every(0.1, 7, TELEMETRY)
     record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
-    said: dict[str, Any] = {"latched_topics": ("/fmu/*",), "never_latched_topics": (MAP,)}
-    memory = remembered(tmp_path, **said)
+    latched: dict[str, Any] = {"latched_topics": ("/fmu/*",), "never_latched_topics": (MAP,)}
+    memory = remembered(tmp_path, **latched)
     assert reply(memory, TELEMETRY, T0 + 59 * S)["latched"] is True
     assert set(reply(memory, MAP, T0 + 59 * S)) == {"error"}
     both = remembered(tmp_path, latched_topics=("/odom",), never_latched_topics=("/odom",))

@@ -99,17 +99,17 @@ def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reporte
     tmp_path: Path, sign: float
 ) -> None:
     turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
-    told = render(TransformAt("odom", "base_link", T0, turned, "stamp"))
-    assert isinstance(told, dict)
-    assert told["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+    reply = render(TransformAt("odom", "base_link", T0, turned, "stamp"))
+    assert isinstance(reply, dict)
+    assert reply["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
 
 
 @pytest.mark.parametrize(
-    ("length_s", "told"),
+    ("length_s", "reply"),
     [(0.0493, "0.0493 s"), (2.0, "2 s"), (99.96, "100 s"), (515_219.9, "515220 s")],
 )
-def test_a_duration_is_reported_without_powers_of_ten(length_s: float, told: str) -> None:
-    assert seconds(round(length_s * NS_PER_S)) == told
+def test_a_duration_is_reported_without_powers_of_ten(length_s: float, reply: str) -> None:
+    assert seconds(round(length_s * NS_PER_S)) == reply
 
 
 @pytest.mark.parametrize("older_s", [12_345.631, 1_234_567.891])
@@ -121,10 +121,10 @@ def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s
         queries.topic_value(memory, Call(), "/bumper", after(older_s))
     advised = re.search(r"tolerance_s of at least ([\d.]+)", caught.value.detail)
     assert advised
-    told = queries.topic_value(
+    reply = queries.topic_value(
         memory, Call(), "/bumper", after(older_s), tolerance_s=float(advised[1])
     )
-    assert told.sample.time == T0
+    assert reply.sample.time == T0
 
 
 def test_what_never_had_a_message_before_a_time_is_reported_in_words(tmp_path: Path) -> None:

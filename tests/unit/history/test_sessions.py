@@ -101,7 +101,7 @@ def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
 
 @each_way
 def test_another_robots_static_transform_places_nothing(tmp_path: Path, recalls: bool) -> None:
-    """A boat that knows no map was nowhere in it, whoever else has one."""
+    """A boat without a map has no position in that of another robot."""
     record(tmp_path / "nav2", [static(BEGIN - DAY, "map", "odom", 100.0), *drive(BEGIN - DAY, 20)])
     record(
         tmp_path / "boat", [*moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5), *drive(BEGIN, 20)]
@@ -292,13 +292,13 @@ def two_at_once(root: Path) -> None:
 def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path, recalls: bool) -> None:
     two_at_once(tmp_path)
     memory = remembered(tmp_path, recalls=recalls)
-    told = value_when(
+    reply = value_when(
         memory, Call(), "/odom", "/bumper", condition_type="equals", value=True, fields=[]
     )
-    assert told.value is not None
-    assert told.value.sample.time == BEGIN + 49 * S // 5 + S // 10
-    assert [note for note in told.notes if "/bumper" in note and note.endswith(": r1, r2")]
-    assert not [note for note in told.notes if "the match is of" in note]
+    assert reply.value is not None
+    assert reply.value.sample.time == BEGIN + 49 * S // 5 + S // 10
+    assert [note for note in reply.notes if "/bumper" in note and note.endswith(": r1, r2")]
+    assert not [note for note in reply.notes if "the match is of" in note]
 
 
 @each_way
@@ -308,9 +308,9 @@ def test_a_value_of_another_recording_than_the_match_is_noted(
     record(tmp_path / "r1", [boolean(BEGIN + 4 * S + 1, on=True)])
     record(tmp_path / "r2", drive(BEGIN, 20))
     memory = remembered(tmp_path, recalls=recalls)
-    told = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
-    assert told.value is not None
-    assert [note for note in told.notes if "of recording r1" in note and "of r2" in note]
+    reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
+    assert reply.value is not None
+    assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
 
 
 @each_way

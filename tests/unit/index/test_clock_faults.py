@@ -1,4 +1,4 @@
-"""Bags that a wrong clock dated, and the span that is told without them."""
+"""Bags that a wrong clock dated, and the span that is reported without them."""
 
 from __future__ import annotations
 

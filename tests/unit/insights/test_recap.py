@@ -61,10 +61,10 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: 
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
-    assert told.distance_m == pytest.approx(58 * SPEED, rel=0.002)
-    assert told.stood == 0
-    assert told.throughout == ("table",)
+    answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
+    assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
+    assert answer.stood == 0
+    assert answer.throughout == ("table",)
     expected = [
         ("cup in view", 5, 24),
         ("scissors in view", 12, 5),
@@ -72,8 +72,8 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: 
         ("/bumper became false", 26, None),
         ("scissors in view", 40, 5),
     ]
-    assert [each.text for each in told.events] == [text for text, _, _ in expected]
-    for event, (_, start, length) in zip(told.events, expected, strict=True):
+    assert [each.text for each in answer.events] == [text for text, _, _ in expected]
+    for event, (_, start, length) in zip(answer.events, expected, strict=True):
         assert abs(session.since(unix_from_ns(event.start)) - start) < 0.05
         if length is None:
             assert event.end is None
@@ -93,11 +93,11 @@ def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
     memory = memory_of(tmp_path, clock=SettableClock(now))
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = over(memory, 5.0, 95.0)
+    answer = over(memory, 5.0, 95.0)
     standing = [
         (max(start, 5.0), min(end, 95.0)) for start, end in _standing(0.0, 110.0) if 5 < end < 95
     ]
-    found = [each for each in told.events if each.kind == "stop"]
+    found = [each for each in answer.events if each.kind == "stop"]
     assert len(found) == len(standing)
     for stop, (began, ended) in zip(found, standing, strict=True):
         assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.2)
@@ -149,11 +149,11 @@ def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> N
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = over(memory, 260, 286)
-    [stop] = [each for each in told.events if each.kind == "stop"]
+    answer = over(memory, 260, 286)
+    [stop] = [each for each in answer.events if each.kind == "stop"]
     assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
     assert ((stop.end or 0) - BEGIN) / S == pytest.approx(ended, abs=0.0201)
-    reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
+    reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
     assert reply["shortest_stop_s"] == 3.0
     assert reply["stood_s"] == pytest.approx(8.0, abs=0.0401)
     assert reply["events"][0]["duration_s"] == reply["stood_s"]
@@ -178,8 +178,8 @@ def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
     memory = memory_of(tmp_path)
 
     def goes_on(end: float) -> list[bool]:
-        told = over(memory, began - 2, end)
-        return [each.goes_on for each in told.events if each.kind == "stop"]
+        answer = over(memory, began - 2, end)
+        return [each.goes_on for each in answer.events if each.kind == "stop"]
 
     assert goes_on(ended - 1) == [True]
     assert goes_on(ended) == [False]
@@ -209,12 +209,14 @@ def test_stops_under_noise_do_not_last_longer_than_the_window(
         memory = recalling(replace(memory), tmp_path)
     whole = over(memory, 0, 180)
     parts = [over(memory, at, at + 30) for at in range(0, 180, 30)]
-    for told in (whole, *parts):
-        assert told.stood is not None
-        assert told.stood <= told.end - told.start
-        stops = [each for each in told.events if each.kind == "stop"]
+    for answer in (whole, *parts):
+        assert answer.stood is not None
+        assert answer.stood <= answer.end - answer.start
+        stops = [each for each in answer.events if each.kind == "stop"]
         assert all((one.end or 0) <= other.start for one, other in pairwise(stops))
-    assert sum(told.stood or 0 for told in parts) == pytest.approx(whole.stood or 0, abs=0.2 * S)
+    assert sum(answer.stood or 0 for answer in parts) == pytest.approx(
+        whole.stood or 0, abs=0.2 * S
+    )
 
 
 def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
@@ -222,10 +224,10 @@ def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
         tmp_path / "bag.mcap", [odom(BEGIN + at * S, 1.0, 2.0, 0.0) for at in range(0, 20, 2)]
     )
     memory = memory_of(tmp_path)
-    told = over(memory, 6.5, 7.5)
-    assert told.stood == S
-    assert told.distance_m is None
-    assert any("no poses in this time" in note for note in told.notes)
+    answer = over(memory, 6.5, 7.5)
+    assert answer.stood == S
+    assert answer.distance_m is None
+    assert any("no poses in this time" in note for note in answer.notes)
     parts = [over(memory, at, at + 0.5).stood or 0 for at in (n / 2 for n in range(36))]
     assert sum(parts) == over(memory, 0, 18).stood == 18 * S
 
@@ -271,9 +273,9 @@ def test_a_robot_that_creeps_is_not_taken_to_stand(
     if recalls:
         memory = recalling(replace(memory), tmp_path)
     for span in ((0, 60), (10, 20), (45, 60)):
-        told = over(memory, *span)
-        assert told.stood == 0
-        assert told.events == ()
+        answer = over(memory, *span)
+        assert answer.stood == 0
+        assert answer.events == ()
 
 
 @each_way
@@ -291,8 +293,8 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = over(memory, 0, 300)
-    reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
+    answer = over(memory, 0, 300)
+    reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
     assert reply["stood_s"] is None
     assert any("too noisy, or too few" in note for note in reply["notes"])
 
@@ -303,9 +305,9 @@ def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_pa
         tmp_path / "bag.mcap",
         [odom(BEGIN + nth * S // 10, nth * 0.05, draw.gauss(0, 0.02), 0.0) for nth in range(300)],
     )
-    told = over(memory_of(tmp_path), 0, 30)
-    assert told.stood == 0
-    assert not any("stood_s" in note for note in told.notes)
+    answer = over(memory_of(tmp_path), 0, 30)
+    assert answer.stood == 0
+    assert not any("stood_s" in note for note in answer.notes)
 
 
 @each_way
@@ -348,8 +350,8 @@ def test_a_gap_in_the_memory_is_reported(tmp_path: Path) -> None:
             tmp_path / f"bag_{nth}.mcap",
             [odom(BEGIN + (at + t) * S, 0.1 * t, 0.0, 0.0) for t in range(10)],
         )
-    told = over(memory_of(tmp_path), 0, 120)
-    [gap] = [each for each in told.events if each.kind == "gap"]
+    answer = over(memory_of(tmp_path), 0, 120)
+    [gap] = [each for each in answer.events if each.kind == "gap"]
     assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
 
 
@@ -372,13 +374,13 @@ def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> No
         for at, level, msg in said
     ]
     write_mcap(tmp_path / "bag.mcap", messages)
-    told = over(memory_of(tmp_path), 0, 10)
-    assert times(told.events, "error") == [
+    answer = over(memory_of(tmp_path), 0, 10)
+    assert times(answer.events, "error") == [
         ("error: planner: no path (2 times)", 2.0),
         ("error: planner: giving up", 4.0),
     ]
-    assert told.distance_m is None
-    assert any("nothing is known of the way" in note for note in told.notes)
+    assert answer.distance_m is None
+    assert any("nothing is known of the way" in note for note in answer.notes)
 
 
 def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
@@ -409,12 +411,12 @@ def test_every_boolean_of_a_status_message_is_followed(
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = over(memory, 0, 40)
-    assert times(told.events, "flip") == [
+    answer = over(memory, 0, 40)
+    assert times(answer.events, "flip") == [
         (f"/fmu/out/vehicle_status {flag} became true", 13.0),
         (f"/fmu/out/vehicle_status {flag} became false", 26.0),
     ]
-    assert not any("vehicle_status" in note for note in told.notes)
+    assert not any("vehicle_status" in note for note in answer.notes)
 
 
 @each_way
@@ -452,11 +454,11 @@ def test_toggles_that_are_too_many_to_keep_are_counted(tmp_path: Path, recalls: 
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = over(memory, 0, 10)
+    answer = over(memory, 0, 10)
     more = 4 * 40 - 64
-    assert dict(told.counts) == {"flips": 64}
-    assert f"/fmu/out/vehicle_status changes too often to tell each: {more} more" in told.notes
-    assert any("left out, since they are too many: 39 flips" in note for note in told.notes)
+    assert dict(answer.counts) == {"flips": 64}
+    assert f"/fmu/out/vehicle_status changes too often to tell each: {more} more" in answer.notes
+    assert any("left out, since they are too many: 39 flips" in note for note in answer.notes)
 
 
 def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
@@ -480,8 +482,8 @@ def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> N
     seen = [(1, "cup"), (2, ""), (3, "cup"), (4, ""), (5, ""), (8, "cup"), (9, "")]
     messages = [detections(BEGIN + at * S, names.split()) for at, names in seen]
     write_mcap(tmp_path / "bag.mcap", messages)
-    told = over(memory_of(tmp_path), 0, 10)
-    assert times(told.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
+    answer = over(memory_of(tmp_path), 0, 10)
+    assert times(answer.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
 
 
 @each_way
@@ -501,9 +503,9 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = over(memory, 0, 65)
-    assert told.throughout == ("table",)
-    assert times(told.events, "thing") == [("scissors in view", 12.0)]
+    answer = over(memory, 0, 65)
+    assert answer.throughout == ("table",)
+    assert times(answer.events, "thing") == [("scissors in view", 12.0)]
     assert over(memory, 12.5, 16).throughout == ("scissors", "table")
     # What the memory does not hold was not looked at.
     assert over(memory, 0, 80).throughout == ()
@@ -529,13 +531,13 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     ]
     messages = sorted([*blinking, *things], key=lambda each: each.log_time)
     write_mcap(tmp_path / "bag.mcap", messages)
-    told = over(memory_of(tmp_path), 0, 100)
-    assert len(told.events) == MOST_EVENTS
-    assert len(times(told.events, "flip")) == 19
-    assert dict(told.counts) == {"flips": 19, "sights of things": 20}
-    assert any("left out, since they are too many: 14 sights of things" in n for n in told.notes)
-    assert [each.start for each in told.events] == sorted(each.start for each in told.events)
-    reply = Replies(tmp_path, 24_000).answer(told).text
+    answer = over(memory_of(tmp_path), 0, 100)
+    assert len(answer.events) == MOST_EVENTS
+    assert len(times(answer.events, "flip")) == 19
+    assert dict(answer.counts) == {"flips": 19, "sights of things": 20}
+    assert any("left out, since they are too many: 14 sights of things" in n for n in answer.notes)
+    assert [each.start for each in answer.events] == sorted(each.start for each in answer.events)
+    reply = Replies(tmp_path, 24_000).answer(answer).text
     assert len(reply) < 3_500
     assert set(json.loads(reply)["events"][0]) == {"timestamp", "ago_s", "text", "duration_s"}
 
@@ -565,8 +567,8 @@ def _answer(memory: Memory, span: TimeRange) -> str:
 def test_a_stop_a_hair_below_0_is_reported_without_a_sign(tmp_path: Path) -> None:
     stood = [odom(BEGIN + at * S // 2, -0.0001, 2.0, 0.0) for at in range(40)]
     write_mcap(tmp_path / "bag.mcap", stood)
-    told = [each.text for each in over(memory_of(tmp_path), 0, 30).events]
-    assert told == ["stood at x 0.00, y 2.00"]
+    answer = [each.text for each in over(memory_of(tmp_path), 0, 30).events]
+    assert answer == ["stood at x 0.00, y 2.00"]
 
 
 def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> None:
@@ -578,8 +580,8 @@ def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> Non
     flips = [boolean(BEGIN + at * S, 3 <= at < 7) for at in range(20)]
     messages = sorted([*stood, *seen, *flips], key=lambda each: each.log_time)
     write_mcap(tmp_path / "bag.mcap", messages)
-    told = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 30).events}
-    assert told == {
+    answer = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 30).events}
+    assert answer == {
         "stood at x 1.00, y 2.00": True,
         "cup in view": False,
         "fork in view": True,

@@ -161,11 +161,11 @@ class TestSilentTopics:
         assert describe_silent_topics([], []) is None
 
     def test_the_silent_ones_are_named(self) -> None:
-        said = describe_silent_topics(["/b", "/odom", "/a"], ["/odom"])
-        assert said is not None
-        assert said.endswith("/a, /b")
+        sentence = describe_silent_topics(["/b", "/odom", "/a"], ["/odom"])
+        assert sentence is not None
+        assert sentence.endswith("/a, /b")
 
     def test_silence_of_all_of_them_points_at_the_transport(self) -> None:
-        said = describe_silent_topics(["/odom", "/tf"], [])
-        assert said is not None
-        assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in said
+        sentence = describe_silent_topics(["/odom", "/tf"], [])
+        assert sentence is not None
+        assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in sentence

@@ -388,11 +388,11 @@ class TestAdopt:
         (tmp_path / "a" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
         (tmp_path / "b" / "old").symlink_to(target.parent)
         assert cli.main(["adopt", "a", "b"]) == 1
-        said = capsys.readouterr().out
-        assert "no bag files lie there" in said
+        output = capsys.readouterr().out
+        assert "no bag files lie there" in output
         for link in ("a/x_0.mcap", "a/y_0.mcap", "b/old"):
-            assert f"{link} is a symbolic link, which is not followed" in said
-        assert "adopted" not in said
+            assert f"{link} is a symbolic link, which is not followed" in output
+        assert "adopted" not in output
         (tmp_path / "old" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
         assert cli.main(["adopt", "old", "a"]) == 0
         assert "adopted: old (1 bag file, " in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Who can reach an address, and what is said where it cannot be listened on."""
+"""Who can reach an address, and the error where the server cannot listen on it."""
 
 from __future__ import annotations
 

@@ -121,8 +121,8 @@ class TestReadingOnlyWhatIsWanted:
 def read_on(
     reader: McapReader, path: Path, *, newest_first: bool = False
 ) -> tuple[list[int], list[str]]:
-    """The log times of all messages, and what is said of contradictions on the way."""
-    told: list[str] = []
+    """The log times of all messages, and the notes on contradictions on the way."""
+    notes: list[str] = []
     found: list[int] = []
     records = reader.records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
     while True:
@@ -130,9 +130,9 @@ def read_on(
             for each in records:
                 found.append(each.log_time)  # noqa: PERF401 - what came before an error counts
         except BagContradictionError as error:
-            told.append(error.reason)
+            notes.append(error.reason)
         else:
-            return found, told
+            return found, notes
 
 
 class TestIndexesThatAreWrong:
@@ -211,18 +211,18 @@ class TestIndexesThatAreWrong:
         change_index(path, wrong, at, first + value if at == 0 else value)
         reason = "damaged: a message is not where its index says; its messages were read without"
         for newest_first in (False, True):
-            found, told = read_on(McapReader(), path, newest_first=newest_first)
+            found, notes = read_on(McapReader(), path, newest_first=newest_first)
             assert found == sorted(range(count), reverse=newest_first)
-            assert told == [f"{reason} its indexes"]
+            assert notes == [f"{reason} its indexes"]
         reader = McapReader()
         with pytest.raises(BagContradictionError):
             next(reader.records(path, ["/chatter"], TimeWindow(first, first + 1)))
         # From now on it is known, and named in every answer.
         with pytest.raises(BagError):
             reader.newest(path, "/chatter", EVERYTHING)
-        found, told = read_on(reader, path)
+        found, notes = read_on(reader, path)
         assert found == [*range(count)]
-        assert len(told) == 1
+        assert len(notes) == 1
         assert any("without its indexes" in note for note in reader.summarize(path).notes)
 
     def test_what_a_wrong_message_index_says_is_in_no_summary_and_no_log_times(
@@ -271,9 +271,9 @@ class TestIndexesThatAreWrong:
             " were read without its indexes"
         )
         assert summary.notes == (reason,)
-        found, told = read_on(reader, path)
+        found, notes = read_on(reader, path)
         assert found == [*range(20)]
-        assert told == [reason]
+        assert notes == [reason]
         records = reader.records(path, ["/chatter"], TimeWindow(15, 20))
         with pytest.raises(BagContradictionError):
             next(records)
@@ -305,9 +305,9 @@ class TestIndexesThatAreWrong:
         data = bytearray(path.read_bytes())
         data[index_at + 15 : index_at + 31] = data[index_at + 31 : index_at + 47]
         path.write_bytes(data)
-        found, told = read_on(McapReader(), path)
+        found, notes = read_on(McapReader(), path)
         assert found == [5] * 4
-        assert len(told) == 1
+        assert len(notes) == 1
 
     @pytest.mark.parametrize(
         ("at", "value"),
@@ -370,9 +370,9 @@ class TestIndexesThatAreWrong:
         edit_summary(path, Opcode.CHUNK_INDEX, renamed)
         for newest_first in (False, True):
             reader = McapReader()
-            found, told = read_on(reader, path, newest_first=newest_first)
+            found, notes = read_on(reader, path, newest_first=newest_first)
             assert found == sorted(range(20), reverse=newest_first)
-            assert told or reader.summarize(path).notes
+            assert notes or reader.summarize(path).notes
             assert times(read(McapReader(), path, "/bumper")) == [*range(20)]
 
     def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(

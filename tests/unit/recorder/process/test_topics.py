@@ -116,9 +116,9 @@ def test_an_invalid_name_is_refused_with_file_entry_and_reason(
     tmp_path: Path, entry: str, reason: str
 ) -> None:
     path = listed(tmp_path, f"topics: [/odom, '{entry}']")
-    said = refusal(path)
-    assert said.startswith(f"{path}: {entry!r} cannot be recorded: ")
-    assert reason in said
+    message = refusal(path)
+    assert message.startswith(f"{path}: {entry!r} cannot be recorded: ")
+    assert reason in message
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,9 @@ def test_an_invalid_name_is_refused_with_file_entry_and_reason(
 )
 def test_what_is_no_list_of_topics_is_refused(tmp_path: Path, text: str, reason: str) -> None:
     path = listed(tmp_path, text)
-    said = refusal(path)
-    assert said.startswith(f"{path}: ")
-    assert reason in said
+    message = refusal(path)
+    assert message.startswith(f"{path}: ")
+    assert reason in message
 
 
 def test_a_missing_list_is_refused_with_its_key(tmp_path: Path) -> None:
