@@ -201,28 +201,19 @@ class BagAccess:
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """Returns one bag's messages in log-time order; a note says what cannot be read.
+        """Yields one bag's messages in log-time order; a note says what cannot be read.
 
         There is no note where all that is lost lies before `since`: that part is read to recognise
         duplicates only.
         """
         self.check_deadline()
         stored = self._stored_messages(bag, topics)
-        if stored is None:
-            part = _indexed_part(bag, window)
-            return self._read(bag, topics, part, newest_first=newest_first, since=since)
-        ordered = reversed(stored) if newest_first else iter(stored)
-        return (StoredMessage(bag, each) for each in ordered if window.contains(each.log_time))
-
-    def _read(
-        self,
-        bag: BagFile,
-        topics: Sequence[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool,
-        since: Ns,
-    ) -> Iterator[StoredMessage]:
+        if stored is not None:
+            inside = [each for each in stored if window.contains(each.log_time)]
+            ordered = reversed(inside) if newest_first else inside
+            yield from (StoredMessage(bag, each) for each in ordered)
+            return
+        part, reader = _indexed_part(bag, window), self.memory.reader
         records: Iterator[Record] | None = None
         # The time between two records is the reader's; what happens at `yield` is the caller's.
         clock, spent, count = time.perf_counter_ns, 0, 0
@@ -230,8 +221,7 @@ class BagAccess:
             begin = clock()
             try:
                 if records is None:
-                    reader = self.memory.reader
-                    records = reader.records(bag.path, topics, window, newest_first=newest_first)
+                    records = reader.records(bag.path, topics, part, newest_first=newest_first)
                 for record in records:
                     spent += clock() - begin
                     count += 1

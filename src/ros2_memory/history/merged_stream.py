@@ -232,10 +232,11 @@ class MergedStream:
             yield from read(bags[0].bag)
             return
         sign = -1 if newest_first else 1
+        # Each with the earliest sort key that one of its messages can have in the heap.
         waiting = deque(
             sorted(
-                enumerate(bags),
-                key=lambda each: (_edge(each[1], newest_first=newest_first), sign * each[0]),
+                (-span.last if newest_first else span.first, sign * rank, span.bag)
+                for rank, span in enumerate(bags)
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
@@ -246,11 +247,9 @@ class MergedStream:
                 heapq.heappush(heap, (sign * found.time, rank, found, source))
 
         while heap or waiting:
-            while waiting and (
-                not heap or _edge(waiting[0][1], newest_first=newest_first) <= heap[0][0]
-            ):
-                rank, span = waiting.popleft()
-                push(sign * rank, read(span.bag))
+            while waiting and (not heap or waiting[0][0] <= heap[0][0]):
+                _, rank, bag = waiting.popleft()
+                push(rank, read(bag))
             if heap:
                 _, rank, found, source = heapq.heappop(heap)
                 yield found
@@ -284,8 +283,3 @@ def _in_order(span: BagSpan) -> tuple[Ns, Ns, str]:
 def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:
     """Returns a bag with the times of its first and last message of these topics, if any."""
     return BagSpan(*bag.summary.span_of(topics), bag)
-
-
-def _edge(span: BagSpan, *, newest_first: bool) -> Ns:
-    """Returns the earliest sort key that a message of a bag can have in the heap."""
-    return -span.last if newest_first else span.first

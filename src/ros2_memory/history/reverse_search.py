@@ -8,7 +8,6 @@ decide which messages count is read, as without a catalogue: the answer is the s
 from __future__ import annotations
 
 import heapq
-import time
 from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.analysis.conditions import refusal_for
@@ -148,21 +147,19 @@ class ReverseSearch:
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
-        begin = time.perf_counter_ns()
         channel = found.record.channel
         memory = self._view.memory
-        try:
-            message = memory.reader.decode(found.record)
-            value = memory.extractor.exact(message, channel.type)
-            self._has_decoded = True
-            return self._condition.matches(value)
-        except UndecodableError as error:
-            # A copy: the raised error keeps its traceback alive, and the message with it.
-            alone = UndecodableError(error.topic, error.type_name, error.reason)
-            self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
-            return None
-        finally:
-            self._view.call.stages.add("extract", time.perf_counter_ns() - begin)
+        with self._view.call.stages.timed("extract"):
+            try:
+                message = memory.reader.decode(found.record)
+                value = memory.extractor.exact(message, channel.type)
+                self._has_decoded = True
+                return self._condition.matches(value)
+            except UndecodableError as error:
+                # A copy: the raised error keeps its traceback alive, and the message with it.
+                alone = UndecodableError(error.topic, error.type_name, error.reason)
+                self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
+                return None
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:
         """Notes which topics have messages from a moment on that could not be tested."""

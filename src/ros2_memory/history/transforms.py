@@ -6,7 +6,6 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 
 from __future__ import annotations
 
-import time
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -306,7 +305,8 @@ def _stored_pairs(
     known: set[tuple[str, str]] = set()
     rest: list[tuple[Ns, Ns]] = []
     for bag, first, last in segment.extents(topic):
-        if window.overlaps(first, last) and _is_of(view, bag, among):
+        is_of_session = among is None or sessions_of(view).folder(bag.recording) in among
+        if is_of_session and window.overlaps(first, last):
             edge = edges.get(numbers.get(bag.file, 0))
             mixed = among is not None and sessions_of(view).is_carried(bag)
             if edge is None or mixed:
@@ -458,19 +458,13 @@ def _bags_of(
     return [each for each in bags if each.bag.recording in chosen]
 
 
-def _is_of(view: View, bag: BagFile, among: Session | None) -> bool:
-    return among is None or sessions_of(view).folder(bag.recording) in among
-
-
 def _decoded(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
     static = found.record.channel.topic in view.memory.limits.tf_static_topics
-    begin = time.perf_counter_ns()
-    try:
-        message = view.memory.reader.decode(found.record)
-        return view.memory.extractor.transforms(message, found.time, static=static)
-    except UndecodableError as error:
-        view.notes.complete = False
-        view.notes.add(f"messages of {error.topic} could not be decoded: {error.reason}")
-        return ()
-    finally:
-        view.call.stages.add("extract", time.perf_counter_ns() - begin)
+    with view.call.stages.timed("extract"):
+        try:
+            message = view.memory.reader.decode(found.record)
+            return view.memory.extractor.transforms(message, found.time, static=static)
+        except UndecodableError as error:
+            view.notes.complete = False
+            view.notes.add(f"messages of {error.topic} could not be decoded: {error.reason}")
+            return ()

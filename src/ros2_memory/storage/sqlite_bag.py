@@ -316,11 +316,9 @@ def _ordered_rows(
     """Returns log time, row and topic of the messages, in order; by an index if `indexed`."""
     query = _DESCENDING if newest_first else _ASCENDING
     arguments = (window.start, window.stop, json.dumps(list(wanted)))
-    return base.execute(query if indexed else _without_index(query), arguments)
-
-
-def _without_index(query: str) -> str:
-    return query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
+    if not indexed:
+        query = query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
+    return base.execute(query, arguments)
 
 
 def _is_newest(

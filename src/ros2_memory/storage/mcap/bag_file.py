@@ -11,11 +11,14 @@ from __future__ import annotations
 import struct
 from bisect import bisect_left
 from functools import lru_cache, partial
+from io import BytesIO
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.records import Header
 
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.model import TimeWindow
@@ -55,10 +58,10 @@ from ros2_memory.storage.mcap.records import (
     Declarations,
     closing_of,
     is_finished,
-    profile_of,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
+from ros2_memory.storage.mcap.walk import file_records
 from ros2_memory.storage.zstd_bag import uncompressed_payload
 
 if TYPE_CHECKING:
@@ -80,13 +83,11 @@ class _ContradictedError(UnreadableError):
 
     Attributes:
         chunk: the chunk in place of whose messages this is raised; None before any was read.
-        believed: the chunks by offset, as the index described them.
     """
 
     def __init__(self, reason: str, chunk: Chunk | None = None) -> None:
         super().__init__(reason)
         self.chunk = chunk
-        self.believed: dict[int, Chunk] = {}
 
 
 class McapBags:
@@ -132,9 +133,13 @@ class McapBags:
             return list(self._index(file).channels.values())
 
     def profile(self, path: Path) -> str:
-        """Returns the profile in the header of the file."""
+        """Returns the profile in the header of the file; empty if there is no header."""
         with OpenFile(path) as file:
-            return profile_of(file)
+            first = next(file_records(file), None)
+            if first is None or first.opcode != Opcode.HEADER:
+                return ""
+            header: Header = Header.read(ReadDataStream(BytesIO(first.body(file))))
+            return header.profile
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
@@ -154,11 +159,11 @@ class McapBags:
                 yield from merged(runs, newest_first=newest_first)
             except _ContradictedError as error:
                 # Raised in place of a run: what was yielded lies before all that the run can hold.
-                index = self._distrust(file, index, error)
+                believed, index = index, self._distrust(file, error)
                 yield ContradictionError(index.contradiction, window.start, window.stop - 1)
                 left, passed = _split_window(window, error.chunk, newest_first=newest_first)
-                if lost := _overlooked(index, error, _wanted(index, topics), passed):
-                    yield lost
+                if overlooked := _overlooked(believed, index, _wanted(index, topics), passed):
+                    yield LostError(str(error), *overlooked)
                 runs = self._runs(file, index, topics, left, newest_first=newest_first)
                 yield from merged(runs, newest_first=newest_first)
 
@@ -214,7 +219,7 @@ class McapBags:
             try:
                 columns = self._columns(file, index, topic, window)
             except _ContradictedError as error:
-                index = self._distrust(file, index, error)
+                index = self._distrust(file, error)
                 columns = self._columns(file, index, topic, window)
         parts = [column.between(window.start, window.stop).times for column in columns]
         if window.empty or not parts:
@@ -415,12 +420,11 @@ class McapBags:
                 if index.declared is not None:
                     _require_declared(index.declared, data, columns)
         except _ContradictedError as error:
-            return self._distrust(file, index, error)
+            return self._distrust(file, error)
         return index
 
-    def _distrust(self, file: OpenFile, index: McapIndex, error: _ContradictedError) -> McapIndex:
+    def _distrust(self, file: OpenFile, error: _ContradictedError) -> McapIndex:
         """Returns an index of the messages themselves, in place of one that was found wrong."""
-        error.believed = {chunk.offset: chunk for chunk in index.chunks}
         reason = f"{error}; {READ_WITHOUT_INDEXES}"
         # Kept apart from the index: not every read that follows would find it out again.
         self._contradictions.put(file.key, reason, len(reason) + len(file.key.path) + 200)
@@ -494,20 +498,20 @@ def _split_window(
 
 
 def _overlooked(
-    index: McapIndex, error: _ContradictedError, wanted: Collection[int], passed: TimeWindow
-) -> LostError | None:
-    """Returns what was missed in a part of a window that was read by wrong indexes."""
+    believed: McapIndex, index: McapIndex, wanted: Collection[int], passed: TimeWindow
+) -> tuple[Ns, Ns] | None:
+    """Returns between which log times messages were missed, in a part read by wrong indexes."""
+    known = {chunk.offset: chunk for chunk in believed.chunks}
     chunks = [
         chunk
         for chunk in index.chunks
         if _overlaps(chunk, passed) and not chunk.channels.isdisjoint(wanted)
-        if not _describes(error.believed.get(chunk.offset), chunk)
+        if not _describes(known.get(chunk.offset), chunk)
     ]
     if not chunks:
         return None
     first = max(min(chunk.start for chunk in chunks), passed.start)
-    last = min(max(chunk.end for chunk in chunks), passed.stop - 1)
-    return LostError(str(error), first, last)
+    return first, min(max(chunk.end for chunk in chunks), passed.stop - 1)
 
 
 def _describes(believed: Chunk | None, chunk: Chunk) -> bool:

@@ -67,12 +67,11 @@ def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
         UnreadableError: the file ends before one, or a record before it is damaged.
     """
     for record in file_records(file):
-        opcode, size = record.opcode, record.end - record.body_at
-        begins_right = (record.offset == MAGIC_SIZE) == (opcode == Opcode.HEADER)
-        if begins_right and opcode in _END:
+        if (record.offset == MAGIC_SIZE) != (record.opcode == Opcode.HEADER):
+            raise UnreadableError("damaged: it does not begin with one header")
+        if record.opcode in _END:
             return
-        is_readable = begins_right and size <= _MAX_BYTES
-        read = decode_record(opcode, file.read(record.body_at, size)) if is_readable else None
+        read = decode_record(record.opcode, record.body(file, _MAX_BYTES))
         if read is None:
             raise UnreadableError("damaged: a record before the first message cannot be read")
         yield read

@@ -51,9 +51,6 @@ _COUNTS_AT: Final = 46
 _COUNT_BYTES: Final = 10
 _LONGEST_CACHED: Final = 16 * 1024
 
-_MAX_PROFILE_BYTES: Final = 256
-_LENGTH_BYTES: Final = 4
-
 
 # rosbag2 writes QoS into the metadata of a channel as YAML; to parse it takes fifty times as long
 # as this search. Newer distros write the name of the durability, older ones the number of rmw.
@@ -218,22 +215,3 @@ def require_mcap(file: OpenFile) -> None:
         raise UnreadableError("not an MCAP file: it does not begin as one")
     if file.size < MAGIC_SIZE:
         raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
-
-
-def profile_of(file: OpenFile) -> str:
-    """Returns the profile in the header record; empty if there is no header.
-
-    Raises:
-        UnreadableError: it is not MCAP, or its header is damaged.
-    """
-    require_mcap(file)
-    text_at = MAGIC_SIZE + RECORD.size + _LENGTH_BYTES
-    if file.size < text_at:
-        return ""
-    head = file.read(MAGIC_SIZE, RECORD.size + _LENGTH_BYTES)
-    if head[0] != Opcode.HEADER:
-        return ""
-    length = int.from_bytes(head[RECORD.size :], "little")
-    if length > _MAX_PROFILE_BYTES:
-        raise UnreadableError("damaged: its profile is longer than any can be")
-    return file.read(text_at, length).decode()

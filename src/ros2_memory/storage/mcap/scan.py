@@ -17,7 +17,6 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import (
-    MAX_SECTION_BYTES,
     UnreadableError,
     as_unreadable,
     too_large,
@@ -103,7 +102,7 @@ class _Scan:
                 self._add_chunk(record)
             elif record.opcode in _DECLARED:
                 known = self.repeated if self.data_ended else self.declared
-                self._declare(record.opcode, self._body(record), known)
+                self._declare(record.opcode, record.body(self.file), known)
         except UnreadableError as error:
             self.damaged.append(str(error))
         self.read_to = record.end
@@ -124,11 +123,6 @@ class _Scan:
                 return
             self.redeclared = self.redeclared or not known.agrees(opcode, body)
             known.add(opcode, body)
-
-    def _body(self, record: FileRecord) -> bytes:
-        if record.end - record.body_at > MAX_SECTION_BYTES:
-            raise UnreadableError("damaged: a record is larger than any can be")
-        return self.file.read(record.body_at, record.end - record.body_at)
 
     def _add_chunk(self, record: FileRecord) -> None:
         opened = self.opener.open(record)

@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from ros2_memory.storage.errors import (
     MAX_CHUNKS,
     MAX_COMPRESSION_RATIO,
+    MAX_SECTION_BYTES,
     MESSAGE_BYTES,
     UnreadableError,
     as_unreadable,
@@ -64,6 +65,16 @@ class FileRecord(NamedTuple):
     def body_at(self) -> int:
         """Where the body begins in the file."""
         return self.offset + RECORD.size
+
+    def body(self, file: OpenFile, max_bytes: int = MAX_SECTION_BYTES) -> bytes:
+        """Returns the body.
+
+        Raises:
+            UnreadableError: it is larger than `max_bytes`, or not all there.
+        """
+        if self.end - self.body_at > max_bytes:
+            raise UnreadableError("damaged: a record is larger than any can be")
+        return file.read(self.body_at, self.end - self.body_at)
 
 
 def file_records(file: OpenFile) -> Iterator[FileRecord]:
