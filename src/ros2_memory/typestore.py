@@ -72,7 +72,7 @@ class MessageType(NamedTuple):
 
 
 class _UnusableError(Exception):
-    """A definition that no deserializer can be made of; the text says why."""
+    """A definition that no deserializer can be made of; the text is the reason."""
 
 
 class _Section(NamedTuple):

@@ -51,11 +51,10 @@ def identity_of(directory: Path | str) -> Identity | None:
     Raises:
         OSError: the directory cannot be opened.
     """
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
     try:
         if stat.S_ISLNK(os.lstat(directory).st_mode):
             return None
-        descriptor = os.open(directory, flags)
+        descriptor = os.open(directory, _LISTABLE | os.O_NOFOLLOW)
     except (FileNotFoundError, NotADirectoryError):
         return None
     try:

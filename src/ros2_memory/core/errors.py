@@ -84,7 +84,7 @@ class QueryTimeoutError(EpisodicError):
 
 
 class BusyError(EpisodicError):
-    """The call was not begun, because others were first; the sentence says what to do."""
+    """The call was not begun, because others were first; the sentence advises what to do."""
 
     code = "busy"
 
@@ -133,12 +133,12 @@ class UndecodableError(EpisodicError):
 
 
 class RefusedError(EpisodicError):
-    """A request is refused; the sentence says why, and what to do instead."""
+    """A request is refused; the sentence gives the reason, and what to do instead."""
 
     code = "refused"
 
 
 class RecorderError(EpisodicError):
-    """Recording cannot start or continue; the sentence says what to do."""
+    """Recording cannot start or continue; the sentence advises what to do."""
 
     code = "recorder"

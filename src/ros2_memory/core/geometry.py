@@ -1,7 +1,7 @@
 """Rotations, rigid transforms and paths in plain floats.
 
 Quaternions are (x, y, z, w) with Hamilton's product, and must be of unit length unless a function
-says otherwise: `normalised` makes them so. A `Transform` is the pose of a child in its parent.
+documents otherwise: `normalised` makes them so. A `Transform` is the pose of a child in its parent.
 """
 
 from __future__ import annotations

@@ -46,11 +46,11 @@ _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
 class BagAccess:
     """Reads the bags of one snapshot, with a deadline.
 
-    A bag that cannot be read raises nothing here: a note says so, and the other bags answer.
+    A bag that cannot be read raises nothing here: a note reports it, and the other bags answer.
 
     Attributes:
         snapshot: the index as it was when the call began; the same for the whole call.
-        notes: what the reply says besides its answer.
+        notes: what the reply reports besides its answer.
     """
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
@@ -136,7 +136,7 @@ class BagAccess:
         """Yields the messages, and records what kind of bags they are from.
 
         A bag that a crash left open makes the answer incomplete; of one that is still being
-        written the reply has to say that it was used.
+        written the reply has to report that it was used.
         """
         for each in messages:
             if each.bag.state is BagState.INCOMPLETE:
@@ -201,7 +201,7 @@ class BagAccess:
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """Yields one bag's messages in log-time order; a note says what cannot be read.
+        """Yields one bag's messages in log-time order; a note reports what cannot be read.
 
         There is no note where all that is lost lies before `since`: that part is read to recognise
         duplicates only.
@@ -269,7 +269,7 @@ class BagAccess:
         if not static and not self.snapshot.timeline.is_transient_local(topic):
             return None
         if is_carried(bag.path):
-            return None  # its channels say which recording each message is of, the catalogue not
+            return None  # its channels name the recording of each message, the catalogue not
         entry = self.entry(bag)
         if entry is None:
             return None

@@ -277,7 +277,7 @@ class Notes:
         """Returns the sentences for the reply, in the order in which each was first needed."""
         by_kind: dict[Reason, dict[str, str]] = {}
         for note in self._notes.values():
-            # A sentence on the bag's summary may say the same already.
+            # A sentence on the bag's summary may report the same already.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
         # In which order bags are found damaged depends on what the catalogue knows: sorted, the

@@ -172,7 +172,7 @@ def positions_of(
 ) -> Iterator[tuple[StoredMessage, Vector3]]:
     """Yields messages with the positions (m) of their poses; without those that are NaN or beyond.
 
-    A note says which messages cannot be decoded.
+    A note reports which messages cannot be decoded.
     """
     for found in messages:
         try:

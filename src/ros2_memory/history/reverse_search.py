@@ -55,12 +55,12 @@ class ReverseSearch:
         return CandidateBags(self._view, self.topics, self._condition, until)
 
     def newest(self, until: Ns) -> StoredMessage | None:
-        """Returns the newest match before a moment; notes say what could not be tested.
+        """Returns the newest match before a moment; notes report what could not be tested.
 
         Raises:
             InvalidArgumentsError: no value of the topics can meet the condition.
             NoDataError: no message could be decoded.
-            QueryTimeoutError: the call's time is over; says how far back was searched.
+            QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
         candidates = self.candidates(until)
         noted_before = self._view.notes.keys()

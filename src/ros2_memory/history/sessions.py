@@ -8,7 +8,7 @@ Recordings of one time may be of one robot, for which two recorders were started
 moving transforms alone borrows the static ones of other frames from one that has these alone, and
 one without any borrows from the one session beside it that has some. Nothing is lent where two
 recordings hold poses at that time: these are two robots. Only a handover proves that two recordings
-are of one robot, so a reply that uses borrowed transforms has to say so.
+are of one robot, so a reply that uses borrowed transforms has to note it.
 """
 
 from __future__ import annotations

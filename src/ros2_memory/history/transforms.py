@@ -86,7 +86,7 @@ def transform_at(
     """Returns the pose of `child` in `parent` at a moment, by tf2's rules.
 
     With the `recording` of a message the transforms of that recording's session are used; else
-    those of the session that was recorded then. Where several were, and differ, a note says so.
+    those of the session that was recorded then. Where several were, and differ, a note reports it.
 
     Raises:
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
@@ -126,7 +126,7 @@ def transform_at(
 
 
 def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
-    """Returns the session whose transforms place a message of a recording; a note says if borrowed.
+    """Returns the session whose transforms place a message of a recording; a note if borrowed.
 
     They are borrowed where those of the recording's own session do not lead from one frame to the
     other, and those of the one other session that lends do.
@@ -255,7 +255,7 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     named = [each for each in sorted(pairs.items()) if _is_edge(each[0])]
     if len(named) < len(pairs):
         view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
-    return tuple(FrameEdge(parent, child, static) for (parent, child), static in named)
+    return tuple(FrameEdge(parent, child, is_static) for (parent, child), is_static in named)
 
 
 def _pairs(
@@ -459,11 +459,11 @@ def _bags_of(
 
 
 def _decoded(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
-    static = found.record.channel.topic in view.memory.limits.tf_static_topics
+    is_static = found.record.channel.topic in view.memory.limits.tf_static_topics
     with view.call.stages.timed("extract"):
         try:
             message = view.memory.reader.decode(found.record)
-            return view.memory.extractor.transforms(message, found.time, static=static)
+            return view.memory.extractor.transforms(message, found.time, static=is_static)
         except UndecodableError as error:
             view.notes.complete = False
             view.notes.add(f"messages of {error.topic} could not be decoded: {error.reason}")

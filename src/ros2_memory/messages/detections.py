@@ -1,4 +1,4 @@
-"""Reads detections from messages: what a detector saw, by name, and where if the message says so.
+"""Reads detections from messages: what a detector saw, by name, and where if the message has that.
 
 A detection is an object with a name under one of `NAMES`: an entry of a list, or the whole message.
 A string that is JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The

@@ -69,7 +69,7 @@ def round_single(number: np.float32) -> JsonValue:
 def round_real(number: float) -> JsonValue:
     """Rounds a float of unknown unit.
 
-    rosbags decodes a scalar float32 to a Python float, which no longer says that it was one. Its
+    rosbags decodes a scalar float32 to a Python float, which no longer shows that it was one. Its
     value does: it is exactly a float32 and yet needs more digits than these, which happens to a
     measured float64 once in 2**29. It is rounded as by `round_single`.
     """

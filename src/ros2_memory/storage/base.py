@@ -31,7 +31,7 @@ ROS2_PROFILE: Final = "ros2"
 
 
 class Closing(StrEnum):
-    """Whether a file says of itself that its writer has finished."""
+    """Whether the writer of a file has finished, by the file itself."""
 
     CLOSED = "closed"
     OPEN = "open"
@@ -72,9 +72,7 @@ class Channel:
     def memory_bytes(self) -> int:
         """About how much memory its texts take, in bytes."""
         size = len(self.topic) + len(self.schema.name) + len(self.schema.text)
-        for name, text in self.metadata:
-            size += len(name) + len(text)
-        return size
+        return size + sum(len(name) + len(text) for name, text in self.metadata)
 
 
 class Record(NamedTuple):

@@ -62,7 +62,7 @@ def layout_of(definitions: Typesdict, root: str, payload: bytes) -> CdrLayout | 
 def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
     """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
 
-    One byte of it can stand for an object of a hundred. A payload that does not fit its definition
+    One byte of it can become an object of a hundred. A payload that does not fit its definition
     is left to decoding, which names the fault.
     """
     if len(payload) < _COUNTED_FROM_BYTES:

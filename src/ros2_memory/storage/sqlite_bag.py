@@ -327,7 +327,7 @@ def _is_newest(
     window: TimeWindow,
     found: tuple[Ns, int, int],
 ) -> bool:
-    """Returns whether a message found by an index is the newest, as far as the next rows tell.
+    """Returns whether a message found by an index is the newest, as far as the next rows show.
 
     A message that the index lacks, or has elsewhere, or that is not found because the index is
     stored in another order than it declares, was mostly written soon after the one found instead.

@@ -265,7 +265,7 @@ class McapBags:
 
         def chunk_run(chunk: Chunk) -> SortedRun[Record | LostError]:
             def rows() -> Rows[Record | LostError] | None:
-                # Of a chunk that cannot be read, only what its index says was wanted is lost.
+                # Of a chunk that cannot be read, only what is wanted by its index is lost.
                 try:
                     with as_unreadable():
                         data = self._chunk_data(file, chunk)

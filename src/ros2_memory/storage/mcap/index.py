@@ -241,8 +241,8 @@ def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]
     """Compares every chunk index with the head of its chunk, and looks between the chunks.
 
     Raises:
-        DoubtError: a chunk is not where its index says, or not of these times; or there is a chunk
-            or a message that no index knows.
+        DoubtError: a chunk is not where its index has it, or not of these times; or there is a
+            chunk or a message that no index knows.
     """
     ordered = sorted(chunks, key=itemgetter(0))
     if ordered[-1].offset >= file.size:

@@ -31,7 +31,8 @@ class Rows(NamedTuple, Generic[T]):
 class SortedRun(NamedTuple, Generic[T]):
     """A part of a file: no message in it lies outside `first` to `last` (inclusive).
 
-    `rank` is its position in the file; `rows` reads it, and is called only when its turn comes.
+    `rank` is its position in the file, which no other run has; `rows` reads it, and is called only
+    when its turn comes.
     """
 
     first: Ns
@@ -50,7 +51,6 @@ def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
     # Sorted so that the next to be read is the last of the list.
     waiting = sorted(
         ((-run.last if newest_first else run.first, sign * run.rank, run) for run in runs),
-        key=lambda entry: entry[:2],
         reverse=True,
     )
     heap: list[tuple[Ns, int, int, Rows[T], list[Ns]]] = []

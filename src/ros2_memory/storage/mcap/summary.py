@@ -2,7 +2,7 @@
 
 Written by hand, since indexing a week reads sixty thousand of them, and a query of an unread bag
 waits for one: 0.06 ms for a bag of 29 chunks, where `get_summary` of the `mcap` library takes
-0.31 ms (the splits that `benchmarks/bags.py` writes). It decodes only what tells whether a chunk is
+0.31 ms (the splits that `benchmarks/bags.py` writes). It decodes only what shows whether a chunk is
 wanted, and the schemas and channels, which the bags of one robot share, only once.
 """
 
@@ -39,7 +39,7 @@ _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
 INDEX_OFFSET_BYTES: Final = _INDEX_OFFSET.size
-"""What a chunk index takes to say where the message index of one channel lies."""
+"""Bytes of a chunk index for the place of one channel's message index."""
 _INDEX_LENGTH: Final = struct.Struct("<Q")
 _new_tuple: Final = tuple.__new__
 _MAX_CACHED_BYTES: Final = 128 << 10
