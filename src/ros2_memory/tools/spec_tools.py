@@ -86,118 +86,110 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
     )
 
 
-_LIST = ToolDeclaration(
-    (ToolName("list_recorded_topics", "Recorded topics"),),
-    "Every recorded topic. Ask this first when a topic's name is not known. "
-    "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first where "
-    "they are too many.",
-    TopicListArguments,
-    _list_topics,
-)
-_RANGE = ToolDeclaration(
-    (ToolName("data_time_range", "Span of the memory"),),
-    "What time span the memory covers, with its holes, and what time it is now. "
-    "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
-    "local ISO, null while the memory is empty.",
-    NoArguments,
-    queries.data_time_range,
-)
-_TOPIC_AT = ToolDeclaration(
-    _at_and_ago("topic", "A topic's value", at="at_time"),
-    "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
-    "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
-    "Reply: {{topic, type, timestamp, value}}.",
-    TopicAtArguments,
-    queries.topic_value,
-)
-_TOPIC_RANGE = ToolDeclaration(
-    (
-        ToolName("get_topic_in_range", "A topic over a window", Between),
-        ToolName("get_topic_in_last", "A topic over the last seconds", Last),
-    ),
-    "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
-    "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
-    "fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all messages.",
-    TopicRangeArguments,
-    queries.topic_range,
-)
-_POSITION = ToolDeclaration(
-    _at_and_ago("position", "Robot position"),
-    "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-    "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, longitude "
-    "and altitude instead of x, y, z, which are null.",
-    MotionArguments,
-    queries.position,
-)
-_VELOCITY = ToolDeclaration(
-    _at_and_ago("velocity", "Robot velocity"),
-    "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
-    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
-    "x is ahead and angular z turns left.",
-    MotionArguments,
-    queries.velocity,
-)
-_TRANSFORM = ToolDeclaration(
-    _at_and_ago("transform", "Transform"),
-    "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
-    "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
-    "}}.",
-    TransformArguments,
-    queries.transform,
-)
-_FRAMES = ToolDeclaration(
-    (ToolName("list_frames", "Frames"),),
-    "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
-    NoArguments,
-    queries.frames,
-    blocking=True,
-)
 _CONDITIONS = (
     "contains (part of a text anywhere in the message, or an element of the list that field "
     "names), equals (boolean, number or text; 1 and 0 are true and false), "
     "above and below (number; field says which), near_position "
     '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
 )
-_LAST_MATCH = ToolDeclaration(
-    (ToolName("find_last_match", "Last time something held"),),
-    "When a condition last held, in all history. "
-    f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
-    "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
-    "read).",
-    LastMatchArguments,
-    queries.find_last_match,
-    blocking=True,
-)
-_VALUE_WHEN = ToolDeclaration(
-    (ToolName("get_value_when", "A topic when another matched"),),
-    "What value_topic held when condition_topic last met a condition (as in find_last_match), "
-    "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
-    "value_timestamp, condition_topic, value_topic}}, or null as there.",
-    ValueWhenArguments,
-    queries.value_when,
-    blocking=True,
-)
-_TRAJECTORY = ToolDeclaration(
-    (
-        ToolName("trajectory_summary", "Way driven", Between),
-        ToolName("recent_trajectory_summary", "Way driven lately", Last),
-    ),
-    "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, avg_speed, "
-    "max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], ...}}.",
-    TrajectoryArguments,
-    queries.trajectory_summary,
-    blocking=True,
-)
 _DECLARATIONS = (
-    _LIST,
-    _RANGE,
-    _TOPIC_AT,
-    _TOPIC_RANGE,
-    _POSITION,
-    _VELOCITY,
-    _TRANSFORM,
-    _FRAMES,
-    _LAST_MATCH,
-    _VALUE_WHEN,
-    _TRAJECTORY,
+    ToolDeclaration(
+        (ToolName("list_recorded_topics", "Recorded topics"),),
+        "Every recorded topic. Ask this first when a topic's name is not known. "
+        "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first "
+        "where they are too many.",
+        TopicListArguments,
+        _list_topics,
+    ),
+    ToolDeclaration(
+        (ToolName("data_time_range", "Span of the memory"),),
+        "What time span the memory covers, with its holes, and what time it is now. "
+        "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s "
+        "and local ISO, null while the memory is empty.",
+        NoArguments,
+        queries.data_time_range,
+    ),
+    ToolDeclaration(
+        _at_and_ago("topic", "A topic's value", at="at_time"),
+        "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
+        "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
+        "Reply: {{topic, type, timestamp, value}}.",
+        TopicAtArguments,
+        queries.topic_value,
+    ),
+    ToolDeclaration(
+        (
+            ToolName("get_topic_in_range", "A topic over a window", Between),
+            ToolName("get_topic_in_last", "A topic over the last seconds", Last),
+        ),
+        "What a topic said {when}: up to max_samples messages, evenly spaced over the window, "
+        "first and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; "
+        "with fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all "
+        "messages.",
+        TopicRangeArguments,
+        queries.topic_range,
+    ),
+    ToolDeclaration(
+        _at_and_ago("position", "Robot position"),
+        "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
+        "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, "
+        "longitude and altitude instead of x, y, z, which are null.",
+        MotionArguments,
+        queries.position,
+    ),
+    ToolDeclaration(
+        _at_and_ago("velocity", "Robot velocity"),
+        "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
+        "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
+        "x is ahead and angular z turns left.",
+        MotionArguments,
+        queries.velocity,
+    ),
+    ToolDeclaration(
+        _at_and_ago("transform", "Transform"),
+        "The pose of frame child in frame parent {when}, through any chain of frames, "
+        "interpolated. Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, "
+        "parent, child, clock}}.",
+        TransformArguments,
+        queries.transform,
+    ),
+    ToolDeclaration(
+        (ToolName("list_frames", "Frames"),),
+        "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
+        "static}}]}}.",
+        NoArguments,
+        queries.frames,
+        blocking=True,
+    ),
+    ToolDeclaration(
+        (ToolName("find_last_match", "Last time something held"),),
+        "When a condition last held, in all history. "
+        f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
+        "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
+        "read).",
+        LastMatchArguments,
+        queries.find_last_match,
+        blocking=True,
+    ),
+    ToolDeclaration(
+        (ToolName("get_value_when", "A topic when another matched"),),
+        "What value_topic held when condition_topic last met a condition (as in find_last_match), "
+        "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
+        "value_timestamp, condition_topic, value_topic}}, or null as there.",
+        ValueWhenArguments,
+        queries.value_when,
+        blocking=True,
+    ),
+    ToolDeclaration(
+        (
+            ToolName("trajectory_summary", "Way driven", Between),
+            ToolName("recent_trajectory_summary", "Way driven lately", Last),
+        ),
+        "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, "
+        "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
+        "...}}.",
+        TrajectoryArguments,
+        queries.trajectory_summary,
+        blocking=True,
+    ),
 )
