@@ -52,7 +52,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
     "info": CommandEntry(
         "info.info",
         "range, gaps, budget and how long it lasts",
-        {0: "it was told", 1: "there is nothing to tell of"},
+        {0: "it was shown", 1: "there are no bags"},
     ),
     "watch": CommandEntry(
         "watch.watch",

@@ -37,7 +37,7 @@ def config_show(
 ) -> None:
     """The configuration as YAML, composed of files, environment and arguments; no secrets.
 
-    Whether there is a token for the server is told in a comment, never what it is.
+    A comment shows whether there is a token for the server, never what it is.
     """
     settings, source = load_with_sources(bag_dir, overrides)
     if sources:

@@ -343,7 +343,7 @@ def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
         yield _warning("recorder", f"it was stopped {age}", _START_RECORDER)
     elif not heartbeat.is_live(now):
         do = f"journalctl -u ros2-memory-recorder says why it ended; {_START_RECORDER}"
-        yield _error("recorder", f"it was last heard of {age}, and never said why", do)
+        yield _error("recorder", f"its last heartbeat was {age}, and gives no reason to end", do)
     elif heartbeat.state is RecorderState.PAUSED:
         why = heartbeat.last_error or "it does not say why"
         yield _error("recorder", f"it is paused: {why}", "see disk above")

@@ -135,7 +135,7 @@ class Dataset:
         folder.mkdir(parents=True, exist_ok=True)
         if folder not in self._parts and any(folder.glob("*.parquet")):
             raise InvalidArgumentsError(
-                f"{folder} has rows already, which would stand there twice; export whole days (UTC)"
+                f"{folder} has rows already, which would be there twice; export whole days (UTC)"
                 ", name another folder, or delete this one"
             )
         parts = self._parts.setdefault(folder, [])

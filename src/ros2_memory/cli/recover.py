@@ -29,7 +29,7 @@ from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.repair import Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S
-"""A file that changed so lately may be being written by a program that does not say so."""
+"""A file that changed so lately may be being written by a program that is not known here."""
 
 _MCAP: Final = ".mcap"
 

@@ -188,7 +188,7 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     )
     yield _by_state(
         "ros2_memory_recorder_state",
-        "1 for what the recorder last said it does.",
+        "1 for the state that the recorder last reported.",
         **{str(state): int(state is heartbeat.state) for state in RecorderState},
     )
     yield GaugeMetricFamily(
@@ -198,7 +198,7 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     )
     yield GaugeMetricFamily(
         "ros2_memory_recorder_heartbeat_age_seconds",
-        "Since the recorder last said something of itself.",
+        "Since the recorder last reported.",
         unix_from_ns(now - heartbeat.updated),
     )
     yield GaugeMetricFamily(

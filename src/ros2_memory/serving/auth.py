@@ -299,6 +299,6 @@ def _require_usable(text: str, source: str) -> None:
         )
     if not _TOKEN.fullmatch(text):
         raise ConfigError(
-            f"{source}: the API token holds characters that cannot stand in an Authorization "
-            f"header; letters, digits and -._~+/ can, with = at the end; {_HOW}"
+            f"{source}: the API token holds characters that an Authorization header cannot "
+            f"hold; letters, digits and -._~+/ are allowed, with = at the end; {_HOW}"
         )

@@ -95,7 +95,7 @@ class BoundedConnection(H11Protocol):
 
     def _abort(self) -> None:
         """Closes it at once, without a reply."""
-        self._log_refused("a stranger made room for another")
+        self._log_refused("an unknown connection replaced by a newer one")
         self._is_refused = True
         self.transport.abort()
 

@@ -40,7 +40,7 @@ class Tool:
 
     @property
     def description(self) -> str:
-        """Returns the text that tells planners what the tool answers."""
+        """Returns the text from which planners learn what the tool answers."""
         return self._described[0]
 
     @property
