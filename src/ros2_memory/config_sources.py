@@ -46,13 +46,11 @@ class Override:
         key: the key or group that it sets.
         text: the assignment in Hydra's grammar.
         source: who gave it, as a phrase that follows "set".
-        option: the file that it chooses, where the key is a group.
     """
 
     key: str
     text: str
     source: str
-    option: str | None = None
 
 
 @dataclass(frozen=True)
@@ -81,15 +79,14 @@ class Sources:
 
     def choice(self, group: str) -> tuple[str | None, str]:
         """Returns the option of a group, and who chose it."""
+        composed = self._composed.overrides if self._composed else None
+        option = composed.known_choices.get(group) if composed else None
         for override in reversed(self.overrides):
             if override.key == group:
-                return override.option, override.source
-        if self._composed is None:
-            return None, f"in {self.folder / 'config.yaml'}"
-        composed = self._composed.overrides
-        chosen = composed.override_metadata.get(group)
-        file = "config" if chosen is None else chosen.containing_config_path
-        return composed.known_choices.get(group), f"in {self.folder / f'{file}.yaml'}"
+                return option, override.source
+        chosen = composed.override_metadata.get(group) if composed else None
+        file = chosen.containing_config_path if chosen else "config"
+        return option, f"in {self.folder / f'{file}.yaml'}"
 
     def _file(self, key: str) -> str:
         for each in reversed(self._composed.defaults if self._composed else ()):
@@ -234,8 +231,7 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
             f"(set {source})"
         )
     # Added by force, an unknown key reaches the validation, which names the known ones.
-    option = str(override.value()) if is_group and changes else None
-    return Override(key, f"++{text}" if changes and not is_group else text, source, option)
+    return Override(key, f"++{text}" if changes and not is_group else text, source)
 
 
 def _lookup(path: Path, section: str, key: str) -> tuple[bool, object]:
