@@ -124,7 +124,7 @@ def test_what_is_taken_can_stand_in_a_header(text: str) -> None:
 @given(st.text(max_size=60))
 def test_what_is_refused_is_not_shown(text: str) -> None:
     token = f"sEcReT7{text}\x7f"
-    assert "cannot stand" in refused({"MEMORY_API_TOKEN": token}) or len(token) < SHORTEST_TOKEN
+    assert "cannot hold" in refused({"MEMORY_API_TOKEN": token}) or len(token) < SHORTEST_TOKEN
 
 
 def test_a_server_that_others_can_reach_needs_one() -> None:
