@@ -9,6 +9,7 @@ and sequences, the texts themselves, integers and booleans are all outside.
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from rosbags.interfaces import Nodetype
@@ -36,12 +37,8 @@ MAX_OBJECTS: Final = 200_000
 _COUNTED_FROM_BYTES: Final = 256 << 10
 
 
-class _NoLayoutError(Exception):
-    """The numbers are too many, or the payload does not fit its definition."""
-
-
-class _TooManyError(Exception):
-    """The payload holds more texts and messages than are decoded."""
+class _StoppedError(Exception):
+    """A walk found more than it counts to, or the payload does not fit its definition."""
 
 
 def layout_of(definitions: Typesdict, root: str, payload: bytes) -> CdrLayout | None:
@@ -51,7 +48,7 @@ def layout_of(definitions: Typesdict, root: str, payload: bytes) -> CdrLayout | 
     walk = _NumberWalk(definitions, payload)
     try:
         walk.message(root)
-    except (_NoLayoutError, struct.error):
+    except (_StoppedError, struct.error):
         return None
     # Writers may pad the end to a multiple of 4.
     if not 0 <= len(payload) - walk.position < 4:
@@ -67,13 +64,10 @@ def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
     """
     if len(payload) < _COUNTED_FROM_BYTES:
         return False
-    try:
-        _ObjectWalk(definitions, payload).message(root)
-    except _TooManyError:
-        return True
-    except (_NoLayoutError, struct.error, IndexError):
-        return False
-    return False
+    walk = _ObjectWalk(definitions, payload)
+    with suppress(_StoppedError, struct.error, IndexError):
+        walk.message(root)
+    return walk.objects > MAX_OBJECTS
 
 
 class _Walk:
@@ -119,7 +113,7 @@ class _Walk:
         elif name in _SIZES:
             self._advance(_SIZES[name], _SIZES[name])
         else:
-            raise _NoLayoutError
+            raise _StoppedError
 
     def _length(self) -> int:
         at = self._advance(4, 4)
@@ -131,7 +125,7 @@ class _Walk:
         at = self.position + -(self.position - _HEADER_BYTES) % alignment
         self.position = at + size
         if self.position > len(self._payload):
-            raise _NoLayoutError
+            raise _StoppedError
         return at
 
 
@@ -156,7 +150,7 @@ class _NumberWalk(_Walk):
 
     def _each(self, element: FieldDesc, count: int) -> None:
         if count > _MAX_NUMBERS:
-            raise _NoLayoutError
+            raise _StoppedError
         super()._each(element, count)
 
     def _primitive(self, name: str) -> None:
@@ -165,13 +159,13 @@ class _NumberWalk(_Walk):
             offsets = self.doubles if name == "float64" else self.singles
             offsets.append(self.position - _SIZES[name])
             if len(self.doubles) + len(self.singles) > _MAX_NUMBERS:
-                raise _NoLayoutError
+                raise _StoppedError
 
 
 class _ObjectWalk(_Walk):
     """Counts texts and messages."""
 
-    _objects = 0
+    objects = 0
 
     def message(self, name: str) -> None:
         self._count()
@@ -185,9 +179,9 @@ class _ObjectWalk(_Walk):
         super()._primitive(name)
 
     def _count(self) -> None:
-        self._objects += 1
-        if self._objects > MAX_OBJECTS:
-            raise _TooManyError
+        self.objects += 1
+        if self.objects > MAX_OBJECTS:
+            raise _StoppedError
 
 
 def _is_time(name: str, fields: list[tuple[str, FieldDesc]]) -> bool:

@@ -263,28 +263,25 @@ class McapBags:
         def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
             return _fetch_from_chunk(last_used(chunk), wanted, self._max_chunk_bytes)(place, time)
 
-        def chunk_run(chunk: Chunk) -> SortedRun[Record | LostError]:
-            def rows() -> Rows[Record | LostError] | None:
-                # Of a chunk that cannot be read, only what is wanted by its index is lost.
-                try:
-                    with as_unreadable():
-                        data = self._chunk_data(file, chunk)
-                except UnreadableError as error:
-                    lost = self._lost(file, chunk, wanted, window, str(error))
-                    return _lost_row(lost, newest_first=newest_first) if lost else None
-                columns = self._chunk_columns(file, chunk, wanted, data)
-                column = joined([each.between(window.start, window.stop) for each in columns])
-                if not column.times.size:
-                    return None
-                fetch = _fetch_from_chunk(data, wanted, self._max_chunk_bytes)
-                if len(data) > _LARGE_BYTES:
-                    fetch = partial(fetch_large, chunk)
-                return _rows(column, fetch, newest_first=newest_first)
-
-            return SortedRun(chunk.start, chunk.end, chunk.offset, rows)
+        def rows_of(chunk: Chunk) -> Rows[Record | LostError] | None:
+            # Of a chunk that cannot be read, only what is wanted by its index is lost.
+            try:
+                with as_unreadable():
+                    data = self._chunk_data(file, chunk)
+            except UnreadableError as error:
+                lost = self._lost(file, chunk, wanted, window, str(error))
+                return _lost_row(lost, newest_first=newest_first) if lost else None
+            columns = self._chunk_columns(file, chunk, wanted, data)
+            column = joined([each.between(window.start, window.stop) for each in columns])
+            if not column.times.size:
+                return None
+            fetch = _fetch_from_chunk(data, wanted, self._max_chunk_bytes)
+            if len(data) > _LARGE_BYTES:
+                fetch = partial(fetch_large, chunk)
+            return _rows(column, fetch, newest_first=newest_first)
 
         for chunk in self._chunks_with(file, index, wanted, window):
-            yield chunk_run(chunk)
+            yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
         loose = [column for channel, column in index.loose.items() if channel in wanted]
         column = joined([part.between(window.start, window.stop) for part in loose])
         if column.times.size:
