@@ -256,7 +256,7 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
 
 def query_settings_of(settings: Settings) -> QuerySettings:
     """Returns what queries need of the configuration."""
-    from ros2_memory.history.context import QuerySettings
+    from ros2_memory.history.context import Latching, QuerySettings
 
     data = settings.data
     records = not isinstance(settings.recorder, NullRecorderNode)
@@ -273,8 +273,9 @@ def query_settings_of(settings: Settings) -> QuerySettings:
         split_duration_s=settings.recording.split_duration_s,
         include_active=settings.reader.include_active,
         kept=retention_limits(settings) if records else None,
-        latched_topics=data.latched_topics.include,
-        never_latched_topics=data.latched_topics.exclude,
+        latching=Latching(
+            data.tf_static_topics, data.latched_topics.include, data.latched_topics.exclude
+        ),
     )
 
 

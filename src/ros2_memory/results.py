@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.analysis.transform_tree import FrameEdge
+    from ros2_memory.bag_dir.moment_file import StoredMoment
     from ros2_memory.core.model import Geodetic, Pose, Sample, SetAside, Transform, Twist, Vector3
     from ros2_memory.core.timebase import Ns
 
@@ -412,18 +413,10 @@ class RememberedMoment:
 
 
 @dataclass(frozen=True, slots=True)
-class ListedMoment(RememberedMoment):
-    """A saved moment; `size` in bytes, `missing` names what of it could not be saved."""
-
-    size: int
-    missing: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class MomentList:
     """The saved moments, newest first; `more` is how many there are besides."""
 
-    moments: tuple[ListedMoment, ...]
+    moments: tuple[StoredMoment, ...]
     more: int
     now: Ns
 

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from functools import partial
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final
 
 import anyio
 import uvicorn
@@ -42,7 +42,6 @@ from ros2_memory.serving.web_app import STREAM_PATH, web_app
 if TYPE_CHECKING:
     import socket
     from collections.abc import Sequence
-    from types import FrameType
 
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
@@ -66,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _exit_on_signal)
+        signal.signal(number, lambda *_: sys.exit(0))
     try:
         _run(overrides)
     except CannotListenError as error:
@@ -144,10 +143,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {package_version()}")
     return parser
-
-
-def _exit_on_signal(_number: int, _frame: FrameType | None) -> NoReturn:
-    raise SystemExit(0)
 
 
 def _end_threads(code: int) -> int:

@@ -19,11 +19,10 @@ from ros2_memory.cli.options import (
     Sets,
     load_for,
     print_line,
+    require_recorder,
 )
-from ros2_memory.config import NullRecorderNode
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import (
-    ConfigError,
     InvalidArgumentsError,
     RecorderError,
 )
@@ -49,11 +48,7 @@ def adopt(
     `forget` deletes them too. Nothing is deleted or changed here.
     """
     settings = load_for(bag_dir, sets)
-    if isinstance(settings.recorder, NullRecorderNode):
-        raise ConfigError(
-            "recorder=none: nothing is deleted here, so there is nothing to adopt; choose the "
-            "deployment that records here, such as deployment=robot"
-        )
+    require_recorder(settings)
     root = settings.recording.bag_dir
     own = OwnRecordings(root)
     given = [_below(root, each) for each in directories]

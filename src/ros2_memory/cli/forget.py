@@ -33,14 +33,14 @@ from ros2_memory.cli.options import (
     open_memory,
     parse_window,
     print_line,
+    require_recorder,
     spinner,
 )
 from ros2_memory.cli.output import format_time
-from ros2_memory.config import NullRecorderNode, Settings
+from ros2_memory.config import Settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import (
     BagError,
-    ConfigError,
     InvalidArgumentsError,
     RecorderError,
 )
@@ -76,11 +76,7 @@ def forget(
     this deployment records.
     """
     settings = load_for(bag_dir, overrides)
-    if isinstance(settings.recorder, NullRecorderNode):
-        raise ConfigError(
-            "recorder=none: bags that another program records are not deleted here; choose the "
-            "deployment that records them, such as deployment=robot"
-        )
+    require_recorder(settings)
     if last is None and (start is None or end is None):
         raise InvalidArgumentsError("say what to forget: --start and --end, or --last")
     memory = open_memory(settings, verbose=verbose)

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.console import Console
 
-from ros2_memory.config import Settings, load_explained
+from ros2_memory.config import NullRecorderNode, Settings, load_explained
 from ros2_memory.config_sources import Sources, quoted
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
@@ -79,6 +79,19 @@ def load_with_sources(
 def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
     """Loads the configuration as `load_with_sources` does, without the sources."""
     return load_with_sources(bag_dir, overrides)[0]
+
+
+def require_recorder(settings: Settings) -> None:
+    """Checks that this deployment records: only then may a command have bags deleted.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if isinstance(settings.recorder, NullRecorderNode):
+        raise ConfigError(
+            "recorder=none: bags that another program records are not deleted here; choose the "
+            "deployment that records them, such as deployment=robot"
+        )
 
 
 def open_memory(settings: Settings, *, verbose: bool = False) -> "Memory":

@@ -115,7 +115,6 @@ def recover_files(
             done += size
     for folder in sorted(recovery.changed):
         recovery.correct_metadata(folder, report)
-    for folder in sorted(recovery.changed):
         # A recording whose metadata.yaml was never written: only its recorder knew all of it.
         if any(folder.glob(f"*{_MCAP}")) and not size_of(folder / METADATA_FILE):
             report(f"{folder} has no {METADATA_FILE}: `ros2 bag reindex {folder}` makes one")

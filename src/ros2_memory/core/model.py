@@ -154,14 +154,8 @@ class BagFile(NamedTuple):
 
 
 # Two caches, since a pass over all files would evict the folders.
-@lru_cache(maxsize=_CACHED_PATHS)
-def _path(text: str) -> Path:
-    return Path(text)
-
-
-@lru_cache(maxsize=_CACHED_PATHS)
-def _folder(text: str) -> Path:
-    return Path(text)
+_path = lru_cache(maxsize=_CACHED_PATHS)(Path)
+_folder = lru_cache(maxsize=_CACHED_PATHS)(Path)
 
 
 @dataclass(frozen=True, slots=True)

@@ -266,7 +266,7 @@ class BagAccess:
             return None
         [topic] = topics
         static = topic in self.memory.limits.tf_static_topics
-        if not static and not self.snapshot.timeline.is_transient_local(topic):
+        if not static and topic not in self.snapshot.timeline.transient_local:
             return None
         if is_carried(bag.path):
             return None  # its channels name the recording of each message, the catalogue not

@@ -51,13 +51,7 @@ class QuerySettings:
     split_duration_s: float = 10.0
     include_active: bool = False
     kept: RetentionLimits | None = None
-    latched_topics: tuple[str, ...] = ()
-    never_latched_topics: tuple[str, ...] = ()
-
-    @property
-    def latching(self) -> Latching:
-        """Returns what decides which topics are latched."""
-        return Latching(self.tf_static_topics, self.latched_topics, self.never_latched_topics)
+    latching: Latching = field(default_factory=lambda: Latching(("/tf_static",)))
 
 
 class SnapshotSource(Protocol):

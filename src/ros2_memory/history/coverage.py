@@ -58,7 +58,12 @@ def note_unread(
     if window.empty:
         return
     absent = _absent(view) if nothing or search else ()
-    odd = [bag for bag in view.snapshot.timeline.faulty(window) if not _is_noted(view, bag)]
+    odd = [
+        bag
+        for bag in view.snapshot.timeline.faulty(window)
+        # No remark says that a crash left a bag open.
+        if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
+    ]
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
@@ -100,11 +105,6 @@ def not_covered(view: View, window: TimeWindow) -> tuple[str, ...]:
         return ()
     note_unread(view, window, nothing=True)
     return view.notes.sentences()
-
-
-def _is_noted(view: View, bag: BagFile) -> bool:
-    """Whether notes already describe the bag; that a crash left it open they do not."""
-    return bag.state is not BagState.INCOMPLETE and view.notes.has_remarks(bag)
 
 
 def _absent(view: View) -> Sequence[SetAside]:

@@ -174,7 +174,7 @@ class MergedStream:
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether two recordings may have received one latched message of these topics."""
         return any(
-            self._timeline.is_transient_local(topic) and len(self._timeline.recordings(topic)) > 1
+            topic in self._timeline.transient_local and len(self._timeline.recordings(topic)) > 1
             for topic in topics
         )
 

@@ -34,7 +34,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     Nothing is noted of latched topics, which each recording receives anew, and where the time for
     the answer is over before it is known.
     """
-    if view.snapshot.timeline.is_transient_local(topic):
+    if topic in view.snapshot.timeline.transient_local:
         return
     apart: set[Path] = set()
     noted_before = view.notes.keys()

@@ -98,10 +98,7 @@ def _recorded_folder(folder: str) -> str:
 def _took_over(pair: Overlapping) -> bool:
     """Returns whether a handover joins the two recordings."""
     names = {pair.first.name, pair.second.name}
-    if pair.first.parent != pair.second.parent:
-        return False
-    for recording in (pair.first, pair.second):
-        handover = read_handover(recording).handover
-        if names & {handover.previous, handover.next}:
-            return True
-    return False
+    handovers = (read_handover(each).handover for each in (pair.first, pair.second))
+    return pair.first.parent == pair.second.parent and any(
+        names & {handover.previous, handover.next} for handover in handovers
+    )

@@ -154,7 +154,10 @@ class Timeline:
 
     @cached_property
     def transient_local(self) -> frozenset[str]:
-        """The topics that some publisher offered as transient local."""
+        """The topics that some publisher offered as transient local.
+
+        A subscriber may receive their last messages again, long after they were published.
+        """
         return frozenset(chain.from_iterable(each.transient_local for each in self.segments))
 
     def topics(self) -> tuple[str, ...]:
@@ -165,16 +168,9 @@ class Timeline:
         """Returns the message types of the topic, sorted; empty where it has no message."""
         return self.types.get(topic, ())
 
-    def is_transient_local(self, topic: str) -> bool:
-        """Returns whether some publisher offered the topic as transient local.
-
-        Then a subscriber may receive its last messages again, long after they were published.
-        """
-        return topic in self.transient_local
-
     def is_transient_state(self, topic: str) -> bool:
         """Returns whether the topic is transient local, and no log as `/rosout` is everywhere."""
-        return self.is_transient_local(topic) and not self.is_log(topic)
+        return topic in self.transient_local and not self.is_log(topic)
 
     def is_log(self, topic: str) -> bool:
         """Returns whether the topic is a log, whose lines come when something happens."""

@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
 from ros2_memory.history.view import View
-from ros2_memory.results import ListedMoment, MomentList, RememberedMoment
+from ros2_memory.results import MomentList, RememberedMoment
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.request_queue import Outcome
@@ -78,20 +78,7 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
             "to read moments/ of the bag directory"
         ) from error
     stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
-    listed = (
-        ListedMoment(
-            each.folder.name,
-            each.moment.request.label,
-            each.moment.request.start,
-            each.moment.request.end,
-            len(each.files),
-            each.moment.pending,
-            sum(each.files.values()),
-            each.moment.missing,
-        )
-        for each in stored[:MAX_LISTED]
-    )
-    return MomentList(tuple(listed), len(stored[MAX_LISTED:]), _now(memory, call))
+    return MomentList(tuple(stored[:MAX_LISTED]), len(stored[MAX_LISTED:]), _now(memory, call))
 
 
 def _now(memory: Memory, call: Call) -> Ns:

@@ -37,12 +37,15 @@ def memory_status(memory: Memory, call: Call) -> Status:
     snapshot, heartbeat = view.snapshot, memory.heartbeat()
     latest = snapshot.dating.latest
     now = memory.now(wall, latest)
+    live = heartbeat is not None and heartbeat.is_live(wall)
+    # What a live recorder keeps too long while its clock may be wrong.
+    held = heartbeat.age_held if heartbeat is not None and live else None
     return Status(
         now=now,
         earliest=snapshot.dating.earliest,
         latest=latest,
         recorder=None if heartbeat is None else str(heartbeat.state),
-        live=heartbeat is not None and heartbeat.is_live(wall),
+        live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
         never_heard=() if heartbeat is None else heartbeat.silent,
@@ -52,7 +55,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
-        notes=(*view.notes.sentences(), *_age_held(heartbeat, wall)),
+        notes=(*view.notes.sentences(), *filter(None, [held])),
     )
 
 
@@ -98,12 +101,6 @@ def lacking_in(view: View) -> Iterator[str]:
     if undecodable := {each.topic for each in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
-
-
-def _age_held(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
-    """Yields the note on what a live recorder keeps too long while its clock may be wrong."""
-    if heartbeat is not None and heartbeat.age_held is not None and heartbeat.is_live(wall):
-        yield heartbeat.age_held
 
 
 def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[SilentTopic]:

@@ -27,7 +27,7 @@ from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.collect import Collected, GarbageCollector
-from ros2_memory.retention.delete import left_by_repair, remove_emptied
+from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime
@@ -138,7 +138,9 @@ class Housekeeping(Housekeeper):
                 is_own = self._own.owns(directory)
             else:
                 is_own = directory in named or has_own_name(directory.name)
-            if is_own and (directory in named or _is_unfinished(directory)):
+            # It was never written, or the disk was full at that time.
+            is_unfinished = not size_of(directory / METADATA_FILE)
+            if is_own and (directory in named or is_unfinished):
                 self._repair_recording(directory)
 
     def make_room(self, free_bytes_wanted: int) -> None:
@@ -412,11 +414,3 @@ class BackgroundHousekeeper(Housekeeper):
 def _named(bag_dir: Path) -> frozenset[Path]:
     """Returns the recordings that the last heartbeat names, live or not."""
     return frozenset(bag_dir / name for name in read_heartbeat(bag_dir).recordings)
-
-
-def _is_unfinished(recording: Path) -> bool:
-    """Whether its metadata.yaml was never written, or the disk was full at that time."""
-    try:
-        return (recording / METADATA_FILE).lstat().st_size == 0
-    except OSError:
-        return True

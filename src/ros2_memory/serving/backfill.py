@@ -24,7 +24,7 @@ from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
-from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ms_from_ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index.scan import settled
@@ -46,9 +46,6 @@ BACKLOG: Final = 8
 """A child process digests more bags than these, so that answers stay fast."""
 PRUNE_INTERVAL_S: Final = 600.0
 """How often the entries of deleted files are removed."""
-
-LATEST_UNIX_S: Final = 9.2e9
-"""A time after everything that was ever recorded."""
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be digested is tried again: the disk may have failed."""
@@ -142,7 +139,7 @@ class Backfill:
             rows = list_recorded_topics(self._memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
         with suppress(EpisodicError):
-            everything = TimeRange(start_s=0.0, end_s=LATEST_UNIX_S)
+            everything = TimeRange(start_s=0.0, end_s=unix_from_ns(MAX_NS))
             trajectory_summary(self._memory, Call(), everything)
 
     def prune(self) -> None:

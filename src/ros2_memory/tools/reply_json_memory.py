@@ -13,6 +13,7 @@ from ros2_memory.tools.reply_json import moment, render, seconds, with_notes
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.bag_dir.moment_file import SaveRequest, StoredMoment
     from ros2_memory.core.model import JsonValue, SetAside
     from ros2_memory.tools.reply_size import JsonObject
 
@@ -140,7 +141,11 @@ def _gigabytes(size: float | None) -> float | None:
 
 @render.register(results.RememberedMoment)
 def _saved_moment(answer: results.RememberedMoment) -> JsonObject:
-    return {**_labelled_window(answer), "bags": answer.bags, "pending": answer.pending}
+    return {
+        **_labelled_window(answer.moment, answer),
+        "bags": answer.bags,
+        "pending": answer.pending,
+    }
 
 
 @render.register(results.MomentList)
@@ -151,20 +156,21 @@ def _stored_moments(answer: results.MomentList) -> JsonObject:
     return reply
 
 
-def _stored(stored: results.ListedMoment, now: Ns) -> JsonObject:
+def _stored(stored: StoredMoment, now: Ns) -> JsonObject:
+    saved = stored.moment
     reply: JsonObject = {
-        **_labelled_window(stored),
-        "ago_s": seconds(now - stored.end),
-        "bags": stored.bags,
-        "size_gb": round(stored.size / GB, 6),
-        "complete": not (stored.pending or stored.missing),
+        **_labelled_window(stored.folder.name, saved.request),
+        "ago_s": seconds(now - saved.request.end),
+        "bags": len(stored.files),
+        "size_gb": round(sum(stored.files.values()) / GB, 6),
+        "complete": not (saved.pending or saved.missing),
     }
-    return with_notes(reply, stored.missing, pending=stored.pending)
+    return with_notes(reply, saved.missing, pending=saved.pending)
 
 
-def _labelled_window(saved: results.RememberedMoment) -> JsonObject:
+def _labelled_window(name: str, saved: results.RememberedMoment | SaveRequest) -> JsonObject:
     return {
-        "moment": saved.moment,
+        "moment": name,
         "label": saved.label,
         "start": moment(saved.start),
         "end": moment(saved.end),

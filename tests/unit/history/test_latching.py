@@ -13,7 +13,7 @@ from ros2_memory.cli.info import usual_rate
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Latching, QuerySettings
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.insights.status import memory_status
@@ -175,18 +175,18 @@ def test_static_transforms_hold_in_bags_without_qos(tmp_path: Path) -> None:
     record(tmp_path / "rec", [*mounts, *drive(T0, T0 + 60 * S)], McapLayout(latched=frozenset()))
     memory = remembered(tmp_path)
     assert reply(memory, "/tf_static", T0 + 59 * S)["latched"] is True
-    memory = remembered(tmp_path, tf_static_topics=())
+    memory = remembered(tmp_path, tf_static_topics=(), latching=Latching())
     assert set(reply(memory, "/tf_static", T0 + 59 * S)) == {"error"}
 
 
 def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) -> None:
     telemetry = every(0.1, 7, TELEMETRY)
     record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
-    latched: dict[str, Any] = {"latched_topics": ("/fmu/*",), "never_latched_topics": (MAP,)}
-    memory = remembered(tmp_path, **latched)
+    latching = Latching(include=("/fmu/*",), exclude=(MAP,))
+    memory = remembered(tmp_path, latching=latching)
     assert reply(memory, TELEMETRY, T0 + 59 * S)["latched"] is True
     assert set(reply(memory, MAP, T0 + 59 * S)) == {"error"}
-    both = remembered(tmp_path, latched_topics=("/odom",), never_latched_topics=("/odom",))
+    both = remembered(tmp_path, latching=Latching(include=("/odom",), exclude=("/odom",)))
     assert set(reply(both, "/odom", T0 + 99 * S)) == {"error"}
 
 
@@ -225,7 +225,7 @@ def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None
 
 def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
     record(tmp_path / "rec", [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
-    memory = remembered(tmp_path, latched_topics=("/odom",))
+    memory = remembered(tmp_path, latching=Latching(include=("/odom",)))
     found = position(memory, Call(), AtTime(unix_from_ns(T0 + 30 * S)))
     assert [note for note in found.notes if "/odom is latched" in note and "30" in note]
 

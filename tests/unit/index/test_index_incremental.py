@@ -212,6 +212,6 @@ def _views(snapshot: Snapshot) -> tuple[object, ...]:
             for topic in snapshot.timeline.topics()
         ],
         [snapshot.timeline.types_of(topic) for topic in snapshot.timeline.topics()],
-        [snapshot.timeline.is_transient_local(topic) for topic in snapshot.timeline.topics()],
+        snapshot.timeline.transient_local,
         snapshot.timeline.overlapping(TimeWindow(20, 60)),
     )

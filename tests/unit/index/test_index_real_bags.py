@@ -49,8 +49,8 @@ def test_the_splits_of_a_real_recording_are_found_in_order() -> None:
     assert snapshot.timeline.totals("/odom")["nav_msgs/msg/Odometry"].messages == 1300
     extents = snapshot.timeline.extents("/tf_static", TimeWindow.everything())
     assert [bag.path.name for bag, *_ in extents] == ["session_mcap_0.mcap"]
-    assert snapshot.timeline.is_transient_local("/tf_static")
-    assert not snapshot.timeline.is_transient_local("/tf")
+    assert "/tf_static" in snapshot.timeline.transient_local
+    assert "/tf" not in snapshot.timeline.transient_local
 
 
 @needs_recorded

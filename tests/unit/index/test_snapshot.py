@@ -89,9 +89,7 @@ def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> No
 
 def test_a_topic_is_transient_local_where_any_bag_says_so() -> None:
     snapshot = Snapshot(Timeline.of((_bag("a", ("/tf_static", 0, 0), ("/tf", 0, 9)),)))
-    assert snapshot.timeline.is_transient_local("/tf_static")
-    assert not snapshot.timeline.is_transient_local("/tf")
-    assert not snapshot.timeline.is_transient_local("/nothing")
+    assert snapshot.timeline.transient_local == {"/tf_static"}
 
 
 def test_heard_topics_come_sorted_without_the_silent_ones() -> None:
