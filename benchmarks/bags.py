@@ -42,7 +42,7 @@ END_NS: Final = 1_768_176_000_000_000_000
 _FORMAT: Final = 2  # of what is written here; folders of another one are made anew
 _CHUNK_BYTES: Final = 16 * 1024
 _OVERLAP_NS: Final = 3_000_000_000
-_QOS: Final = """\
+QOS: Final = """\
 - history: unknown
   depth: 0
   reliability: reliable
@@ -58,6 +58,7 @@ _QOS: Final = """\
     sec: 9223372036
     nsec: 854775807
   avoid_ros_namespace_conventions: false"""
+"""What rosbag2 records of a publisher's quality of service."""
 
 
 class Topic(NamedTuple):
@@ -199,7 +200,7 @@ def _write(split: Split, so_far: Sequence[Split]) -> None:
 
 def _declared(writer: Writer) -> dict[Topic, int]:
     schemas = {
-        name: writer.register_schema(name, "ros2msg", _definition(name).encode())
+        name: writer.register_schema(name, "ros2msg", definition(name).encode())
         for name in dict.fromkeys(topic.type for topic in TOPICS)
     }
     return {
@@ -207,7 +208,7 @@ def _declared(writer: Writer) -> dict[Topic, int]:
             topic.name,
             "cdr",
             schemas[topic.type],
-            {"offered_qos_profiles": _QOS.format(durability=topic.durability)},
+            {"offered_qos_profiles": QOS.format(durability=topic.durability)},
         )
         for topic in TOPICS
     }
@@ -271,7 +272,7 @@ def _topic_told(topic: Topic, splits: int) -> str:
     return (
         f"  - topic_metadata:\n      name: {topic.name}\n      type: {topic.type}\n"
         "      serialization_format: cdr\n      offered_qos_profiles:\n"
-        + indent(_QOS.format(durability=topic.durability), " " * 8)
+        + indent(QOS.format(durability=topic.durability), " " * 8)
         + f'\n      type_description_hash: ""\n    message_count: {topic.messages * splits}'
     )
 
@@ -285,5 +286,6 @@ def _split_told(split: Split) -> str:
 
 
 @cache
-def _definition(type_name: str) -> str:
+def definition(type_name: str) -> str:
+    """A type's definition with all that it contains, as bags have it."""
     return payloads.typestore().generate_msgdef(type_name, ros_version=2)[0]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 DETECTIONS: Final = "ros2_vision_interfaces/msg/VisionDetectionArray"
 NEVER_SEEN: Final = "unicorn"
 """A label that no detection carries."""
+ODOM_TO_BASE: Final = ("odom", "base_link")
 
 _DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetection": (
@@ -71,7 +72,11 @@ def typestore() -> Typestore:
 
 def odometry(t: Floats, stamps: NDArray[np.int64], seed: int) -> list[bytes]:
     """One `nav_msgs/msg/Odometry` for each moment: pose in odom, with a wheel encoder's noise."""
-    moved = _measured(t, seed)
+    return odometry_of(_measured(t, seed), stamps)
+
+
+def odometry_of(moved: Motion, stamps: NDArray[np.int64]) -> list[bytes]:
+    """One `nav_msgs/msg/Odometry` for each pose and speed."""
     half = moved.yaw / 2.0
     return _filled(
         _odometry(),
@@ -90,16 +95,28 @@ def odometry(t: Floats, stamps: NDArray[np.int64], seed: int) -> list[bytes]:
 def moving_frame(t: Floats, stamps: NDArray[np.int64], seed: int) -> list[bytes]:
     """One `tf2_msgs/msg/TFMessage` for each moment: base_link in odom."""
     moved = _measured(t, seed)
-    half = moved.yaw / 2.0
-    columns = {"x": moved.x, "y": moved.y, "qz": np.sin(half), "qw": np.cos(half)}
-    return _filled(_moving_frame(), stamps, columns)
+    return frames_of((moved.x, moved.y, moved.yaw), stamps, ODOM_TO_BASE)
+
+
+def frames_of(
+    at: tuple[Floats, Floats, Floats], stamps: NDArray[np.int64], frames: tuple[str, str]
+) -> list[bytes]:
+    """One `tf2_msgs/msg/TFMessage` for each pose (x, y, yaw) of the second frame in the first."""
+    x, y, yaw = at
+    columns = {"x": x, "y": y, "qz": np.sin(yaw / 2.0), "qw": np.cos(yaw / 2.0)}
+    return _filled(_moving_frame(*frames), stamps, columns)
 
 
 def command(t: Floats) -> list[bytes]:
     """One `geometry_msgs/msg/Twist` for each moment, to the centimetre as planners command."""
     moved = motion(t)
-    columns = {"vx": np.round(moved.speed, 2), "wz": np.round(moved.turning, 2)}
-    return _filled(_command(), np.zeros(len(t), np.int64), columns)
+    return command_of(moved.speed, moved.turning)
+
+
+def command_of(speed: Floats, turning: Floats) -> list[bytes]:
+    """One `geometry_msgs/msg/Twist` for each pair of m/s and rad/s."""
+    columns = {"vx": np.round(speed, 2), "wz": np.round(turning, 2)}
+    return _filled(_command(), np.zeros(len(speed), np.int64), columns)
 
 
 @cache
@@ -109,23 +126,23 @@ def fixed_frames() -> bytes:
         _transform("base_link", child, 1_000_000_000, (x, 0.0, z, 0.0, 1.0))
         for child, x, z in (("laser", 0.10, 0.20), ("camera", 0.15, 0.30))
     ]
-    return _serialized("tf2_msgs/msg/TFMessage", transforms=frames)
+    return serialized("tf2_msgs/msg/TFMessage", transforms=frames)
 
 
 def detections(stamp: int, skill: str, count: int, chance: np.random.Generator) -> bytes:
     """One detection array in the camera's frame with `count` things in it."""
     drawn = chance.random((count, 4))
     corners = chance.integers(0, 480, (count, 4))
-    return _serialized(
+    return serialized(
         DETECTIONS,
-        header=_header(stamp, "camera"),
+        header=header(stamp, "camera"),
         skill=skill,
         detections=[
-            _make(
+            make(
                 "ros2_vision_interfaces/msg/VisionDetection",
                 label=_LABELS[int(label * len(_LABELS))],
                 score=_CONFIDENCE * score,
-                point=_make("geometry_msgs/msg/Point", x=3.0 * x, y=2.0 * y - 1.0, z=0.4),
+                point=make("geometry_msgs/msg/Point", x=3.0 * x, y=2.0 * y - 1.0, z=0.4),
                 bbox=box.astype(np.int32),
             )
             for (label, score, x, y), box in zip(drawn.tolist(), corners, strict=True)
@@ -148,40 +165,48 @@ def _measured(t: Floats, seed: int) -> Motion:
     return Motion(*(value.astype(np.float32).astype(np.float64) for value in noisy))
 
 
-def _make(type_name: str, **fields: object) -> object:
+def make(type_name: str, **fields: object) -> object:
+    """A message object of a type."""
     return cast("_Build", typestore().types[type_name])(**fields)
 
 
-def _serialized(type_name: str, **fields: object) -> bytes:
-    return bytes(typestore().serialize_cdr(_make(type_name, **fields), type_name))
+def serialized(type_name: str, **fields: object) -> bytes:
+    """A message in CDR."""
+    return bytes(typestore().serialize_cdr(make(type_name, **fields), type_name))
 
 
-def _header(stamp: int, frame_id: str) -> object:
+def header(stamp: int, frame_id: str) -> object:
+    """A `std_msgs/msg/Header`; the stamp is in nanoseconds."""
+    return make("std_msgs/msg/Header", stamp=time(stamp), frame_id=frame_id)
+
+
+def time(stamp: int) -> object:
+    """A `builtin_interfaces/msg/Time` of nanoseconds."""
     sec, nanosec = divmod(stamp, 1_000_000_000)
-    time = _make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return _make("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+    return make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 
-def _vector3(x: float, y: float, z: float) -> object:
-    return _make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+def vector3(x: float, y: float, z: float) -> object:
+    """A `geometry_msgs/msg/Vector3`."""
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
 def _twist(vx: float, wz: float) -> object:
-    return _make(
-        "geometry_msgs/msg/Twist", linear=_vector3(vx, 0.0, 0.0), angular=_vector3(0.0, 0.0, wz)
+    return make(
+        "geometry_msgs/msg/Twist", linear=vector3(vx, 0.0, 0.0), angular=vector3(0.0, 0.0, wz)
     )
 
 
 def _transform(parent: str, child: str, stamp: int, placed: Sequence[float]) -> object:
     x, y, z, qz, qw = placed
-    return _make(
+    return make(
         "geometry_msgs/msg/TransformStamped",
-        header=_header(stamp, parent),
+        header=header(stamp, parent),
         child_frame_id=child,
-        transform=_make(
+        transform=make(
             "geometry_msgs/msg/Transform",
-            translation=_vector3(x, y, z),
-            rotation=_make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=qz, w=qw),
+            translation=vector3(x, y, z),
+            rotation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=qz, w=qw),
         ),
     )
 
@@ -189,19 +214,19 @@ def _transform(parent: str, child: str, stamp: int, placed: Sequence[float]) -> 
 @cache
 def _odometry() -> bytes:
     covariance = np.diag([1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-2]).ravel()
-    pose = _make(
+    pose = make(
         "geometry_msgs/msg/Pose",
-        position=_make("geometry_msgs/msg/Point", x=_MARKS["x"], y=_MARKS["y"], z=0.0),
-        orientation=_make(
+        position=make("geometry_msgs/msg/Point", x=_MARKS["x"], y=_MARKS["y"], z=0.0),
+        orientation=make(
             "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=_MARKS["qz"], w=_MARKS["qw"]
         ),
     )
-    return _serialized(
+    return serialized(
         "nav_msgs/msg/Odometry",
-        header=_header(_STAMP_MARK, "odom"),
+        header=header(_STAMP_MARK, "odom"),
         child_frame_id="base_link",
-        pose=_make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
-        twist=_make(
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+        twist=make(
             "geometry_msgs/msg/TwistWithCovariance",
             twist=_twist(_MARKS["vx"], _MARKS["wz"]),
             covariance=covariance,
@@ -210,17 +235,17 @@ def _odometry() -> bytes:
 
 
 @cache
-def _moving_frame() -> bytes:
+def _moving_frame(parent: str, child: str) -> bytes:
     placed = (_MARKS["x"], _MARKS["y"], 0.0, _MARKS["qz"], _MARKS["qw"])
-    return _serialized(
-        "tf2_msgs/msg/TFMessage", transforms=[_transform("odom", "base_link", _STAMP_MARK, placed)]
+    return serialized(
+        "tf2_msgs/msg/TFMessage", transforms=[_transform(parent, child, _STAMP_MARK, placed)]
     )
 
 
 @cache
 def _command() -> bytes:
-    linear, angular = _vector3(_MARKS["vx"], 0.0, 0.0), _vector3(0.0, 0.0, _MARKS["wz"])
-    return _serialized("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+    linear, angular = vector3(_MARKS["vx"], 0.0, 0.0), vector3(0.0, 0.0, _MARKS["wz"])
+    return serialized("geometry_msgs/msg/Twist", linear=linear, angular=angular)
 
 
 def _filled(marked: bytes, stamps: NDArray[np.int64], columns: Mapping[str, Floats]) -> list[bytes]:
