@@ -1,8 +1,8 @@
 """The detector: what is in its view, and what it makes of that.
 
 In view is what is in range, in the field of view, and behind no wall. Of what is in view a fifth is
-dropped; places have a noise that grows with the range; two labels in a hundred are wrong, near-names
-are confused, and one label has several spellings.
+dropped; places have a noise that grows with the range; two labels in a hundred are wrong, two names
+that are near each other are confused, and one label has several spellings.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from benchmarks.home.days import Person
     from benchmarks.home.paths import Pose
+    from benchmarks.home.people import Person
     from benchmarks.home.things import Thing
     from benchmarks.motion import Floats
 
@@ -92,9 +92,9 @@ def targets(things: Sequence[Thing], people: Sequence[Person], t: Floats) -> Tar
     return Targets(x, y, z)
 
 
-def in_camera(robot: Pose, x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[
-    NDArray[np.float64], NDArray[np.float64]
-]:
+def in_camera(
+    robot: Pose, x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns how far ahead of the camera and to its left points of the map are."""
     cos, sin = np.cos(robot.yaw)[:, None], np.sin(robot.yaw)[:, None]
     east, north = x - robot.x[:, None], y - robot.y[:, None]
@@ -153,9 +153,7 @@ class _Detector:
             away = float(self.chance.uniform(*RANGE_M))
             to_side = float(self.chance.uniform(-HALF_VIEW, HALF_VIEW))
             point = (away * math.cos(to_side), away * math.sin(to_side), true[2])
-            return Detected(
-                message, -1, self._wrong(label), self._score(0.45, score), False, point
-            )
+            return Detected(message, -1, self._wrong(label), self._score(0.45, score), False, point)
         if fate < FALSE:
             wrong = self._wrong(label)
             return Detected(message, target, wrong, self._score(0.5, score), False, point)
@@ -163,9 +161,7 @@ class _Detector:
             near = NEAR_NAMES[label]
             return Detected(message, target, near, self._score(0.55, score), False, point)
         sure = 0.95 - 0.06 * distance
-        return Detected(
-            message, target, self._spelt(label), self._score(sure, score), True, point
-        )
+        return Detected(message, target, self._spelt(label), self._score(sure, score), True, point)
 
     def _wrong(self, label: str) -> str:
         among = [each for each in (*self.labels, *NONSENSE) if each != label]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.home.flat import DOCK, HALL_X, ROOMS, SPOTS, Spot, way
+from benchmarks.home.flat import DOCK, HALL_X, SPOTS, Spot, way
 from benchmarks.home.paths import Knots, Path, finished
 from benchmarks.home.things import DAY, HOUR
 
@@ -37,6 +37,7 @@ _BLIND_H: Final = (10 + 5 / 60, 12 + 5 / 60)
 _OUTAGE_UNTIL_H: Final = 17.0
 _POWER_CUT_S: Final = 1500.0
 _GAZES: Final = 6
+_NOTICE_S: Final = 0.3  # from what makes the robot stop until it stands
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +185,7 @@ class _Robot:
                 break
             self._look_around()
             if event == "power cut":
-                self._lose_power(day)
+                self._lose_power()
                 break
         cut = self.life.power_cut[0] >= start
         if not cut:
@@ -246,23 +247,22 @@ class _Robot:
         at = self.at
         start = at.t
         if event == "blocked":
-            at.wait(15.0)
-            self._goal(ABORTED)
-            self._log(at.t, 40, "controller_server", "Failed to make progress")
-            at.wait(float(self.chance.uniform(10.0, 20.0)))
+            self._goal(ABORTED, ago=_NOTICE_S)
+            self._log(start - _NOTICE_S, 40, "planner_server", "Failed to create plan: no way")
+            at.wait(float(self.chance.uniform(25.0, 35.0)))
             self._goal(EXECUTING, new=True)
         elif event == "bump":
-            self.life.bumps.append(start)
+            self.life.bumps.append(start - _NOTICE_S)
             at.wait(6.0)
         elif event == "pause":
             at.wait(float(self.chance.uniform(20.0, 35.0)))
         elif event == "hot":
-            self.life.hot.append((start - 4.0, start + 30.0))
-            self._log(start - 3.0, 30, "motor_driver", "Left wheel motor is overheated: 81 C")
+            self.life.hot.append((start - 6.0, start + 30.0))
+            self._log(start - 5.0, 30, "motor_driver", "Left wheel motor is overheated: 81 C")
             at.wait(25.0)
         elif event == "low battery":
+            self._goal(CANCELED, ago=_NOTICE_S)
             at.wait(5.0)
-            self._goal(CANCELED)
         elif event == "outage":
             until = math.floor(start / DAY) * DAY + _OUTAGE_UNTIL_H * HOUR
             self.life.outage = (start, max(until, start + 600.0))
@@ -272,7 +272,7 @@ class _Robot:
             self.life.halts.append(Halt(start, at.t, event, at.x, at.y))
         return event != "low battery"
 
-    def _lose_power(self, day: int) -> None:
+    def _lose_power(self) -> None:
         """Goes dead where it stands; somebody carries it to the dock and switches it on."""
         cut, back = self.at.t, self.at.t + _POWER_CUT_S
         self.life.power_cut = (cut, back)
@@ -306,9 +306,9 @@ class _Robot:
         self.life.battery.append((t, now))
         return now
 
-    def _goal(self, status: int, *, new: bool = False) -> None:
+    def _goal(self, status: int, *, new: bool = False, ago: float = 0.0) -> None:
         self.goal += new
-        self.life.goals.append(GoalChange(self.at.t, self.goal, status))
+        self.life.goals.append(GoalChange(self.at.t - ago, self.goal, status))
 
     def _log(self, t: float, level: int, node: str, text: str) -> None:
         self.life.logs.append(Log(t, level, node, text))
@@ -317,50 +317,6 @@ class _Robot:
 def live(scale: Scale) -> Life:
     """Returns the robot's life."""
     return _Robot(scale).live()
-
-
-class Person(NamedTuple):
-    """A person's way, and when they are out of the flat."""
-
-    path: Path
-    out: tuple[tuple[float, float], ...]
-
-
-_BEDS: Final = ((9.0, 7.8), (10.2, 7.8), (0.8, 1.6))
-_OUT_H: Final = ((8.5, 17.1), None, (9.2, 12.5))
-
-
-def people(scale: Scale) -> list[Person]:
-    """Returns the three people who live here: asleep at night, about by day, two of them out."""
-    return [
-        _person(scale, nth, bed, out)
-        for nth, (bed, out) in enumerate(zip(_BEDS, _OUT_H, strict=True))
-    ]
-
-
-def _person(
-    scale: Scale, nth: int, bed: tuple[float, float], out_h: tuple[float, float] | None
-) -> Person:
-    chance = scale.chance(2, nth)
-    at = Knots(-10.0, *bed)
-    out = []
-    for day in range(scale.days):
-        start = day * DAY
-        at.until(start + 7.0 * HOUR + float(chance.uniform(0.0, 1200.0)))
-        while at.t < start + 22.7 * HOUR:
-            if out_h is not None and start + out_h[0] * HOUR < at.t < start + out_h[1] * HOUR:
-                at.walk(HALL_X, 8.8)
-                out.append((at.t, start + out_h[1] * HOUR))
-                at.until(start + out_h[1] * HOUR)
-            room = ROOMS[str(chance.choice(list(ROOMS)))]
-            x = float(chance.uniform(room.x0 + 0.5, room.x1 - 0.5))
-            y = float(chance.uniform(room.y0 + 0.5, room.y1 - 0.5))
-            at.walk(x, y)
-            brief = chance.random() < 0.5
-            at.wait(float(chance.uniform(15, 90) if brief else chance.uniform(300, 1800)))
-        at.walk(*bed)
-    at.until(scale.days * DAY + 60.0)
-    return Person(finished(at), tuple(out))
 
 
 def without(

@@ -117,9 +117,7 @@ def way(start: tuple[float, float], goal: tuple[float, float]) -> list[tuple[flo
     return [*corners, goal]
 
 
-def clear_lines(
-    from_x: Floats, from_y: Floats, to_x: Floats, to_y: Floats
-) -> NDArray[np.bool_]:
+def clear_lines(from_x: Floats, from_y: Floats, to_x: Floats, to_y: Floats) -> NDArray[np.bool_]:
     """Returns whether no wall lies between each pair of points."""
     clear = np.ones(len(from_x), dtype=np.bool_)
     along_x, along_y = to_x - from_x, to_y - from_y

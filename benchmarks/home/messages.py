@@ -34,7 +34,7 @@ COMMAND: Final = Stream("/cmd_vel", 0.4, 0.1)
 DOCKED: Final = Stream("/is_docked", 2.0, 0.5)
 BUMPER: Final = Stream("/bumper", 1.0, 0.5)
 BATTERY: Final = Stream("/battery_state", 10.0, 2.0)
-DIAGNOSTICS: Final = Stream("/diagnostics", 10.0, 2.0)
+DIAGNOSTICS: Final = Stream("/diagnostics", 2.0, 2.0)
 
 TYPES: Final = {
     "/odom": "nav_msgs/msg/Odometry",
@@ -116,16 +116,12 @@ def _transform(
     )
 
 
-def _records(
-    world: World, topic: str, beats: Beats, bodies: Sequence[bytes]
-) -> Iterator[Record]:
+def _records(world: World, topic: str, beats: Beats, bodies: Sequence[bytes]) -> Iterator[Record]:
     logged = world.clock_ns(beats.log)
     # Published when the middleware took it; a detector publishes when it is done.
     slow = beats.log - beats.stamp > 0.01
     published = world.clock_ns(np.where(slow, beats.log - 0.0002, beats.stamp))
-    return map(
-        Record, logged.tolist(), published.tolist(), (topic,) * len(bodies), bodies
-    )
+    return map(Record, logged.tolist(), published.tolist(), (topic,) * len(bodies), bodies)
 
 
 def _moving(world: World, recording: Recording) -> Iterator[Record]:
@@ -190,9 +186,7 @@ def _detections(world: World, recording: Recording) -> Iterator[Record]:
 def _detection(seen: Detected) -> object:
     ahead, left, up = seen.point
     # A pinhole camera of 640 by 480 pixels.
-    across, down, half = (
-        round(320.0 * part / max(ahead, 0.2)) for part in (-left, -up, 0.15)
-    )
+    across, down, half = (round(320.0 * part / max(ahead, 0.2)) for part in (-left, -up, 0.15))
     edges = (320 + across - half, 240 + down - half, 320 + across + half, 240 + down + half)
     return payloads.make(
         "ros2_vision_interfaces/msg/VisionDetection",
@@ -329,9 +323,7 @@ def _goals(world: World, recording: Recording) -> Iterator[Record]:
 def _rosout(world: World, recording: Recording) -> Iterator[Record]:
     if not world.scale.rosout:
         return iter(())
-    lines = [
-        each for each in world.life.logs if recording.start <= each.t < recording.stop - 0.001
-    ]
+    lines = [each for each in world.life.logs if recording.start <= each.t < recording.stop - 0.001]
     stamps = np.array([each.t for each in lines])
     bodies = [
         payloads.serialized(

@@ -177,7 +177,7 @@ def things_of(days: int, chance: np.random.Generator, blind: tuple[float, float]
     for label, history in hand.stays.items():
         things.append(Thing(label, label, _stays(history, end)))
     moved = (days // 2) * DAY + 11.9 * HOUR
-    chair = [(0.0, _CHAIR[0]), (moved, _CHAIR[1])]
+    chair: list[tuple[float, Place | None]] = [(0.0, _CHAIR[0]), (moved, _CHAIR[1])]
     things.append(Thing("moved chair", "chair", _stays(chair, end)))
     return things
 

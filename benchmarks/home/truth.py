@@ -178,9 +178,7 @@ def _inside(spans: Sequence[Span], t: float) -> bool:
 def _day(world: World, recorded: Sequence[Span], day: int) -> DayTruth:
     start = day * DAY
     parts = [
-        (max(a, start), min(b, start + DAY))
-        for a, b in recorded
-        if a < start + DAY and b > start
+        (max(a, start), min(b, start + DAY)) for a, b in recorded if a < start + DAY and b > start
     ]
     gone = world.life.path.driven(np.array(parts).ravel()).reshape(-1, 2)
     grid = np.concatenate([np.append(np.arange(a, b, 1.0), b) for a, b in parts])
@@ -208,7 +206,9 @@ def _things(world: World) -> tuple[ThingTruth, ...]:
         beats, sights = world.sights(recording)
         clock = world.clock(beats.stamp).tolist()
         stamps = beats.stamp.tolist()
-        for message, target in zip(*map(np.ndarray.tolist, np.nonzero(sights.in_view)), strict=True):
+        for message, target in zip(
+            *map(np.ndarray.tolist, np.nonzero(sights.in_view)), strict=True
+        ):
             if target < len(world.things):
                 nth = _stay(world.things[target], stamps[message])
                 _view(seen[target][nth], clock[message])
@@ -255,12 +255,12 @@ def _visits(world: World, recorded: Sequence[Span]) -> dict[str, tuple[Span, ...
     for start, stop in recorded:
         grid = np.append(np.arange(start, stop, _SAMPLE_S), stop)
         pose = world.robot(grid)
-        for name in found:
+        for name, spans in found.items():
             inside = _in_place(name, pose.x, pose.y)
             edges = np.flatnonzero(np.diff(inside.astype(np.int8), prepend=0, append=0))
             for first, after in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
                 left = min(after, len(grid) - 1)
-                found[name].append(
+                spans.append(
                     (world.clock_at(float(grid[first])), world.clock_at(float(grid[left])))
                 )
     return {name: tuple(spans) for name, spans in found.items()}

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from benchmarks.home import camera, days, drift, things
 from benchmarks.home.paths import Pose
+from benchmarks.home.people import people
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from benchmarks.home.camera import Sights
-    from benchmarks.home.days import Life, Person, Scale
+    from benchmarks.home.days import Life, Scale
     from benchmarks.home.drift import Drift
+    from benchmarks.home.people import Person
     from benchmarks.home.things import Thing
     from benchmarks.motion import Floats
 
@@ -65,7 +68,7 @@ class Recording(NamedTuple):
         """Returns the times of its splits."""
         count = max(1, round(np.ceil((self.stop - self.start) / split_s - 1e-6)))
         edges = [self.start + nth * split_s for nth in range(count)] + [self.stop]
-        return list(zip(edges[:-1], edges[1:], strict=True))
+        return list(pairwise(edges))
 
 
 class Beats(NamedTuple):
@@ -90,9 +93,7 @@ class World:
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """Returns the label of each target: things, then people."""
-        return tuple(
-            [thing.label for thing in self.things] + [camera.PERSON] * len(self.people)
-        )
+        return tuple([thing.label for thing in self.things] + [camera.PERSON] * len(self.people))
 
     @cached_property
     def recordings(self) -> tuple[Recording, ...]:
@@ -132,7 +133,7 @@ class World:
         k = np.arange(first, int(recording.stop / period) + 2)
         # The same fraction for a message whatever recording is asked: no draw.
         shortest, longest = stream.delay_s
-        stamp = k * period
+        stamp = np.asarray(k * period, dtype=np.float64)
         log = stamp + shortest + (longest - shortest) * ((k * _GOLDEN) % 1.0)
         kept = (log >= recording.start) & (log < recording.stop) & (stamp >= recording.booted)
         if stream is VISION:
@@ -149,9 +150,7 @@ class World:
         robot, frame = self.robot(t), self.drift.at(t, believed=False)
         cos, sin = np.cos(frame.yaw), np.sin(frame.yaw)
         east, north = robot.x - frame.x, robot.y - frame.y
-        return Pose(
-            cos * east + sin * north, cos * north - sin * east, robot.yaw - frame.yaw
-        )
+        return Pose(cos * east + sin * north, cos * north - sin * east, robot.yaw - frame.yaw)
 
     def docked(self, t: Floats) -> NDArray[np.bool_]:
         """Returns whether the robot is on its dock."""
@@ -183,7 +182,7 @@ def world_of(scale: Scale) -> World:
     return World(
         scale=scale,
         life=life,
-        people=tuple(days.people(scale)),
+        people=tuple(people(scale)),
         things=tuple(things.things_of(scale.days, scale.chance(4), life.blind)),
         drift=drift.drift(scale, life, sorted(moving)),
         on=tuple(days.switched_on(scale, life)),
