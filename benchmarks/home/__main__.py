@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -21,7 +22,7 @@ from benchmarks.home.things import LABELS
 from benchmarks.home.truth import places, truth_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
 
@@ -33,16 +34,14 @@ _FORMAT: Final = 1  # of what is written; folders of another one are made anew
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the benchmark; the exit code is 0 whatever was right."""
     given = _parser().parse_args(argv)
-    # Days are calendar days of the robot, whose clock is set to UTC.
-    os.environ["TZ"] = "UTC"
-    time.tzset()
     scale = Scale(given.seed, given.days, given.compression, given.split_s, given.rosout)
     if given.write is not None:
         write(scale, given.write)
         return 0
     world = made(scale, given.dir)
-    server = asking.server_over(asking.settings_for(world, scale.split_s))
-    outcomes = asking.ask_all(server, questions(scale))
+    with _in_utc():
+        server = asking.server_over(asking.settings_for(world, scale.split_s))
+        outcomes = asking.ask_all(server, questions(scale))
     print(asking.as_table(outcomes))
     if given.json is not None:
         rows = [
@@ -58,6 +57,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         ]
         given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 0
+
+
+@contextmanager
+def _in_utc() -> Iterator[None]:
+    """Has this process's days begin and end as those of the robot do."""
+    before = os.environ.get("TZ")
+    os.environ["TZ"] = "UTC"
+    time.tzset()
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["TZ"]
+        else:
+            os.environ["TZ"] = before
+        time.tzset()
 
 
 def made(scale: Scale, folder: Path) -> Path:

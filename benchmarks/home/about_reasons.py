@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from benchmarks.home import replies
 from benchmarks.home.days import CLOCK_STEP_S
-from benchmarks.home.judging import Number, Time, Truth, Words
+from benchmarks.home.judging import Number, Time, Words, YesNo
 from benchmarks.home.questions import Question, ask, in_words
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def _blind(asked: Asked) -> list[Question]:
             "blind-yesterday",
             "reliability",
             "Did your detector fall silent on any day before today?",
-            {"blind": Truth(value=False)},
+            {"blind": YesNo(value=False)},
             ask("data_time_range"),
             of_yesterday,
         ),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from benchmarks.home import replies
 from benchmarks.home.camera import PERSON
 from benchmarks.home.flat import FRONT_DOOR
-from benchmarks.home.judging import Names, Number, Order, Time, Truth, Words
+from benchmarks.home.judging import Names, Number, Order, Time, Words, YesNo
 from benchmarks.home.questions import Question, ask
 from benchmarks.home.things import NEVER_SEEN
 from benchmarks.home.world import VISION
@@ -288,7 +288,7 @@ def _changes(asked: Asked) -> list[Question]:
         "sofa-still",
         "change",
         "Is the sofa still where it was?",
-        {"still_there": Truth(value=True)},
+        {"still_there": YesNo(value=True)},
         ask("find_things", label="sofa"),
         lambda found: {"still_there": _one(found).get("still_there") in {True, "seen_again"}},
     )

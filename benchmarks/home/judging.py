@@ -87,7 +87,7 @@ class Words:
 
 
 @dataclass(frozen=True, slots=True)
-class Truth:
+class YesNo:
     """Yes or no."""
 
     value: bool

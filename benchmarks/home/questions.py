@@ -132,7 +132,13 @@ def in_words(moment: float) -> str:
 
 
 def questions(scale: Scale) -> list[Question]:
-    """Returns the questions about the world of a scale."""
+    """Returns the questions about the world of a scale.
+
+    Raises:
+        ValueError: it has one day, which is to be compared with no other.
+    """
+    if scale.days < 2:
+        raise ValueError("the questions need 2 days or more")
     # Their makers import this module.
     from benchmarks.home import about_places, about_reasons, about_things  # noqa: PLC0415
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from benchmarks.home import days, flat
+from benchmarks.home import flat
 from benchmarks.home.things import DAY
 from benchmarks.home.world import START_S, world_of
 
@@ -131,8 +132,9 @@ class Truth:
         return _plain(asdict(self))
 
 
+@cache
 def truth_of(scale: Scale) -> Truth:
-    """Returns the truth about the world of a scale."""
+    """Returns the truth about the world of a scale; the same one however often it is asked for."""
     world = world_of(scale)
     recorded = _recorded(world)
     life, clock = world.life, world.clock_at
@@ -342,6 +344,3 @@ def _plain(value: object) -> JsonValue:
     if value is None or isinstance(value, int | str):
         return value
     raise TypeError(f"{value!r} is no plain value")
-
-
-__all__ = ["Truth", "days", "places", "truth_of"]
