@@ -17,13 +17,16 @@ import yaml
 
 from benchmarks.home import asking, recording
 from benchmarks.home.days import Scale
+from benchmarks.home.judging import wrong_fields
 from benchmarks.home.questions import questions
 from benchmarks.home.things import LABELS
 from benchmarks.home.truth import places, truth_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
+    from benchmarks.home.judging import Answer
+    from benchmarks.home.questions import Question
     from ros2_memory.core.model import JsonValue
 
 _DIR: Final = Path(__file__).resolve().parents[2] / "build" / "benchmarks"
@@ -37,6 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     scale = Scale(given.seed, given.days, given.compression, given.split_s, given.rosout)
     if given.write is not None:
         write(scale, given.write)
+        return 0
+    if given.judge is not None:
+        answers = json.loads(given.judge.read_text(encoding="utf-8"))
+        print(judged(questions(scale), answers))
         return 0
     world = made(scale, given.dir)
     with _in_utc():
@@ -57,6 +64,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         ]
         given.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 0
+
+
+def judged(asked: Sequence[Question], answers: Mapping[str, Answer]) -> str:
+    """Returns how many answers (by the question's id) are right, and what is wrong with others."""
+    lines, right = [], 0
+    for question in asked:
+        wrong = wrong_fields(question.truth, answers.get(question.id, {}))
+        right += not wrong
+        if wrong:
+            lines.append(f"wrong: {question.id}: {', '.join(wrong)}")
+    return "\n".join([f"{right} of {len(asked)} right", *lines])
 
 
 @contextmanager
@@ -127,6 +145,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--split-s", type=float, default=shipped.split_s)
     parser.add_argument("--no-rosout", dest="rosout", action="store_false")
     parser.add_argument("--write", type=Path, metavar="DIR", help="build there, and ask nothing")
+    parser.add_argument(
+        "--judge",
+        type=Path,
+        metavar="FILE",
+        help="only judge somebody's answers: for each id an object with the fields asked for",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the outcomes there")
     parser.add_argument("--dir", type=Path, default=_DIR, help="where worlds are kept")
     return parser

@@ -266,7 +266,11 @@ def _each_day(asked: Asked) -> list[Question]:
             "battery",
             "routine",
             "How low was your battery on each day?",
-            {"lowest": Series({day.date: Number(day.lowest_battery, 0.02) for day in days})},
+            {
+                "lowest_fraction": Series(
+                    {day.date: Number(day.lowest_battery, 0.02) for day in days}
+                )
+            },
             ask(
                 "get_topic_in_range",
                 topic=_BATTERY,
@@ -274,7 +278,7 @@ def _each_day(asked: Asked) -> list[Question]:
                 by="day",
                 fields=["percentage"],
             ),
-            lambda found: {"lowest": replies.bins(found[0], "min", "lowest")},
+            lambda found: {"lowest_fraction": replies.bins(found[0], "min", "lowest")},
         ),
         Question(
             "recorded",

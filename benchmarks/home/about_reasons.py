@@ -52,13 +52,13 @@ def _stopped(reason: str, stood: Standstill, words: tuple[str, ...]) -> Question
         if before is None:
             events = replies.rows(found[0], "events", "standstills")
             before = [each["before"] for each in events if each.get("before")]
-        return {"before": json.dumps(before)}
+        return {"reason": json.dumps(before)}
 
     return Question(
         f"why-{reason.replace(' ', '-')}",
         "why",
         f"Why did you stop at {in_words(at)} in the {stood.room}?",
-        {"before": truth},
+        {"reason": truth},
         ask("recap", around=at),
         read,
     )

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
 
+_NOTHING = ("nothing", "no reason", "not recorded", "unknown")
+
 Answer: TypeAlias = "Mapping[str, JsonValue]"
 
 
@@ -27,6 +29,10 @@ class Expected(Protocol):
 
     def as_json(self) -> dict[str, JsonValue]:
         """Returns it as `questions.json` has it."""
+        ...
+
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
         ...
 
 
@@ -47,6 +53,10 @@ class Number:
         """Returns `number` and `within`."""
         return {"number": round(self.value, 3), "within": round(self.within, 3)}
 
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        return "number"
+
 
 @dataclass(frozen=True, slots=True)
 class Time:
@@ -64,6 +74,10 @@ class Time:
         """Returns `earliest` and `latest`."""
         return {"earliest": round(self.earliest, 3), "latest": round(self.latest, 3)}
 
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        return "time: Unix seconds or ISO 8601"
+
 
 @dataclass(frozen=True, slots=True)
 class Words:
@@ -76,7 +90,9 @@ class Words:
         """Returns whether the text is right."""
         if not isinstance(given, str):
             return False
-        text = given.casefold()
+        text = given.casefold().strip()
+        if not self.any_of and text.startswith(_NOTHING):
+            return True
         if any(word in text for word in self.none_of):
             return False
         return not self.any_of or any(word in text for word in self.any_of)
@@ -84,6 +100,10 @@ class Words:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `any_of` and `none_of`."""
         return {"any_of": [*self.any_of], "none_of": [*self.none_of]}
+
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        return "text"
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +119,10 @@ class YesNo:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `is`."""
         return {"is": self.value}
+
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        return "true or false"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +142,10 @@ class Names:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `all_of` and `maybe`."""
         return {"all_of": [*sorted(self.all_of)], "maybe": [*sorted(self.maybe)]}
+
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        return "list of names"
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +168,11 @@ class Series:
         """Returns `series`."""
         return {"series": {name: each.as_json() for name, each in self.values.items()}}
 
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        names, values = [*self.values], [*self.values.values()]
+        return f"object: {values[0].form()} for each name, such as {names[0]}"
+
 
 @dataclass(frozen=True, slots=True)
 class Order:
@@ -154,6 +187,10 @@ class Order:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `in_order`."""
         return {"in_order": [*self.names]}
+
+    def form(self) -> str:
+        """Returns what kind of value is asked for."""
+        return "list of names in order"
 
 
 def right(truth: Mapping[str, Expected], answer: Answer) -> bool:

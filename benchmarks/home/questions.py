@@ -54,7 +54,7 @@ class Question:
             "id": self.id,
             "kind": self.kind,
             "text": self.text,
-            "answer": [*self.truth],
+            "answer": {name: expected.form() for name, expected in self.truth.items()},
             "truth": {name: expected.as_json() for name, expected in self.truth.items()},
             "calls": [{"tool": call.tool, "arguments": {**call.arguments}} for call in self.calls],
         }

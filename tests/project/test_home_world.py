@@ -364,6 +364,7 @@ def test_answers_are_judged_within_their_tolerance() -> None:
     assert not Time(START_S - 1, START_S + 1).accepts("yesterday")
     assert Words(("kitchen",)).accepts("the Kitchen")
     assert Words((), ("bumper",)).accepts("nothing recorded")
+    assert Words((), ("bumper",)).accepts("Nothing recorded, the bumper was free")
     assert not Words((), ("bumper",)).accepts("/bumper became true")
     assert not Words(("kitchen",)).accepts(None)
     names = Names(frozenset({"mug"}), frozenset({"cup"}))
@@ -377,6 +378,19 @@ def test_answers_are_judged_within_their_tolerance() -> None:
     assert not Order(("hall", "study")).accepts(["study", "hall"])
     assert YesNo(value=True).accepts(given=True)
     assert not YesNo(value=True).accepts(1)
+
+
+def test_the_answers_of_a_planner_are_judged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "answers.json").write_text(
+        json.dumps({"count-chair": {"count": 4}, "count-plant": {"count": 4}, "crash": {}})
+    )
+    assert main(["--judge", str(tmp_path / "answers.json")]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("1 of 60 right")
+    assert "wrong: count-plant: count" in said
+    assert "count-chair" not in said
 
 
 def test_the_script_counts_what_is_right_and_what_no_tool_answers_yet(
