@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import yaml
 
-from benchmarks.home import asking, recording
+from benchmarks.home import asking, instances, recording
 from benchmarks.home.days import Scale
 from benchmarks.home.judging import wrong_fields
 from benchmarks.home.questions import questions
@@ -49,7 +49,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     with _in_utc():
         server = asking.server_over(asking.settings_for(world, scale.split_s))
         outcomes = asking.ask_all(server, questions(scale))
+        things = instances.measured(server, truth_of(scale), scale.split_s)
     print(asking.as_table(outcomes))
+    if things is not None:
+        print("\n".join(["", *things.lines()]))
     if given.json is not None:
         rows = [
             {

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from benchmarks.home import replies
 from benchmarks.home.camera import PERSON
 from benchmarks.home.flat import FRONT_DOOR
+from benchmarks.home.instances import point_of
 from benchmarks.home.judging import Names, Number, Order, Time, Words, YesNo
 from benchmarks.home.questions import Question, ask
 from benchmarks.home.things import NEVER_SEEN
@@ -114,10 +115,8 @@ def _where(asked: Asked) -> list[Question]:
 
 
 def _point(found: Sequence[Row]) -> Answer:
-    thing = _one(found)
-    at = thing.get("place", thing.get("position", thing))
-    where = at if isinstance(at, dict) and "x" in at else thing
-    return {"x": replies.number(where, "x"), "y": replies.number(where, "y")}
+    x, y = point_of(_one(found))
+    return {"x": x, "y": y}
 
 
 def _now(thing: ThingTruth) -> Place:

@@ -16,6 +16,7 @@ from benchmarks.home import camera, flat
 from benchmarks.home.__main__ import as_json, made, main, write
 from benchmarks.home.days import BUMP_S, CLOCK_STEP_S, Scale
 from benchmarks.home.drift import NOTICED_S
+from benchmarks.home.instances import measured
 from benchmarks.home.judging import Names, Number, Order, Series, Time, Words, YesNo
 from benchmarks.home.questions import KINDS, questions
 from benchmarks.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS, SURFACES
@@ -25,8 +26,11 @@ from benchmarks.payloads import typestore
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
+from ros2_memory.tools.replies import Reply
+
 if TYPE_CHECKING:
-    from benchmarks.home.truth import Truth
+    from benchmarks.home.instances import Measures
+    from benchmarks.home.truth import ThingTruth, Truth
     from benchmarks.home.world import World
     from numpy.typing import NDArray
 
@@ -402,3 +406,64 @@ def test_the_script_counts_what_is_right_and_what_no_tool_answers_yet(
     outcomes = json.loads(told.read_text(encoding="utf-8"))
     right = {each["id"] for each in outcomes if each["result"] == "right"}
     assert right >= {"never-seen", "last-outing", "battery-low", "since-when", "outage", "crash"}
+
+
+def _reported(thing: ThingTruth, **more: object) -> dict[str, object]:
+    """A thing as `find_things` should report it."""
+    history = [
+        {"x": stay.place.x, "y": stay.place.y, "from": stay.sight.first_detected}
+        for stay in thing.known()
+        if stay.place is not None
+    ]
+    return {"label": thing.label, **history[-1], "history": history, **more}
+
+
+class _Replies:
+    """A server whose `find_things` reports what it is given."""
+
+    def __init__(self, things: dict[str, list[dict[str, object]]]) -> None:
+        self.dispatcher = self
+        self.things = things
+
+    async def answer(self, name: str, given: dict[str, str]) -> Reply:
+        found = self.things[given["label"]]
+        return Reply(json.dumps({"things": found, "total": len(found)}), is_error=False)
+
+
+def _all_right() -> dict[str, list[dict[str, object]]]:
+    found: dict[str, list[dict[str, object]]] = {}
+    for thing in _truth().things:
+        found.setdefault(thing.label, []).append(_reported(thing))
+    return found
+
+
+def _measures(things: dict[str, list[dict[str, object]]]) -> Measures:
+    server: Any = _Replies(things)
+    found = measured(server, _truth(), SCALE.split_s)
+    assert found is not None
+    return found
+
+
+def test_the_truth_itself_measures_as_perfect() -> None:
+    found = _measures(_all_right())
+    assert found.right_labels == found.labels == len({each.label for each in _truth().things})
+    assert max(found.away_m) == 0.0
+    assert found.moves_in_time == found.moves >= 8
+    assert not found.switches
+    assert not found.denied
+
+
+def test_what_is_wrong_with_instances_is_measured() -> None:
+    things = _all_right()
+    (mug,) = things["mug"]
+    history = mug["history"]
+    assert isinstance(history, list)
+    history[-1]["from"] += 2 * SCALE.split_s
+    things["chair"].append({"label": "chair", "x": 5.0, "y": 5.0, "history": []})
+    things["sofa"][0]["still_there"] = "not_seen_where_expected"
+    things["bed"][0]["history"] = [{"x": 1.0, "y": 1.0, "from": 0.0}]
+    found = _measures(things)
+    assert found.wrong_numbers == ["chair 5 for 4"]
+    assert [each.split(" to ")[0] for each in found.late_moves] == ["mug"]
+    assert found.denied == ["sofa at 0.9, 0.9"]
+    assert found.switches == ["bed at 1.0, 1.0"]

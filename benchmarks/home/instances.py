@@ -1,0 +1,149 @@
+"""How well `find_things` makes instances of detections: numbers, places, moves, and what it denies.
+
+All labels are asked for one by one, without a window, as an owner does. A thing that was never
+detected is not expected; what cannot be known (a move that nobody saw) is not counted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from dataclasses import dataclass, field
+from statistics import median
+from typing import TYPE_CHECKING, Final
+
+from benchmarks.home import replies
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from benchmarks.home.replies import Row
+    from benchmarks.home.things import Place
+    from benchmarks.home.truth import PlaceOfThing, ThingTruth, Truth
+    from ros2_memory.serving.mcp_server import EpisodicServer
+
+_SAME_M: Final = 0.7
+"""A place that is reported so near to a true one is that one: half of the way to another."""
+_DENIED: Final = "not_seen_where_expected"
+
+
+@dataclass(slots=True)
+class Measures:
+    """What was found. `switches` are places of a thing that it never stood at."""
+
+    labels: int = 0
+    right_labels: int = 0
+    wrong_numbers: list[str] = field(default_factory=list)
+    away_m: list[float] = field(default_factory=list)
+    moves: int = 0
+    moves_in_time: int = 0
+    late_moves: list[str] = field(default_factory=list)
+    sightings: int = 0
+    switches: list[str] = field(default_factory=list)
+    denied: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """Returns them in words."""
+        share = len(self.switches) / self.sightings if self.sightings else 0.0
+        away = f"{median(self.away_m):.2f} m median, {max(self.away_m):.2f} m at most"
+        return [
+            f"labels with the right number of instances: {self.right_labels} of {self.labels}"
+            + _listed(self.wrong_numbers),
+            f"places away from the truth: {away if self.away_m else 'none'}",
+            f"moves known within one split: {self.moves_in_time} of {self.moves}"
+            + _listed(self.late_moves),
+            f"places where a thing never stood: {len(self.switches)}, {share:.1%} of "
+            f"{self.sightings} sightings" + _listed(self.switches),
+            f"denied where the thing does stand: {len(self.denied)}" + _listed(self.denied),
+        ]
+
+
+def measured(server: EpisodicServer, truth: Truth, split_s: float) -> Measures | None:
+    """Returns the measures; None while no tool, or another one, answers `find_things`."""
+    found = Measures()
+    try:
+        for label in sorted({thing.label for thing in truth.things}):
+            things = [thing for thing in truth.of(label) if thing.known()]
+            if not things:
+                continue
+            reply = asyncio.run(server.dispatcher.answer("find_things", {"label": label})).text
+            _compare(found, label, things, replies.things(json.loads(reply)), split_s)
+    except replies.UnreadableError:
+        return None
+    return found
+
+
+def _compare(
+    found: Measures, label: str, things: Sequence[ThingTruth], reported: list[Row], split_s: float
+) -> None:
+    found.labels += 1
+    found.right_labels += len(reported) == len(things)
+    if len(reported) != len(things):
+        found.wrong_numbers.append(f"{label} {len(reported)} for {len(things)}")
+    points = [point_of(each) for each in reported]
+    for thing in things:
+        now = thing.known()[-1]
+        nearest = min((_away(point, now.place) for point in points), default=math.inf)
+        if nearest <= _SAME_M:
+            found.away_m.append(nearest)
+        found.sightings += sum(len(stay.sight.in_view) for stay in thing.stays)
+    histories = [replies.stays(each) for each in reported]
+    _compare_moves(found, label, things, histories, split_s)
+    every = [stay for thing in things for stay in thing.known()]
+    for history in histories:
+        for each in history:
+            if all(_away(point_of(each), stay.place) > _SAME_M for stay in every):
+                x, y = point_of(each)
+                found.switches.append(f"{label} at {x:.1f}, {y:.1f}")
+    for each, point in zip(reported, points, strict=True):
+        stands = [thing.stays[-1] for thing in things]
+        if _DENIED in {each.get("still_there"), each.get("state")} and any(
+            _away(point, stay.place) <= _SAME_M for stay in stands
+        ):
+            found.denied.append(f"{label} at {point[0]:.1f}, {point[1]:.1f}")
+
+
+def _compare_moves(
+    found: Measures,
+    label: str,
+    things: Sequence[ThingTruth],
+    histories: Sequence[list[Row]],
+    split_s: float,
+) -> None:
+    for thing in things:
+        for stay in thing.known()[1:]:
+            found.moves += 1
+            if any(_is_known(stay, history, split_s) for history in histories):
+                found.moves_in_time += 1
+            else:
+                found.late_moves.append(f"{label} to {stay.place.name if stay.place else ''}")
+
+
+def _is_known(stay: PlaceOfThing, history: list[Row], split_s: float) -> bool:
+    """Whether a history has the stay, beginning when it was first seen, within one split."""
+    first = stay.sight.first_detected or math.inf
+    return any(
+        _away(point_of(each), stay.place) <= _SAME_M
+        and abs(replies.time(each, *replies.SINCE) - first) <= split_s
+        for each in history
+    )
+
+
+def point_of(found: Row) -> tuple[float, float]:
+    """Returns where a reply has a thing, or a stay of it.
+
+    Raises:
+        UnreadableError: it has no point.
+    """
+    at = found.get("place", found.get("position", found))
+    where = at if isinstance(at, dict) and "x" in at else found
+    return replies.number(where, "x"), replies.number(where, "y")
+
+
+def _away(point: tuple[float, float], place: Place | None) -> float:
+    return math.inf if place is None else math.dist(point, (place.x, place.y))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f" ({', '.join(names)})" if names else ""
