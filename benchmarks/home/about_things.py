@@ -54,15 +54,16 @@ def _how_many(asked: Asked) -> list[Question]:
         "chair": "How many chairs are there in the flat?",
         "plant": "How many plants do we have?",
         "mug": "How many mugs are there? I do not mean cups.",
-        "book": "How many books are lying about, notebooks aside?",
+        "book": "How many books are there, by what you were at least 60 % sure of? No notebooks.",
     }
+    sure: dict[str, dict[str, JsonValue]] = {"book": {"min_score": 0.6}}
     return [
         Question(
             f"count-{label}",
             "counting",
             text,
             {"count": Number(len(asked.truth.of(label)))},
-            ask("find_things", label=label),
+            ask("find_things", label=label, **sure.get(label, {})),
             _count,
         )
         for label, text in words.items()
