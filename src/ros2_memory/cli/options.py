@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -21,7 +20,7 @@ from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArguments
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns, unix_from_text
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
@@ -150,8 +149,8 @@ def parse_time(text: str) -> float:
     except ValueError:
         pass
     try:
-        return datetime.fromisoformat(text).astimezone().timestamp()
-    except (ValueError, OverflowError, OSError):
+        return unix_from_text(text)
+    except ValueError:
         raise InvalidArgumentsError(
             f"{text!r} is no time; write Unix seconds (1795163910.5) or ISO 8601 "
             "(2026-11-20T08:30:00)"

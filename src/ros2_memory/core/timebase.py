@@ -1,14 +1,16 @@
 """Time: integer nanoseconds inside, float seconds outside, and the conversions between them.
 
 Inside, a time is an `Ns` (nanoseconds since the Unix epoch) and a window is half-open. Outside, a
-time is a float of Unix seconds. A float64 near the present resolves about 0.24 microseconds, so a
-time in a reply is rounded *up* to whole microseconds (`unix_rounded_up`) and a time in a query is
-granted `AT_OR_BEFORE_SLACK_NS`: a timestamp fed back finds its own message.
+time is a float of Unix seconds; one that comes in may be ISO 8601 (`unix_from_text`). A float64
+near the present resolves about 0.24 microseconds, so a time in a reply is rounded *up* to whole
+microseconds (`unix_rounded_up`) and a time in a query is granted `AT_OR_BEFORE_SLACK_NS`: a
+timestamp fed back finds its own message.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
@@ -28,6 +30,12 @@ AT_OR_BEFORE_SLACK_NS: Final[Ns] = NS_PER_US
 """Tolerance of "at or before t", because t was converted to a float of seconds."""
 START_SLACK_NS: Final[Ns] = 2 * AT_OR_BEFORE_SLACK_NS
 """Tolerance of "from t on": a timestamp fed back was also rounded up past its own message."""
+
+_WEEKDAYS: Final = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+_DIGITS: Final = re.compile(r"[0-9]{9,}(\.[0-9]+)?")
+# Not every text that `datetime` reads: it takes 17840232 for a day of the year 1784.
+_ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
+_LONGEST_TIME: Final = 64
 
 MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
@@ -68,6 +76,51 @@ def iso_local(ns: Ns) -> str | None:
         return datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).astimezone().isoformat()
     except (OverflowError, ValueError, OSError):
         return None
+
+
+def local_text(ns: Ns) -> str | None:
+    """Returns local time as `Tue 2026-11-17 14:05:03`, which `unix_from_text` reads; else as above.
+
+    Seconds are whole, rounded down. A local time that occurs twice, since clocks were set back, is
+    written the same way both times.
+    """
+    try:
+        local = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).astimezone()
+    except (OverflowError, ValueError, OSError):
+        return None
+    return f"{_WEEKDAYS[local.weekday()]} {local.replace(tzinfo=None).isoformat(sep=' ')}"
+
+
+def unix_from_text(text: str) -> float:
+    """Returns the Unix seconds of a time that is written as ISO 8601.
+
+    Without an offset it is local time, by the zone of this machine (or of TZ), and a date alone is
+    its midnight. A local time that occurs twice, since clocks were set back, is the first of the
+    two; one that clocks skipped counts by the offset before (both as in RFC 5545). A weekday may
+    precede it, as in replies. Unix seconds in quotes are read, too, if they have nine digits or
+    more: fewer could be a date.
+
+    Raises:
+        ValueError: it is neither, no such day exists, or it is another weekday; the message
+            completes "the time, which".
+    """
+    weekday, written = _without_weekday(text.strip() if len(text) <= _LONGEST_TIME else "")
+    if _DIGITS.fullmatch(written):
+        return float(written)
+    try:
+        read = datetime.fromisoformat(written if _ISO.fullmatch(written) else "")
+        seconds = read.timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise ValueError("is no time in ISO 8601, or none that exists") from None
+    if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:
+        raise ValueError(f"is a {_WEEKDAYS[read.weekday()]}, not a {weekday}")
+    return seconds
+
+
+def _without_weekday(text: str) -> tuple[str | None, str]:
+    first, _, rest = text.partition(" ")
+    weekday = first.rstrip(",").title()
+    return (weekday, rest.strip()) if weekday in _WEEKDAYS else (None, text)
 
 
 class Clock(ABC):

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import math
-from datetime import datetime
+import time
+from datetime import UTC, datetime, timedelta, timezone
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -16,13 +18,40 @@ from ros2_memory.core.timebase import (
     Deadline,
     WallClock,
     iso_local,
+    local_text,
     ms_from_ns,
     ns_from_unix,
     unix_from_ns,
+    unix_from_text,
     unix_rounded_up,
 )
 from tests.support.clocks import FixedClock
 from tests.support.strategies import moments
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ZONES = ["UTC", "CET-1CEST,M3.5.0,M10.5.0/3", "EST5EDT,M3.2.0,M11.1.0", "<+0545>-5:45"]
+"""Written out, so that they do not depend on the machine's time zone files."""
+OFFSETS = st.integers(-14 * 60, 14 * 60).map(lambda minutes: timezone(timedelta(minutes=minutes)))
+
+
+@pytest.fixture(params=ZONES)
+def zone(request: pytest.FixtureRequest) -> Iterator[str]:
+    yield from in_zone(request.param)
+
+
+@pytest.fixture
+def berlin() -> Iterator[str]:
+    yield from in_zone(ZONES[1])
+
+
+def in_zone(name: str) -> Iterator[str]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", name)
+        time.tzset()
+        yield name
+    time.tzset()
 
 
 @given(moments)
@@ -109,3 +138,86 @@ def test_a_deadline_passes_once_its_budget_is_spent() -> None:
 
 def test_no_deadline_never_passes() -> None:
     assert not Deadline.never().expired()
+
+
+@given(moments, OFFSETS)
+def test_a_time_with_an_offset_is_read_as_it_was_written(moment: int, zone: timezone) -> None:
+    microseconds = moment // NS_PER_US
+    written = (datetime.fromtimestamp(0, tz=UTC) + timedelta(microseconds=microseconds)).astimezone(
+        zone
+    )
+    assert unix_from_text(written.isoformat()) == pytest.approx(microseconds / 1e6, abs=1e-6)
+    assert unix_from_text(written.isoformat(sep=" ")) == unix_from_text(written.isoformat())
+
+
+@pytest.mark.usefixtures("zone")
+@given(moments)
+def test_local_times_of_replies_are_read_as_they_were_written(moment: int) -> None:
+    whole = moment // NS_PER_S
+    assert unix_from_text(iso_local(moment) or "") == whole
+    # Without an offset an hour that occurs twice is the first of the two.
+    again = unix_from_text(local_text(moment) or "")
+    assert whole - again in {0, 3600}
+    assert local_text(ns_from_unix(again)) == local_text(moment)
+
+
+def test_a_local_time_has_its_weekday(berlin: str) -> None:
+    assert local_text(1_794_920_703 * NS_PER_S + 999) == "Tue 2026-11-17 14:05:03"
+    assert unix_from_text("Tue 2026-11-17 14:05:03") == 1_794_920_703
+    assert unix_from_text("tue, 2026-11-17T14:05:03") == 1_794_920_703
+    with pytest.raises(ValueError, match="is a Tue, not a Wed"):
+        unix_from_text("Wed 2026-11-17 14:05:03")
+
+
+def test_a_date_alone_is_its_local_midnight(berlin: str) -> None:
+    assert unix_from_text("2026-11-20") == unix_from_text("2026-11-20T00:00:00+01:00")
+    assert unix_from_text(" 2026-07-20 ") == unix_from_text("2026-07-19T22:00Z")
+
+
+def test_a_time_that_clocks_skipped_counts_by_the_offset_before(berlin: str) -> None:
+    assert unix_from_text("2026-03-29T02:30") == unix_from_text("2026-03-29T02:30+01:00")
+    assert unix_from_text("2026-03-29T01:59:59") == unix_from_text("2026-03-29T00:59:59Z")
+    assert unix_from_text("2026-03-29T03:00") == unix_from_text("2026-03-29T01:00Z")
+
+
+def test_a_time_that_occurs_twice_is_the_first_of_the_two(berlin: str) -> None:
+    first = unix_from_text("2026-10-25T02:30")
+    assert first == unix_from_text("2026-10-25T02:30+02:00")
+    assert unix_from_text("2026-10-25T02:30+01:00") == first + 3600
+
+
+def test_unix_seconds_in_quotes_are_read_where_they_can_be_no_date() -> None:
+    assert unix_from_text("1795161600.25") == 1_795_161_600.25
+    assert unix_from_text("20261120T080000Z") == 1_795_161_600.0
+    with pytest.raises(ValueError, match="no time"):
+        unix_from_text("20261120")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", " ", "yesterday", "14:05", "2026-02-30", "2026-11-20T25:00", "Tue", "-5", "1e9", "NaN",
+     "2026-11-20T14:05:03 and later", "٢٠٢٦-11-20", "2026-11-20T14:05\x00", "x" * 100_000],
+)  # fmt: skip
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="is no time in ISO 8601, or none that exists"):
+        unix_from_text(text)
+
+
+@given(st.text(max_size=80))
+def test_any_text_is_a_finite_time_or_refused(text: str) -> None:
+    try:
+        seconds = unix_from_text(text)
+    except ValueError:
+        return
+    assert math.isfinite(seconds)
+
+
+@pytest.mark.usefixtures("zone")
+@pytest.mark.parametrize("text", ["0001-01-02T00:00Z", "9999-12-30T23:59:59+00:00"])
+def test_the_ends_of_the_calendar_are_times(text: str) -> None:
+    assert unix_from_text(text) == datetime.fromisoformat(text).timestamp()
+
+
+def test_a_year_that_the_calendar_does_not_have_has_no_local_text() -> None:
+    assert local_text(MIN_NS) is not None
+    assert local_text(10**30) is None
