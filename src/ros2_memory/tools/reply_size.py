@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 JsonObject: TypeAlias = "dict[str, JsonValue]"
 _Path: TypeAlias = tuple[str, ...]
 
-EVENLY_THINNED: Final = frozenset({"samples", "waypoints", "value"})
+EVENLY_THINNED: Final = frozenset({"samples", "rows", "waypoints", "value"})
 """Rows along time: some of every part say more than all of one part. Others lose their end."""
 
+_NEVER_THINNED: Final = frozenset({"notes", "fields"})
 _FEWEST_ROWS: Final = 2
 _SHORTEST_TEXT: Final = 200
 _ARRAY_STEPS: Final = (50, 25, 12, 6, 3, 2)
@@ -167,7 +168,11 @@ def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
 
 def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:
     """Thins the longest lists of the reply's first level until it fits or few rows are left."""
-    lists = {key: item for key, item in reply.items() if isinstance(item, list) and key != "notes"}
+    lists = {
+        key: item
+        for key, item in reply.items()
+        if isinstance(item, list) and key not in _NEVER_THINNED
+    }
     for key in sorted(lists, key=lambda key: len(to_json_text(lists[key])), reverse=True):
         rows = lists[key]
         if len(to_json_text(reply)) <= max_chars or len(rows) <= _FEWEST_ROWS:
@@ -263,14 +268,25 @@ class _Shortener:
 
     def shorten(self, reply: JsonObject) -> JsonObject:
         """Returns the reply with everything within the limits, except notes and its rows."""
+        columns, rows = reply.get("fields"), reply.get("rows")
+        table: JsonObject = {}
+        if isinstance(columns, list) and isinstance(rows, list):
+            table = {"fields": columns, "rows": [self._cells(row, columns) for row in rows]}
         return {
-            key: item
-            if key == "notes"
-            else [self._value(row, key) for row in item]
-            if isinstance(item, list)
-            else self._value(item, key)
+            key: table[key] if key in table else item if key == "notes" else self._rows(key, item)
             for key, item in reply.items()
         }
+
+    def _rows(self, key: str, item: JsonValue) -> JsonValue:
+        if isinstance(item, list):
+            return [self._value(row, key) for row in item]
+        return self._value(item, key)
+
+    def _cells(self, row: JsonValue, columns: list[JsonValue]) -> JsonValue:
+        """Returns a row of a table, of which no cell is left out: each belongs to its column."""
+        if not isinstance(row, list):
+            return row
+        return [self._value(cell, str(name)) for name, cell in zip(columns, row, strict=False)]
 
     def _value(self, value: JsonValue, path: str) -> JsonValue:
         if isinstance(value, str) and len(value) > self._text:

@@ -98,6 +98,29 @@ def test_a_thinned_range_says_how_many_are_left_and_how_to_see_more() -> None:
     assert list(shown)[-1] == "notes"
 
 
+@given(st.integers(2, 300), st.integers(1, 60), st.integers(600, 6000))
+def test_a_thinned_table_keeps_its_ends_and_every_cell_of_its_columns(
+    count: int, columns: int, cap: int
+) -> None:
+    names: list[Any] = ["timestamp", *(f"field_{n}" for n in range(columns))]
+    rows: list[Any] = [[1.5 + at, *(at + n for n in range(columns))] for at in range(count)]
+    shown = strict(fit_reply({"fields": names, "rows": rows, "notes": []}, cap))
+    if "rows" not in shown:
+        return  # two rows are more than fits
+    assert shown["fields"] == names
+    assert shown["rows"][0] == rows[0]
+    assert shown["rows"][-1] == rows[-1]
+    assert all(row in rows for row in shown["rows"])
+
+
+def test_long_cells_of_a_table_are_cut_and_stay_in_their_columns() -> None:
+    rows: list[Any] = [[1.5, "x" * 3000, list(range(900)), 7], [2.5, "y" * 3000, [], 8]]
+    reply: dict[str, Any] = {"fields": ["timestamp", "text", "ranges", "id"], "rows": rows}
+    shown = strict(fit_reply(reply, 2500))
+    assert [(len(row), row[0], row[3]) for row in shown["rows"]] == [(4, 1.5, 7), (4, 2.5, 8)]
+    assert "text (texts cut)" in shown["notes"][0]
+
+
 def test_lists_that_are_not_along_time_keep_their_beginning() -> None:
     shown = strict(fit_reply({"frames": [f"frame_{n:03}" for n in range(500)]}, 1000))
     kept = shown["frames"]
