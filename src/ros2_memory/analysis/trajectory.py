@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 TOLERANCE_M: Final = 0.05
 """How far a pose may be from the drawn path, unless a limit on count widens it."""
 
+MAX_WAYPOINTS: Final = 50
+"""Vertices of the path that is returned, unless more or fewer are asked for."""
+
 _BAG_VERTICES: Final = 32
 """Vertices of the path that is stored of one bag; all of its poses, where they are no more."""
 
@@ -146,7 +149,7 @@ class TrajectoryBuilder(_Poses):
     def __init__(
         self,
         max_plausible_speed_mps: float,
-        max_waypoints: int = 50,
+        max_waypoints: int = MAX_WAYPOINTS,
         tolerance_m: float = TOLERANCE_M,
     ) -> None:
         if max_waypoints < 2 or not (max_plausible_speed_mps > 0 and tolerance_m > 0):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
+from ros2_memory.analysis.trajectory import MAX_WAYPOINTS, PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import counted
@@ -53,10 +53,13 @@ POSES: Final = DigestKind(
 )
 
 
-def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None:
+def driven_path(
+    view: View, topic: str, window: TimeWindow, max_waypoints: int = MAX_WAYPOINTS
+) -> DrivenPath | None:
     """Returns the path in a window by the poses of one topic; None where there is no message.
 
-    Messages that cannot be decoded are left out, with a note.
+    It is drawn with `max_waypoints` (2 or more) at most. Messages that cannot be decoded are left
+    out, with a note.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
@@ -64,7 +67,7 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
     """
     fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
-    builder = TrajectoryBuilder(fastest)
+    builder = TrajectoryBuilder(fastest, max_waypoints)
     decoder = motion_decoder(view.memory.reader, view.memory.extractor)
 
     def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest, Span | None]:
