@@ -241,6 +241,22 @@ class Condition:
         return self.test if self.field is None and isinstance(self.test, NearPosition) else None
 
 
+def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
+    """Returns the texts in a value that meet a condition on texts, each once, in their order."""
+    test = condition.test
+    if not isinstance(test, Contains | Equals):
+        return ()
+    targets = [value] if condition.field is None else at_field(value, condition.field)
+    # `leaves` goes through a value from its end.
+    found = [
+        leaf
+        for target in targets
+        for leaf in reversed([*leaves(target)])
+        if isinstance(leaf, str) and test.matches(leaf)
+    ]
+    return tuple(dict.fromkeys(found))
+
+
 def parse_condition(
     condition_type: str, value: JsonValue, tolerance_m: float, field: str | None = None
 ) -> Condition:
