@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -81,6 +82,7 @@ from ros2_memory.insights.status import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
@@ -89,6 +91,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 _MAX_ODD_BAGS: Final = 5
+_FEWEST_OF_A_LINE: Final = 2
 
 
 def topic_value(
@@ -141,7 +144,7 @@ def topic_range(
     elif fields:
         extremes = extremes_of(view, name, window, fields)
     return results.TopicRange(
-        name, types[-1], total, samples, extremes, notes=view.notes.sentences()
+        name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )
 
 
@@ -379,12 +382,20 @@ def _newest_beside(
 
 
 def trajectory_summary(
-    memory: Memory, call: Call, span: TimeRange, *, topic: str | None = None
+    memory: Memory,
+    call: Call,
+    span: TimeRange,
+    *,
+    topic: str | None = None,
+    max_waypoints: int = MAX_WAYPOINTS,
 ) -> results.TrajectorySummary:
-    """Returns the driven path in a window, from one pose topic in log-time order."""
+    """Returns the driven path in a window, from one pose topic in log-time order.
+
+    Of its waypoints 0 is none, and 1 the last.
+    """
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)
-    path = driven_path(view, name, window)
+    path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
     if path is None:
         raise no_data_between(view, (name,), window)
     if len(path.frames) > 1:
@@ -397,9 +408,17 @@ def trajectory_summary(
         path.frames[0],
         path.first,
         path.last,
-        path.trajectory,
+        _with_few_waypoints(path.trajectory, max_waypoints),
         notes=view.notes.sentences(),
     )
+
+
+def _with_few_waypoints(path: Trajectory, at_most: int) -> Trajectory:
+    """Returns a path without the waypoints that are too many where these are too few for a line."""
+    if at_most >= _FEWEST_OF_A_LINE:
+        return path
+    last = path.waypoints[-1:] if at_most else ()
+    return replace(path, waypoints=last, waypoint_error_m=0.0)
 
 
 def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:

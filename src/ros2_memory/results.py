@@ -14,7 +14,17 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.analysis.transform_tree import FrameEdge
     from ros2_memory.bag_dir.moment_file import StoredMoment
-    from ros2_memory.core.model import Geodetic, Pose, Sample, SetAside, Transform, Twist, Vector3
+    from ros2_memory.core.errors import NoDataReason
+    from ros2_memory.core.model import (
+        Geodetic,
+        JsonValue,
+        Pose,
+        Sample,
+        SetAside,
+        Transform,
+        Twist,
+        Vector3,
+    )
     from ros2_memory.core.timebase import Ns
 
 
@@ -105,7 +115,8 @@ class Extremes:
 class TopicRange(AnswerWithNotes):
     """Samples of a window, evenly spaced over all `total` messages in it, with the first and last.
 
-    `extremes` are those of all messages, for the requested fields that hold numbers.
+    Their values are objects by `fields`, if any were requested. `extremes` are those of all
+    messages, for the requested fields that hold numbers.
     """
 
     topic: str
@@ -113,6 +124,7 @@ class TopicRange(AnswerWithNotes):
     total: int
     samples: tuple[Sample, ...]
     extremes: tuple[Extremes, ...] = ()
+    fields: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +164,26 @@ class TransformAt(AnswerWithNotes):
     transform: Transform
     clock: str
     age: Ns | None = None
+
+
+MomentAnswer: TypeAlias = TopicValue | Position | Velocity | TransformAt
+"""An answer about one moment."""
+
+
+@dataclass(frozen=True, slots=True)
+class NothingAt(AnswerWithNotes):
+    """The answer about one of several moments, at which there is nothing: why."""
+
+    at: Ns
+    reason: NoDataReason
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class AtEach(AnswerWithNotes):
+    """The answers about several moments, in the order in which these were asked."""
+
+    answers: tuple[MomentAnswer | NothingAt, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +243,8 @@ class Sighting:
         begun: whether the message before the first is known not to belong.
         robot: where the robot was at the last.
         thing: where the thing itself was then, if the message has that.
+        matched: the texts of the last message that met the condition, where that is on texts.
+        value: the requested fields of the last message; None where none were, or it has none.
     """
 
     topic: str
@@ -220,6 +254,8 @@ class Sighting:
     begun: bool
     robot: Pose | None
     thing: LabelledPlace | None
+    matched: tuple[str, ...] = ()
+    value: JsonValue = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,7 +229,11 @@ class _Paper:
                 return f"{len(inner)} messages are there" if inner else None
             if not len(inner) <= answer["total"] <= len(outer):
                 return f"total is {len(inner)} to {len(outer)}"
-            times = [sample["timestamp"] for sample in answer["samples"]]
+            times = (
+                [row[0] for row in answer["rows"]]
+                if chosen
+                else [sample["timestamp"] for sample in answer["samples"]]
+            )
             if times != sorted(times) or len(times) > max(7, 1):
                 return "samples are not in order"
             if not all(_recorded(time, outer) for time in times):

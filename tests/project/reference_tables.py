@@ -20,6 +20,7 @@ from ros2_memory.cli.app import COMMANDS, COMMON_EXIT_CODES
 from ros2_memory.config import Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import LineKind
+from ros2_memory.tools.arguments import TIME_KINDS
 from tests.support.documented_history import CALLS
 from tests.support.memories import ROOT
 
@@ -148,8 +149,10 @@ def _kind(schema: Mapping[str, Any]) -> str:
         return "mapping"
     if "anyOf" in schema:
         return " or ".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
+    if schema.get("type") == [*TIME_KINDS]:
+        return "time"
     kind = {
-        "array": "list",
+        "array": "list of times" if schema.get("items") == {"type": [*TIME_KINDS]} else "list",
         "boolean": "`true`, `false`",
         "integer": "whole number",
         "null": "`null`",

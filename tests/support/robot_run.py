@@ -26,7 +26,7 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ("get_topic_at_time", {"topic": "/odom", "timestamp": T0_S + 5}, "value"),
     ("get_topic_seconds_ago", {"topic": "/odom", "seconds_ago": 5}, "age_s"),
     ("get_topic_in_range", {"topic": "/odom", "start": T0_S, "end": T0_S + 9}, "samples"),
-    ("get_topic_in_last", {"topic": "/odom", "seconds": 5, "fields": "position"}, "samples"),
+    ("get_topic_in_last", {"topic": "/odom", "seconds": 5, "fields": "position"}, "rows"),
     ("get_position_at", {"timestamp": T0_S + 3}, "yaw_deg"),
     ("get_position_seconds_ago", {"seconds_ago": 1}, "age_s"),
     ("get_velocity_at", {"timestamp": T0_S + 3}, "linear"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import queries
+from ros2_memory import queries, results
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -30,7 +30,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
-from tests.support.memories import memory_of
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -225,3 +225,26 @@ def test_without_a_bag_directory_it_is_not_reported_that_nothing_was_recorded(
     with pytest.raises(NoDataError, match="the bag directory does not exist"):
         queries.list_recorded_topics(memory, Call())
     assert queries.list_recorded_topics(memory_of(tmp_path), Call()) == ()
+
+
+def test_a_path_is_drawn_with_as_many_waypoints_as_are_asked_for(tmp_path: Path) -> None:
+    zigzag = [odom(T0 + at * S, float(at), float(at % 2)) for at in range(20)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", zigzag)
+    memory = memory_of(tmp_path)
+
+    def drawn(at_most: int) -> results.TrajectorySummary:
+        return queries.trajectory_summary(memory, Call(), span(0, 20), max_waypoints=at_most)
+
+    whole = drawn(50)
+    assert len(whole.trajectory.waypoints) == 20
+    few = drawn(5)
+    assert len(few.trajectory.waypoints) <= 5
+    assert few.trajectory.waypoint_error_m > 0.5
+    none = drawn(0)
+    assert none.trajectory.waypoints == ()
+    assert none.trajectory.totals == whole.trajectory.totals
+    assert [each.time for each in drawn(1).trajectory.waypoints] == [T0 + 19 * S]
+    reply = asked(memory, tmp_path, "trajectory_summary", start=T0 / S, end=T0 / S + 20,
+                  max_waypoints=0)  # fmt: skip
+    assert reply["waypoints"] == []
+    assert not any("waypoint" in each for each in reply.get("notes", []))

@@ -153,10 +153,14 @@ def _tallied(
 
 @dataclass(frozen=True, slots=True)
 class AtTime:
-    """A moment: at Unix seconds, or so many seconds before now. Exactly one is set."""
+    """A moment: at Unix seconds, or so many seconds before now; or several. Exactly one is set.
+
+    `each_s` are moments in Unix seconds; `insights.at_each` asks a query about one after the other.
+    """
 
     at_s: float | None = None
     ago_s: float | None = None
+    each_s: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.conditions import NearPosition, parse_condition
+from ros2_memory.analysis.conditions import NearPosition, matched_texts, parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -77,6 +77,7 @@ def find_matches(
     value: JsonValue,
     *,
     field: str | None = None,
+    fields: Sequence[str] = (),
     start_s: float | None = None,
     end_s: float | None = None,
     last_s: float | None = None,
@@ -86,10 +87,12 @@ def find_matches(
     """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
 
     `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound what is
-    searched. With `oldest_first` all of it is searched, and the oldest sightings are returned.
+    searched. With `oldest_first` all of it is searched, and the oldest sightings are returned. A
+    sighting has the `fields` (dot-paths) of its last message.
 
     Raises:
-        InvalidArgumentsError: nothing can meet the condition, or the bounds make no window.
+        InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or no
+            sighting has one of the fields.
         NoDataError: the memory holds nothing, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
@@ -107,6 +110,8 @@ def find_matches(
         searched = TimeWindow(collected.selected[-1].first, window.stop)
     view.notes.retract_before(searched.start)
     found = tuple(_sighting(view, condition, matches) for matches in collected.selected)
+    if fields:
+        found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
@@ -308,16 +313,51 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
 
 def _sighting(view: View, condition: Condition, matches: _Matches) -> Sighting:
     """Returns the result, with where the robot and the thing were at the newest match."""
-    robot = _robot(view, matches.newest)
+    newest = matches.newest
+    message = view.memory.reader.decode(newest.record)
+    value = view.memory.extractor.exact(message, newest.record.channel.type)
+    robot = _robot(view, newest)
+    things = detections_of(value, view.memory.extractor.frame(message))
     return Sighting(
-        topic=matches.newest.record.channel.topic,
+        topic=newest.record.channel.topic,
         first=matches.first,
-        last=matches.newest.time,
+        last=newest.time,
         messages=matches.messages,
         begun=matches.begun,
         robot=robot,
-        thing=_spot(view, condition, matches.newest, robot),
+        thing=_spot(view, _matching(things, condition), newest, robot),
+        matched=matched_texts(condition, value),
     )
+
+
+def _with_fields(
+    view: View,
+    sightings: Sequence[Sighting],
+    found: Sequence[_Matches],
+    fields: Sequence[str],
+) -> tuple[Sighting, ...]:
+    """Returns the sightings with the fields of their last messages in place of matched texts.
+
+    Raises:
+        InvalidArgumentsError: none of them has these fields.
+    """
+    extended: list[Sighting] = []
+    refused: list[InvalidArgumentsError] = []
+    for sighting, matches in zip(sightings, found, strict=True):
+        record = matches.newest.record
+        message = view.memory.reader.decode(record)
+        try:
+            shown = view.memory.extractor.shown(message, record.channel.type, fields)
+        except InvalidArgumentsError as error:
+            refused.append(error)
+            extended.append(sighting)
+            continue
+        for sentence in shown.notes:
+            view.notes.add(sentence)
+        extended.append(replace(sighting, matched=(), value=shown.value))
+    if refused and len(refused) == len(extended):
+        raise refused[0]
+    return tuple(extended)
 
 
 def _robot(view: View, seen: StoredMessage) -> Pose | None:
@@ -335,13 +375,9 @@ def _robot(view: View, seen: StoredMessage) -> Pose | None:
 
 
 def _spot(
-    view: View, condition: Condition, found: StoredMessage, robot: Pose | None
+    view: View, thing: Detection | None, found: StoredMessage, robot: Pose | None
 ) -> LabelledPlace | None:
     """Returns where the thing that matched was: in the map, the robot's frame, or its message's."""
-    message = view.memory.reader.decode(found.record)
-    value = view.memory.extractor.exact(message, found.record.channel.type)
-    frame = view.memory.extractor.frame(message)
-    thing = _matching(detections_of(value, frame), condition)
     if thing is None or thing.place is None:
         return None
     frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)

@@ -23,7 +23,9 @@ from pydantic import (
     WithJsonSchema,
 )
 
+from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
+from ros2_memory.core.timebase import unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
@@ -32,6 +34,11 @@ LONGEST_NAME: Final = 500
 """Characters: twice what DDS allows for a topic."""
 LONGEST_VALUE: Final = 2_000
 MOST_FIELDS: Final = 100
+MOST_TIMES: Final = 20
+"""Moments that one call asks about."""
+MOST_WAYPOINTS: Final = 200
+TIME_KINDS: Final = ("number", "string")
+"""The JSON types of a time: Unix seconds, or ISO 8601 text."""
 LONGEST_BEFORE_S: Final = 3600.0
 LONGEST_AFTER_S: Final = 600.0
 """Of a moment that is to be saved."""
@@ -44,6 +51,28 @@ def _as_list(value: object) -> object:
         value = parsed if isinstance(parsed, list) else [value]
     if isinstance(value, list) and len(value) > MOST_FIELDS:
         raise ValueError(f"has more than {MOST_FIELDS} elements")
+    return value
+
+
+def _read_time(value: object) -> object:
+    """Returns Unix seconds for a text that is a time; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    seconds = unix_from_text(value)
+    if seconds > LATEST_UNIX_S:
+        raise ValueError("is after the year 2262, up to which times are recorded")
+    return seconds
+
+
+def _as_times(value: object) -> object:
+    """Returns a list of times, which planners also send as JSON text or as one bare time."""
+    if isinstance(value, str):
+        parsed = _parse_json(value)
+        value = parsed if isinstance(parsed, list) else [value]
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        value = [value]
+    if isinstance(value, list) and len(value) > MOST_TIMES:
+        raise ValueError(f"has {len(value)} times, more than {MOST_TIMES}")
     return value
 
 
@@ -115,11 +144,14 @@ _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name
 _Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
-_Unix: TypeAlias = Annotated[
-    float, Field(strict=True, allow_inf_nan=False), AfterValidator(_check_unix)
+_Time: TypeAlias = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False),
+    AfterValidator(_check_unix),
+    BeforeValidator(_read_time),
+    WithJsonSchema({"type": [*TIME_KINDS]}),
 ]
-_UnixBound: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.")]
-_Before: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
+_Times: TypeAlias = Annotated[tuple[_Time, ...], BeforeValidator(_as_times)]
 _Tolerance: TypeAlias = Annotated[
     _Duration, Field(description="How old the message may be then, in s.")
 ]
@@ -175,19 +207,25 @@ class TimeArgument(Arguments):
         replaces: the placeholder, `moment` or `span`.
         text: what a tool's description says for {when}.
         extra_reply: the keys that a reply has in addition.
+        either: the names of arguments of which exactly one must be given.
     """
 
     replaces: ClassVar[str]
     text: ClassVar[str]
     extra_reply: ClassVar[str] = ""
+    either: ClassVar[tuple[str, ...]] = ()
 
 
 class At(TimeArgument):
-    """A moment in Unix seconds."""
+    """A moment, or several."""
 
     replaces = "moment"
-    text = "at a Unix time"
-    at_s: Annotated[_UnixBound, Field(examples=[1784023200.5], alias="timestamp")]
+    text = "at a time"
+    either = ("timestamp", "timestamps")
+    at_s: _Time | None = Field(default=None, alias="timestamp", examples=[1784023200.5])
+    each_s: Annotated[_Times, Field(description=f"Up to {MOST_TIMES}.")] = Field(
+        default=(), alias="timestamps"
+    )
 
 
 class Ago(TimeArgument):
@@ -202,12 +240,12 @@ class Ago(TimeArgument):
 
 
 class Between(TimeArgument):
-    """A window in Unix seconds."""
+    """A window between two times."""
 
     replaces = "span"
-    text = "between two Unix times"
-    start_s: Annotated[_UnixBound, Field(examples=[1784023200], alias="start")]
-    end_s: Annotated[_UnixBound, Field(examples=[1784023260], alias="end")]
+    text = "between two times"
+    start_s: Annotated[_Time, Field(examples=[1784023200], alias="start")]
+    end_s: Annotated[_Time, Field(examples=[1784023260], alias="end")]
 
 
 class Last(TimeArgument):
@@ -280,7 +318,7 @@ class LastMatchArguments(ConditionArguments):
     """A condition on a topic, of which the last match is returned."""
 
     fields: _Fields = ()
-    before_s: _Before | None = Field(default=None, alias="before")
+    before_s: _Time | None = Field(default=None, alias="before", description="Nothing after.")
 
 
 class ValueWhenArguments(Arguments):
@@ -294,7 +332,7 @@ class ValueWhenArguments(Arguments):
     value: _ConditionValue
     field: _SearchField | None = None
     fields: _Fields = ()
-    before_s: _Before | None = Field(default=None, alias="before")
+    before_s: _Time | None = Field(default=None, alias="before", description="Nothing after.")
 
 
 class TrajectoryArguments(Arguments):
@@ -302,6 +340,9 @@ class TrajectoryArguments(Arguments):
 
     span: TimeRange
     topic: _PoseTopic | None = None
+    max_waypoints: Annotated[
+        Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)], BeforeValidator(_as_integer)
+    ] = MAX_WAYPOINTS
 
 
 class WindowArguments(Arguments):
@@ -344,11 +385,12 @@ class VisitsArguments(Arguments):
 class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
+    fields: _Fields = ()
     last_s: Annotated[_Positive, Field(description="Only the last so many s.")] | None = Field(
         default=None, alias="seconds"
     )
-    start_s: _UnixBound | None = Field(default=None, alias="start")
-    end_s: _UnixBound | None = Field(default=None, alias="end")
+    start_s: _Time | None = Field(default=None, alias="start")
+    end_s: _Time | None = Field(default=None, alias="end")
     oldest_first: Annotated[
         bool, Field(strict=True, description="Counts all; the first are told.")
     ] = False

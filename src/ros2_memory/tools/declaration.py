@@ -74,10 +74,13 @@ class ToolDeclaration:
     blocking: bool = False
     writes: bool = False
 
-    def tools(self, defaults: Mapping[str, object]) -> Iterator[Tool]:
-        """Yields a tool for each name; `defaults` fill the description's placeholders."""
+    def tools(self, defaults: Mapping[str, object], *, plain_times: bool = False) -> Iterator[Tool]:
+        """Yields a tool for each name; `defaults` fill the description's placeholders.
+
+        `plain_times`: see `Signature`.
+        """
         for each in self.names:
-            signature = Signature(self.arguments, each.when)
+            signature = Signature(self.arguments, each.when, plain_times=plain_times)
             yield Tool(
                 each.name,
                 each.title,

@@ -24,7 +24,8 @@ _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
     "When, where, how often and how long a condition (as in find_last_match) held, newest first; "
     "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
-    "duration_s, ago_s, count, robot: where it was at last_seen, place: of the thing}}], total}}.",
+    "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: where it "
+    "was then, place: of the thing}}], total}}.",
     MatchesArguments,
     find_matches,
     blocking=True,

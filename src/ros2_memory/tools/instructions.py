@@ -11,9 +11,10 @@ _RULES: Final = """\
 What a robot saw and did in the past, from its recordings. For what it sees right now, ask \
 elsewhere: {newest} answer not_closed_yet.
 Three rules prevent most wrong calls:
-1. Times are Unix seconds. For "10 s ago" or "in the last minute" take the tools named \
-_seconds_ago, _last or recent_: they need no clock. A timestamp from a reply can be passed to any \
-other tool as it is.
+1. Times are Unix seconds{or_text}. For "10 s ago" or "in the last minute" take the tools named \
+_seconds_ago, _last or recent_: they need no clock. A time from a reply can be passed to any \
+other tool as it is, and timestamps in place of timestamp asks about several at once: \
+{{results: [...]}} in their order.
 2. Use topic names as list_recorded_topics spells them; only find_* and get_value_when take globs \
 (/vision/*/scene_objects). "At" a time means the newest message at or before it, at most \
 tolerance_s old ({tolerance} s by default: give 2 for a topic that speaks once a second); the \
@@ -47,6 +48,9 @@ def instructions(settings: QuerySettings, *, additions: bool = True) -> str:
     tools beyond the specification are offered.
     """
     return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
+        or_text=" or ISO 8601 (2026-11-20T14:05, local unless it has an offset)"
+        if additions
+        else "",
         newest="the newest 3 s or so are not on disk yet and"
         if settings.include_active
         else f"the newest {settings.split_duration_s:g} s or so are still being written and",

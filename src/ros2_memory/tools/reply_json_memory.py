@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory import results
 from ros2_memory.core.timebase import Ns, iso_local, unix_rounded_up
 from ros2_memory.retention.policy import GB
-from ros2_memory.tools.reply_json import moment, render, seconds, with_notes
+from ros2_memory.tools.reply_json import LocalTimes, moment, render, seconds, with_notes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,11 +25,13 @@ _S_PER_DAY: Final = 86_400
 def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
     """Returns what `data_time_range` replies; files are named relative to the bag directory."""
     notes = list(answer.notes)
+    local = LocalTimes(answer.earliest, answer.now)
     gaps: list[JsonValue] = [
         {
             "start": unix_rounded_up(gap.start),
             "end": unix_rounded_up(gap.end),
             "duration_s": seconds(gap.end - gap.start),
+            **local.of(gap.start, gap.end),
         }
         for gap in answer.gaps
     ]
@@ -80,12 +82,14 @@ def file_name(path: Path | str, bag_dir: Path) -> str:
 @render.register(results.Status)
 def _status(answer: results.Status) -> JsonObject:
     latest = answer.latest
+    local = LocalTimes(answer.earliest, answer.now)
     lists: dict[str, list[JsonValue]] = {
         "fell_silent": [
             {
                 "topic": each.topic,
                 "last_ts": moment(each.last),
                 "ago_s": seconds(answer.now - each.last),
+                **local.of(each.last),
             }
             for each in answer.fell_silent
         ],
@@ -100,6 +104,7 @@ def _status(answer: results.Status) -> JsonObject:
         "now": moment(answer.now),
         "earliest": moment(answer.earliest),
         "latest": moment(latest),
+        **local.of(answer.earliest, latest),
         "newest_age_s": None if latest is None else seconds(answer.now - latest),
         **{name: topics[:_MAX_TOPICS] for name, topics in lists.items()},
         "damaged": answer.damaged,
@@ -150,16 +155,19 @@ def _saved_moment(answer: results.RememberedMoment) -> JsonObject:
 
 @render.register(results.MomentList)
 def _stored_moments(answer: results.MomentList) -> JsonObject:
-    reply: JsonObject = {"moments": [_stored(each, answer.now) for each in answer.moments]}
+    begun = (each.moment.request.start for each in answer.moments)
+    local = LocalTimes(min(begun, default=None), answer.now)
+    reply: JsonObject = {"moments": [_stored(each, answer.now, local) for each in answer.moments]}
     if answer.more:
         reply["more"] = answer.more
     return reply
 
 
-def _stored(stored: StoredMoment, now: Ns) -> JsonObject:
+def _stored(stored: StoredMoment, now: Ns, local: LocalTimes) -> JsonObject:
     saved = stored.moment
     reply: JsonObject = {
         **_labelled_window(stored.folder.name, saved.request),
+        **local.of(saved.request.start, saved.request.end),
         "ago_s": seconds(now - saved.request.end),
         "bags": len(stored.files),
         "size_gb": round(sum(stored.files.values()) / GB, 6),

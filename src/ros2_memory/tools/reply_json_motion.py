@@ -9,6 +9,7 @@ from ros2_memory.core.geometry import yaw
 from ros2_memory.core.timebase import Ns, unix_rounded_up
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.tools.reply_json import (
+    LocalTimes,
     degrees,
     metres,
     moment,
@@ -113,6 +114,7 @@ def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
         "frame_id": answer.frame_id or None,
         "start": unix_rounded_up(answer.start),
         "end": unix_rounded_up(answer.end),
+        **LocalTimes(answer.start, answer.end).of(answer.start, answer.end),
         "poses": path.poses,
         **({"path_sum_m": rounded(path.totals.path_sum_m, 4)} if path.is_noisy else {}),
         **({"gap_m": rounded(path.totals.gap_m, 4)} if path.totals.gaps else {}),
@@ -141,22 +143,25 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
 
 @render.register(results.Visits)
 def _visits(answer: results.Visits) -> JsonObject:
+    known = (at for each in answer.visits for at in (each.arrived, each.departed) if at is not None)
+    local = LocalTimes(min(known, default=None), answer.now)
     reply: JsonObject = {
         "frame_id": answer.frame_id or None,
         "x": answer.x,
         "y": answer.y,
         "radius_m": answer.radius_m,
         "there_now": any(each.departed is None for each in answer.visits),
-        "visits": [_visit(each, answer.now) for each in answer.visits],
+        "visits": [_visit(each, answer.now, local) for each in answer.visits],
         "total": answer.total,
     }
     return with_notes(reply, answer.notes, more=answer.more)
 
 
-def _visit(visit: results.Visit, now: Ns) -> JsonObject:
+def _visit(visit: results.Visit, now: Ns, local: LocalTimes) -> JsonObject:
     reply: JsonObject = {
         "arrived": moment(visit.arrived),
         "departed": moment(visit.departed),
+        **local.of(visit.arrived, visit.departed),
         "duration_s": seconds(visit.duration),
         "closest_m": rounded(visit.closest_m, 3),
         "closest_at": moment(visit.closest_at),

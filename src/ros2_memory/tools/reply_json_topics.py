@@ -6,9 +6,10 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import listed, shortened
 from ros2_memory.core.timebase import Ns, unix_rounded_up
 from ros2_memory.tools.reply_json import (
+    LocalTimes,
     metres,
     moment,
     planar_pose,
@@ -20,7 +21,7 @@ from ros2_memory.tools.reply_json import (
 from ros2_memory.tools.reply_size import to_json_text, without_constant_zeros
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.tools.reply_size import JsonObject
@@ -30,6 +31,9 @@ ZEROS_SHOWN_BELOW_CHARS: Final = 4000
 
 _LONGEST_LAST_ROW_CHARS: Final = 200
 """Characters of the row that sums up those left out, whatever its numbers."""
+MOST_MATCHED: Final = 5
+LONGEST_MATCHED: Final = 200
+"""Texts that matched in one message, and characters of each."""
 _MAX_ZEROS_NAMED: Final = 20
 
 
@@ -81,6 +85,8 @@ def _topic_value(answer: results.TopicValue) -> JsonObject:
 
 @render.register(results.TopicRange)
 def _topic_range(answer: results.TopicRange) -> JsonObject:
+    if answer.fields:
+        return _columns(answer)
     reply = _range_of(answer, [sample.value for sample in answer.samples], answer.notes)
     if len(to_json_text(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
         return reply
@@ -103,17 +109,54 @@ def _range_of(
             for sample, value in zip(answer.samples, values, strict=True)
         ],
     }
-    if answer.extremes:
-        reply["extremes"] = {each.field: _extremes(each) for each in answer.extremes}
     return with_notes(reply, notes)
 
 
-def _extremes(extremes: results.Extremes) -> JsonObject:
+def _columns(answer: results.TopicRange) -> JsonObject:
+    """Returns a range with a row for each sample: its time, and a cell for each field.
+
+    A field that holds an object becomes a column for each of its parts; a cell is null where a
+    sample has no such part.
+    """
+    cells = [
+        dict(_cells("", sample.value) if isinstance(sample.value, dict) else ())
+        for sample in answer.samples
+    ]
+    columns = [*dict.fromkeys(name for each in cells for name in each)]
+    reply: JsonObject = {
+        "topic": answer.topic,
+        "type": answer.type,
+        "total": answer.total,
+        "fields": ["timestamp", *columns],
+        "rows": [
+            [unix_rounded_up(sample.time), *(each.get(name) for name in columns)]
+            for sample, each in zip(answer.samples, cells, strict=True)
+        ],
+    }
+    if answer.extremes:
+        local = LocalTimes(answer.samples[0].time, answer.samples[-1].time)
+        reply["extremes"] = {each.field: _extremes(each, local) for each in answer.extremes}
+    return with_notes(reply, answer.notes)
+
+
+def _cells(path: str, value: JsonValue) -> Iterator[tuple[str, JsonValue]]:
+    """Yields the parts of a value that are no objects with parts, by their dot-paths."""
+    if not isinstance(value, dict) or not value:
+        yield path, value
+        return
+    for name, part in value.items():
+        yield from _cells(f"{path}.{name}" if path else name, part)
+
+
+def _extremes(extremes: results.Extremes, local: LocalTimes) -> JsonObject:
+    at_least, at_most = local.of(extremes.least_at), local.of(extremes.most_at)
     return {
         "min": rounded(extremes.least, 6),
         "min_at": unix_rounded_up(extremes.least_at),
         "max": rounded(extremes.most, 6),
         "max_at": unix_rounded_up(extremes.most_at),
+        **{f"min_{key}": text for key, text in at_least.items()},
+        **{f"max_{key}": text for key, text in at_most.items()},
     }
 
 
@@ -134,6 +177,7 @@ def _match(answer: results.Match) -> JsonObject | None:
     found = answer.found
     reply: JsonObject = {
         "timestamp": unix_rounded_up(found.sample.time),
+        **LocalTimes(found.sample.time, found.sample.time + (found.age or 0)).of(found.sample.time),
         "value": found.sample.value,
         "topic": found.topic,
         "type": found.type,
@@ -171,21 +215,25 @@ def _distinct(*notes: Sequence[str]) -> tuple[str, ...]:
 
 @render.register(results.Sightings)
 def _sightings(answer: results.Sightings) -> JsonObject:
+    oldest = min((each.first for each in answer.sightings), default=answer.start)
+    local = LocalTimes(oldest, answer.now)
     reply: JsonObject = {
-        "sightings": [_sighting(each, answer.now) for each in answer.sightings],
+        "sightings": [_sighting(each, answer.now, local) for each in answer.sightings],
         "total": answer.total,
         "searched_from": moment(answer.start),
         "searched_to": moment(answer.end),
+        **local.of(answer.start, answer.end),
     }
     return with_notes(reply, answer.notes, more=answer.more)
 
 
-def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
+def _sighting(sighting: results.Sighting, now: Ns, local: LocalTimes) -> JsonObject:
     robot = sighting.robot
     reply: JsonObject = {
         "topic": sighting.topic,
         "first_seen": unix_rounded_up(sighting.first),
         "last_seen": unix_rounded_up(sighting.last),
+        **local.of(sighting.first, sighting.last),
         "duration_s": seconds(sighting.last - sighting.first),
         "ago_s": seconds(now - sighting.last),
         "count": sighting.messages,
@@ -193,6 +241,14 @@ def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
         if robot is None
         else {**planar_pose(robot), "frame_id": robot.frame_id or None},
     }
+    if sighting.matched:
+        reply["matched"] = [
+            shortened(each, LONGEST_MATCHED) for each in sighting.matched[:MOST_MATCHED]
+        ]
+        if len(sighting.matched) > MOST_MATCHED:
+            reply["matched_count"] = len(sighting.matched)
+    if sighting.value is not None:
+        reply["value"] = sighting.value
     if sighting.thing is not None:
         spot = sighting.thing
         reply["place"] = {**metres(spot.position), "frame_id": spot.frame_id or None}
@@ -201,16 +257,18 @@ def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
 
 @render.register(results.Recap)
 def _recap(answer: results.Recap) -> JsonObject:
+    local = LocalTimes(answer.start, answer.end)
     reply: JsonObject = {
         "start": moment(answer.start),
         "end": moment(answer.end),
+        **LocalTimes(answer.start, answer.now).of(answer.start, answer.end),
         "duration_s": seconds(answer.end - answer.start),
         "distance_m": None if answer.distance_m is None else rounded(answer.distance_m, 3),
         "max_speed": None if answer.max_speed is None else rounded(answer.max_speed, 3),
         "stood_s": None if answer.stood is None else seconds(answer.stood),
         "shortest_stop_s": seconds(answer.shortest_stop),
         "frame_id": answer.frame_id or None,
-        "events": [_event(each, answer.now) for each in answer.events],
+        "events": [_event(each, answer.now, local) for each in answer.events],
     }
     if answer.throughout:
         reply["seen_throughout"] = [*answer.throughout]
@@ -222,9 +280,10 @@ def _recap(answer: results.Recap) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
-def _event(event: results.Event, now: Ns) -> JsonObject:
+def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
     reply: JsonObject = {
         "timestamp": moment(event.start),
+        **local.of(event.start, event.end),
         "ago_s": round(seconds(now - event.start), 1),
         "text": event.text,
     }

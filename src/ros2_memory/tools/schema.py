@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
+from ros2_memory.tools.arguments import TIME_KINDS
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
@@ -30,14 +31,26 @@ _KINDS: Final = {
     "array": "a list of texts",
     "object": "an object",
 }
+_TIME: Final = "Unix seconds or ISO 8601 text"
 
 
 class Signature:
-    """The arguments of a model, with a `TimeArgument` in the place of their moment or span."""
+    """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
 
-    def __init__(self, arguments: type[Arguments], when: type[TimeArgument] | None = None) -> None:
+    `plain_times`: the schema shows times as numbers alone, since some clients refuse an argument of
+    two types. Texts are read all the same.
+    """
+
+    def __init__(
+        self,
+        arguments: type[Arguments],
+        when: type[TimeArgument] | None = None,
+        *,
+        plain_times: bool = False,
+    ) -> None:
         self._arguments = arguments
         self._when = when
+        self._plain_times = plain_times
 
     @cached_property
     def _properties(self) -> dict[str, JsonObject]:
@@ -55,19 +68,26 @@ class Signature:
         return [name for name, schema in self._properties.items() if "default" not in schema]
 
     @property
+    def _either(self) -> tuple[str, ...]:
+        """Returns the arguments of which exactly one must be given."""
+        return () if self._when is None else self._when.either
+
+    @property
     def example(self) -> JsonObject:
         """Returns a call with the required arguments alone."""
-        return {name: _example(self._properties[name]) for name in self._required}
+        needed = {*self._required, *self._either[:1]}
+        return {name: _example(each) for name, each in self._properties.items() if name in needed}
 
     def json_schema(self) -> JsonObject:
         """Returns the schema that `tools/list` shows: flat, closed, without empty defaults."""
         properties: JsonObject = {}
         for name, schema in self._properties.items():
-            properties[name] = {
+            shown: JsonObject = {
                 key: item
                 for key, item in schema.items()
                 if key != "examples" and not (key == "default" and item in (None, []))
             }
+            properties[name] = _with_plain_times(shown) if self._plain_times else shown
         closed: JsonObject = {"additionalProperties": False}
         if self._required:
             closed["required"] = [*self._required]
@@ -85,7 +105,7 @@ class Signature:
             for name, value in given.items()
             if value is not None or name in self._required
         }
-        problems = [*self._unknown(given), *self._missing(present)]
+        problems = [*self._unknown(given), *self._missing(present), *self._unclear(present)]
         values = dict(present)
         if self._when is not None:
             try:
@@ -117,6 +137,15 @@ class Signature:
             if name not in present:
                 yield f"{name} is missing: {_expected(self._properties[name])}"
 
+    def _unclear(self, present: Mapping[str, object]) -> Iterator[str]:
+        either = self._either
+        named = [name for name in either if present.get(name) not in (None, [])]
+        if len(named) > 1:
+            yield f"{' and '.join(named)} were both given: one of them is needed"
+        elif either and not named:
+            others = " or ".join(either[1:])
+            yield f"{either[0]} is missing: {_expected(self._properties[either[0]])}; or {others}"
+
     def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
         reported: set[str] = set()
         for fault in error.errors(include_url=False, include_context=False, include_input=False):
@@ -146,6 +175,16 @@ def _flat(schema: JsonObject) -> JsonObject:
     return kept
 
 
+def _with_plain_times(schema: JsonObject) -> JsonObject:
+    plain = dict(schema)
+    if plain.get("type") == [*TIME_KINDS]:
+        plain["type"] = TIME_KINDS[0]
+    items = plain.get("items")
+    if isinstance(items, dict):
+        plain["items"] = _with_plain_times(items)
+    return plain
+
+
 def _expected(schema: JsonObject) -> str:
     """Describes the allowed values of an argument."""
     what = _kind(schema)
@@ -170,6 +209,11 @@ def _kind(schema: JsonObject) -> str:
         return f"one of {', '.join(to_json_text(item) for item in allowed)}"
     if isinstance(several, list):
         return " or ".join(_kind(kind) for kind in several if isinstance(kind, dict))
+    if schema.get("type") == [*TIME_KINDS]:
+        return _TIME
+    items = schema.get("items")
+    if isinstance(items, dict) and items.get("type") == [*TIME_KINDS]:
+        return f"a list of {_TIME}"
     return _KINDS[str(schema.get("type"))]
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
+from ros2_memory.insights.at_each import at_each
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
@@ -58,7 +59,7 @@ def build_tools(
         tool
         for declaration in declarations
         if writing or not declaration.writes
-        for tool in declaration.tools(defaults)
+        for tool in declaration.tools(defaults, plain_times=not additions)
     )
 
 
@@ -115,7 +116,7 @@ _DECLARATIONS = (
         "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
-        queries.topic_value,
+        at_each(queries.topic_value),
     ),
     ToolDeclaration(
         (
@@ -124,8 +125,8 @@ _DECLARATIONS = (
         ),
         "What a topic said {when}: up to max_samples messages, evenly spaced over the window, "
         "first and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; "
-        "with fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all "
-        "messages.",
+        "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
+        "max, max_at}}}} of all messages}}.",
         TopicRangeArguments,
         queries.topic_range,
     ),
@@ -135,7 +136,7 @@ _DECLARATIONS = (
         "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, "
         "longitude and altitude instead of x, y, z, which are null.",
         MotionArguments,
-        queries.position,
+        at_each(queries.position),
     ),
     ToolDeclaration(
         _at_and_ago("velocity", "Robot velocity"),
@@ -143,7 +144,7 @@ _DECLARATIONS = (
         "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
         "x is ahead and angular z turns left.",
         MotionArguments,
-        queries.velocity,
+        at_each(queries.velocity),
     ),
     ToolDeclaration(
         _at_and_ago("transform", "Transform"),
@@ -151,7 +152,7 @@ _DECLARATIONS = (
         "interpolated. Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, "
         "parent, child, clock}}.",
         TransformArguments,
-        queries.transform,
+        at_each(queries.transform),
     ),
     ToolDeclaration(
         (ToolName("list_frames", "Frames"),),

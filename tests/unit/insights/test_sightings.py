@@ -31,7 +31,7 @@ from ros2_memory.tools.replies import Replies
 from tests.support.bags import boolean, detections, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import asked, memory_of, recalling
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -166,6 +166,56 @@ def test_a_number_beyond_a_limit_is_a_sighting_too(tmp_path: Path) -> None:
         memory_of(tmp_path), Call(), "/odom", "above", 0.45, field="linear_velocity.x"
     ).sightings
     assert ((fast.first - BEGIN) // S, (fast.last - BEGIN) // S) == (5, 9)
+
+
+def test_a_sighting_has_the_texts_of_its_last_message_that_matched(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    memory = spoken(tmp_path, (1, "phone"), (2, "Headphones cup phone Headphones"), (3, "cup"))
+    [both] = find_matches(memory, Call(), topic, "contains", "phone").sightings
+    assert both.matched == ("Headphones", "phone")
+    [one] = find_matches(memory, Call(), topic, "equals", "phone").sightings
+    assert one.matched == ("phone",)
+    [named] = find_matches(
+        memory, Call(), topic, "contains", "phone", field="detections.label"
+    ).sightings
+    assert named.matched == ("Headphones", "phone")
+    reply = asked(memory, tmp_path, "find_matches", topic=topic, condition_type="contains",
+                  value="phone")  # fmt: skip
+    assert reply["sightings"][0]["matched"] == ["Headphones", "phone"]
+
+
+def test_only_a_few_texts_are_shown_and_not_whole(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    memory = spoken(tmp_path, (1, " ".join(f"cup{n}" + "x" * 300 for n in range(8))))
+    reply = asked(memory, tmp_path, "find_matches", topic=topic, condition_type="contains",
+                  value="cup")  # fmt: skip
+    [seen] = reply["sightings"]
+    assert [len(each) for each in seen["matched"]] == [200] * 5
+    assert seen["matched_count"] == 8
+
+
+def test_what_is_no_text_has_no_matched_texts(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [boolean(BEGIN, True)])
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "find_matches", topic="/bumper", condition_type="equals",
+                  value=True)  # fmt: skip
+    assert not {"matched", "value"} & reply["sightings"][0].keys()
+
+
+def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
+    driven = [odom(BEGIN + t * S, float(t), 0.0, 0.0, vx=0.1 * t) for t in range(10)]
+    write_mcap(tmp_path / "bag.mcap", [*driven, boolean(BEGIN + 9 * S, True)])
+    memory = memory_of(tmp_path)
+    fast = {"condition_type": "above", "value": 0.45, "field": "linear_velocity.x"}
+    reply = asked(memory, tmp_path, "find_matches", topic="/odom", fields=["position.x"], **fast)
+    assert reply["sightings"][0]["value"] == {"position.x": 9.0}
+    bumped = {"condition_type": "equals", "value": True}
+    given = {"topic": "/*", "fields": "data", **bumped}
+    assert asked(memory, tmp_path, "find_matches", **given)["sightings"][0]["value"] == {
+        "data": True
+    }
+    refused = asked(memory, tmp_path, "find_matches", topic="/odom", fields=["nope"], **fast)
+    assert (refused["error"], "nope" in refused["detail"]) == ("invalid_arguments", True)
 
 
 def test_a_thing_is_reported_in_the_map_where_transforms_lead_there(tmp_path: Path) -> None:

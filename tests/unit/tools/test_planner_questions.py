@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 BY_WORDS = {question.words: question for question in QUESTIONS}
 MOST_CALLS_FOR_FORTY = 45
 MOST_CHARS_FOR_FORTY = 40_000
-MOST_CHARS_OF_TOOLS = 16_000
+MOST_CHARS_OF_TOOLS = 18_000
 OFF_BY = 4
 OF_NOTHING = {
     "Which moments were you told to keep?",

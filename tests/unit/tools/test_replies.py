@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
@@ -29,7 +30,10 @@ from ros2_memory.core.model import Pose, Sample, SetAside, Transform, Twist
 from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
 from ros2_memory.results import Answer
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_json import LocalTimes, render
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 BAGS = Path("bags")
 T0 = 1_784_023_200 * NS_PER_S
@@ -245,6 +249,119 @@ def test_a_hundred_positions_stay_below_8_000_characters() -> None:
     reply = REPLIES.answer(of_samples(narrow))
     assert len(reply.text) < 8_000
     assert len(json.loads(reply.text)["samples"]) == 100
+
+
+def of_fields(values: list[Any], fields: tuple[str, ...]) -> results.TopicRange:
+    return replace(of_samples(values), fields=fields)
+
+
+def test_a_range_with_fields_is_a_table() -> None:
+    whole = odom(1.0, 2.0)
+    values = [{"position": whole["position"], "yaw": 1.25}, {"position": None, "yaw": 0.5}]
+    shown = said(of_fields(values, ("position", "yaw")))
+    assert shown["fields"] == [
+        "timestamp", "position.x", "position.y", "position.z", "yaw", "position",
+    ]  # fmt: skip
+    assert shown["rows"] == [
+        [1784023200.0, 1.0, 2.0, 0.0, 1.25, None],
+        [1784023200.123457, None, None, None, 0.5, None],
+    ]
+    assert "samples" not in shown
+
+
+def test_lists_and_empty_objects_are_cells() -> None:
+    shown = said(of_fields([{"ranges": [1.0, 2.0], "more": {}}], ("ranges", "more")))
+    assert shown["fields"] == ["timestamp", "ranges", "more"]
+    assert shown["rows"] == [[1784023200.0, [1.0, 2.0], {}]]
+
+
+def test_a_hundred_poses_stay_below_6_000_characters() -> None:
+    poses = [
+        {
+            "position.x": round(-1.2345 - n / 90, 4),
+            "position.y": 2.3456,
+            "orientation.yaw_deg": round(-123.45 + n / 3, 2),
+        }
+        for n in range(100)
+    ]
+    reply = REPLIES.answer(of_fields(poses, tuple(poses[0])))
+    assert len(json.loads(reply.text)["rows"]) == 100
+    assert len(reply.text) < 6_000
+
+
+def sighted(first: int, last: int, now: int) -> results.Sightings:
+    seen = results.Sighting("/a", first, last, 3, True, None, None)
+    return results.Sightings((seen,), more=False, total=1, start=first, end=now, now=now)
+
+
+HOUR = 3600 * NS_PER_S
+
+
+@pytest.fixture
+def utc() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", "UTC")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@pytest.mark.usefixtures("utc")
+def test_what_spans_more_than_half_a_day_has_local_times() -> None:
+    near = said(sighted(T0, T0 + NS_PER_S, T0 + 12 * HOUR))
+    assert "local" not in near
+    assert "local" not in near["sightings"][0]
+    far = said(sighted(T0, T0 + NS_PER_S, T0 + 13 * HOUR))
+    assert far["sightings"][0]["local"] == "Tue 2026-07-14 10:00:00 - 10:00:01"
+    assert far["local"] == "Tue 2026-07-14 10:00:00 - 23:00:00"
+    assert far["sightings"][0]["first_seen"] == near["sightings"][0]["first_seen"]
+
+
+@pytest.mark.usefixtures("utc")
+def test_a_local_time_names_the_day_where_it_is_another() -> None:
+    local = LocalTimes(T0, T0 + 24 * HOUR)
+    assert local.of(T0) == {"local": "Tue 2026-07-14 10:00:00"}
+    assert local.of(T0, T0) == local.of(T0, T0 + 1) == local.of(T0)
+    over_night = {"local": "Tue 2026-07-14 10:00:00 - Wed 2026-07-15 01:00:00"}
+    assert local.of(T0, T0 + 15 * HOUR) == over_night
+    assert local.of(None, T0) == {"local": "- Tue 2026-07-14 10:00:00"}
+    assert local.of(None) == LocalTimes(None, T0).of(T0) == LocalTimes(T0, None).of(T0) == {}
+
+
+@pytest.mark.usefixtures("utc")
+def test_a_recap_of_days_has_local_times_at_its_events_and_one_of_an_hour_has_its_own() -> None:
+    stop = results.Event("stop", T0, T0 + HOUR, "stood")
+    day = results.Recap(T0, T0 + 13 * HOUR, T0 + 14 * HOUR, 1.0, 1.0, 0, 0, None, (stop,), ())
+    shown = said(day)
+    assert shown["events"][0]["local"] == "Tue 2026-07-14 10:00:00 - 11:00:00"
+    assert shown["local"] == "Tue 2026-07-14 10:00:00 - 23:00:00"
+    hour = said(replace(day, end=T0 + HOUR))
+    assert hour["local"] == "Tue 2026-07-14 10:00:00 - 11:00:00"
+    assert "local" not in hour["events"][0]
+    assert "local" not in said(replace(day, end=T0 + HOUR, now=T0 + HOUR))
+
+
+@pytest.mark.usefixtures("utc")
+def test_visits_gaps_and_extremes_of_days_have_local_times() -> None:
+    visit = results.Visit(None, T0 + HOUR, HOUR, 0.1, T0, 0)
+    there = results.Visits("map", 0.0, 0.0, 1.0, (visit,), False, 1, T0 + 20 * HOUR)
+    assert said(there)["visits"][0]["local"] == "- Tue 2026-07-14 11:00:00"
+    hole = results.Gap(T0 + HOUR, T0 + 2 * HOUR)
+    covered = results.DataTimeRange(
+        T0, T0 + 20 * HOUR, T0 + 20 * HOUR, 1, (hole,), (), (), (), (), 0
+    )
+    assert said(covered)["gaps"][0]["local"] == "Tue 2026-07-14 11:00:00 - 12:00:00"
+    samples = (Sample(T0, {"level": 0.5}), Sample(T0 + 20 * HOUR, {"level": 0.25}))
+    extremes = (results.Extremes("level", 0.25, T0 + 20 * HOUR, 0.5, T0),)
+    shown = said(results.TopicRange("/a", "t", 2, samples, extremes, ("level",)))
+    assert shown["extremes"]["level"]["min_local"] == "Wed 2026-07-15 06:00:00"
+    assert shown["extremes"]["level"]["max_local"] == "Tue 2026-07-14 10:00:00"
+
+
+@pytest.mark.usefixtures("utc")
+def test_a_match_of_long_ago_has_its_local_time() -> None:
+    assert "local" not in said(results.Match(value(age=12 * HOUR)))
+    assert said(results.Match(value(age=13 * HOUR)))["local"] == "Tue 2026-07-14 10:00:00"
 
 
 def test_a_short_range_keeps_its_zeros() -> None:

@@ -64,20 +64,21 @@ BLOCKING = {
 OPTIONAL = {
     "remember_moment": {"seconds_before", "seconds_after"},
     "visits": {"frame_id", "radius_m", "limit"},
-    "find_matches": {"field", "seconds", "start", "end", "oldest_first", "limit"},
+    "find_matches": {"field", "fields", "seconds", "start", "end", "oldest_first", "limit"},
     "list_recorded_topics": {"pattern"},
-    "get_topic_at_time": {"tolerance_s", "fields"},
+    "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
     "get_topic_in_range": {"max_samples", "fields"},
     "get_topic_in_last": {"max_samples", "fields"},
-    "get_position_at": {"topic", "tolerance_s"},
+    "get_position_at": {"timestamps", "topic", "tolerance_s"},
     "get_position_seconds_ago": {"topic", "tolerance_s"},
-    "get_velocity_at": {"topic", "tolerance_s"},
+    "get_velocity_at": {"timestamps", "topic", "tolerance_s"},
+    "get_transform_at": {"timestamps"},
     "get_velocity_seconds_ago": {"topic", "tolerance_s"},
     "find_last_match": {"field", "fields", "before"},
     "get_value_when": {"field", "fields", "before"},
-    "trajectory_summary": {"topic"},
-    "recent_trajectory_summary": {"topic"},
+    "trajectory_summary": {"topic", "max_waypoints"},
+    "recent_trajectory_summary": {"topic", "max_waypoints"},
 }
 PAIRS = [
     ("get_topic_at_time", "get_topic_seconds_ago"),
@@ -88,7 +89,7 @@ PAIRS = [
     ("trajectory_summary", "recent_trajectory_summary"),
     ("recap", "recap_last"),
 ]
-UNFOLDED = {"timestamp", "seconds_ago", "start", "end", "seconds"}
+UNFOLDED = {"timestamp", "timestamps", "seconds_ago", "start", "end", "seconds"}
 
 
 def seen(tool: Tool) -> dict[str, Any]:
@@ -149,14 +150,15 @@ def test_there_is_a_snapshot_for_each_tool_and_no_other() -> None:
     assert {path.stem for path in SNAPSHOTS.glob("*.json")} == set(NAMES)
 
 
-def test_everything_the_planner_reads_fits_into_16_000_characters() -> None:
+def test_everything_the_planner_reads_fits_into_18_000_characters() -> None:
     text = json.dumps([seen(tool) for tool in TOOLS.values()], separators=(",", ":"))
-    assert len(text) < 16_000
+    assert len(text) < 18_000
 
 
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_every_tool_shows_an_example_that_it_accepts(tool: Tool) -> None:
-    assert set(example(tool)) == set(tool.schema.get("required") or [])  # type: ignore[arg-type]
+    needed: set[str] = set(tool.schema.get("required") or [])  # type: ignore[arg-type]
+    assert set(example(tool)) == needed | {"timestamp"} & set(tool.schema["properties"])  # type: ignore[arg-type]
     assert callable(tool.question(example(tool)))
 
 
@@ -240,6 +242,72 @@ def test_seconds_must_be_a_finite_number_of_at_least_zero(value: Any, reply: str
 def test_milliseconds_and_nanoseconds_are_recognised(value: int) -> None:
     reply = refusal("get_position_at", timestamp=value)
     assert "too large for Unix seconds; is it in milliseconds or nanoseconds?" in reply
+
+
+TIMES = {"timestamp", "start", "end", "before"}
+TWO_KINDS = {"type": ["number", "string"]}
+
+
+def test_every_time_is_a_number_or_a_text_and_for_the_specification_alone_a_number() -> None:
+    plain = {tool.name: tool for tool in build_tools(QuerySettings(), 25.0, additions=False)}
+    for name, tool in TOOLS.items():
+        properties: Any = tool.schema["properties"]
+        for each in TIMES & set(properties):
+            assert properties[each]["type"] == TWO_KINDS["type"]
+            if name in plain:
+                numbers: Any = plain[name].schema["properties"]
+                assert numbers[each]["type"] == "number"
+        if "timestamps" in properties:
+            assert properties["timestamps"]["items"] == TWO_KINDS
+            single: Any = plain[name].schema["properties"]
+            assert single["timestamps"]["items"] == {"type": "number"}
+
+
+def moment_of(**given: Any) -> object:
+    return dict(Signature(MotionArguments, At).parse(given))["moment"]
+
+
+def test_a_time_may_be_a_text_wherever_the_schema_shows_numbers() -> None:
+    read = moment_of(timestamp="2026-11-20T08:00:00Z")
+    assert read == moment_of(timestamp=1_795_161_600) == AtTime(1_795_161_600.0)
+    plain = Signature(MotionArguments, At, plain_times=True)
+    assert dict(plain.parse({"timestamp": "2026-11-20T08:00:00Z"}))["moment"] == read
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [1_795_161_600, "2026-11-20T09:00:00+01:00"],
+        '[1795161600, "2026-11-20T08:00:00Z"]',
+        ("2026-11-20T08:00:00Z", "1795161600"),
+    ],
+)
+def test_several_moments_may_be_a_list_or_its_json_text(times: Any) -> None:
+    assert moment_of(timestamps=times) == AtTime(each_s=(1_795_161_600.0, 1_795_161_600.0))
+    assert moment_of(timestamps=5) == AtTime(each_s=(5.0,))
+    assert moment_of(timestamp=5, timestamps=[]) == AtTime(at_s=5.0)
+
+
+def test_one_moment_or_several_are_given() -> None:
+    expected = "timestamp is missing: Unix seconds or ISO 8601 text, e.g. 1784023200.5"
+    assert refusal("get_position_at") == f"{expected}; or timestamps"
+    assert refusal("get_position_at", timestamp=None) == f"{expected}; or timestamps"
+    assert refusal("get_position_at", timestamps=[]) == f"{expected}; or timestamps"
+    both = refusal("get_position_at", timestamp=5, timestamps=[6])
+    assert both == "timestamp and timestamps were both given: one of them is needed"
+
+
+def test_what_is_no_time_is_told() -> None:
+    told = refusal("get_position_at", timestamp="yesterday")
+    assert told == (
+        'timestamp was "yesterday", which is no time in ISO 8601, or none that exists; '
+        "expected Unix seconds or ISO 8601 text, e.g. 1784023200.5"
+    )
+    assert "is a Fri, not a Wed" in refusal("recap", start="Wed 2026-11-20", end=2e9)
+    assert "is after the year 2262" in refusal("recap", start=0, end="2300-01-01")
+    assert "has 21 times, more than 20" in refusal("get_position_at", timestamps=[1] * 21)
+    assert "timestamps was [1, true]" in refusal("get_position_at", timestamps=[1, True])
+    assert "expected a list of Unix seconds" in refusal("get_position_at", timestamps={"a": 1})
 
 
 @pytest.mark.parametrize("topic", ["", "   "])

@@ -1,0 +1,152 @@
+"""Several moments in one question: each is answered as if it were asked alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import NoDataReason
+from ros2_memory.tools.arguments import MOST_TIMES
+from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.random_histories import write_history
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+    from ros2_memory.index.snapshot import Snapshot
+
+S = 10**9
+T0 = 1_700_000_000
+SHARED = ("topic", "type", "frame_id", "parent", "child", "clock")
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Memory:
+    """Odometry along x at 1 m/s in two bags, with a hole of 10 s between them."""
+    for number, begin in enumerate((0, 20)):
+        messages = [
+            each
+            for at in range(begin, begin + 10)
+            for each in (
+                odom((T0 + at) * S, float(at), 0.0),
+                tf((T0 + at) * S, transform((T0 + at) * S, "odom", "base_link", (at, 0.0, 0.0))),
+                detections((T0 + at) * S, ["cup"]),
+            )
+        ]
+        write_mcap(tmp_path / "a" / f"a_{number}.mcap", messages)
+    return memory_of(tmp_path)
+
+
+def test_results_are_in_the_order_of_the_question(memory: Memory, tmp_path: Path) -> None:
+    times = [T0 + 25, T0 + 3, T0 + 3, T0 + 9]
+    told = asked(memory, tmp_path, "get_position_at", timestamps=times)
+    assert list(told) == ["topic", "frame_id", "results"]
+    assert [each["x"] for each in told["results"]] == [25.0, 3.0, 3.0, 9.0]
+    assert [each["timestamp"] for each in told["results"]] == times
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("get_position_at", {}),
+        ("get_velocity_at", {"tolerance_s": 5.0}),
+        ("get_transform_at", {"parent": "odom", "child": "base_link"}),
+        ("get_topic_at_time", {"topic": "/odom", "fields": ["position.x"]}),
+    ],
+)
+def test_each_is_answered_as_alone(
+    memory: Memory, tmp_path: Path, tool: str, given: dict[str, Any]
+) -> None:
+    times = [T0 + 1, T0 + 5, T0 + 22]
+    told = asked(memory, tmp_path, tool, timestamps=times, **given)
+    for time, row in zip(times, told["results"], strict=True):
+        alone = asked(memory, tmp_path, tool, timestamp=time, **given)
+        assert {**{key: told[key] for key in SHARED if key in told}, **row} == alone
+
+
+def test_an_error_takes_the_place_of_what_is_not_there(memory: Memory, tmp_path: Path) -> None:
+    times = [T0 + 5, T0 + 14.5, T0 + 15.5, T0 + 25, T0 + 5000]
+    told = asked(memory, tmp_path, "get_position_at", timestamps=times)
+    first, hole, again, last, beyond = told["results"]
+    assert (first["x"], last["x"]) == (5.0, 25.0)
+    assert (hole["at"], hole["error"], hole["reason"]) == (T0 + 14.5, "no_data", NoDataReason.GAP)
+    assert "tolerance_s" in hole["detail"]
+    # What one reason means is told once.
+    assert again == {"at": T0 + 15.5, "error": "no_data", "reason": "gap"}
+    assert (beyond["at"], beyond["reason"]) == (T0 + 5000, "outside_range")
+    assert "detail" in beyond
+
+
+def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory, tmp_path: Path) -> None:
+    for timestamps in ({"timestamps": [T0, T0 + 1]}, {"timestamp": T0}):
+        told = asked(memory, tmp_path, "get_topic_at_time", topic="/nope", **timestamps)
+        assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")
+    refused = replied(
+        memory, tmp_path, "get_position_at", {"timestamps": [T0], "topic": "/vision/*"}
+    )
+    assert json.loads(refused.text)["error"]
+
+
+def test_twenty_positions_are_a_small_reply(memory: Memory, tmp_path: Path) -> None:
+    times = [T0 + at for at in range(10)] + [T0 + 20 + at for at in range(10)]
+    assert len(times) == MOST_TIMES
+    reply = replied(memory, tmp_path, "get_position_at", {"timestamps": times})
+    assert len(json.loads(reply.text)["results"]) == MOST_TIMES
+    assert len(reply.text) < 1_800
+
+
+def test_all_of_them_are_of_one_snapshot(memory: Memory, tmp_path: Path) -> None:
+    asked_for: list[int | None] = []
+    source = memory.index.snapshot
+
+    def counted(reach: int | None = None) -> Snapshot:
+        asked_for.append(reach)
+        return source(reach)
+
+    memory.index.snapshot = counted  # type: ignore[method-assign]
+    asked(memory, tmp_path, "get_position_at", timestamps=[T0 + 3, T0 + 25, T0 + 9])
+    assert asked_for == [(T0 + 25) * S]
+
+
+def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
+    messages = [odom((T0 + at) * S, float("nan"), 0.0) for at in range(3)]
+    messages.append(odom((T0 + 3) * S, 1.0, 0.0))
+    write_mcap(tmp_path / "a" / "a_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    told = asked(memory, tmp_path, "get_position_at", timestamps=[T0, T0 + 1, T0 + 3])
+    assert told["notes"] == ["the recorded position is not a number"]
+    assert all("notes" not in each for each in told["results"])
+    alone = asked(memory, tmp_path, "get_position_at", timestamps=[T0, T0 + 3])
+    assert [each.get("notes") for each in alone["results"]] == [told["notes"], None]
+    assert "notes" not in alone
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), data=st.data())
+def test_in_odd_histories_each_is_answered_as_alone_with_and_without_the_catalogue(
+    seed: int, data: st.DataObject
+) -> None:
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        written = write_history(bag_dir, Random(seed))
+        times = data.draw(
+            st.lists(st.sampled_from(sorted(written.moments)), min_size=1, max_size=5)
+        )
+        given = {"topic": "/odom", "tolerance_s": 1.0}
+        several = {"timestamps": [each / S for each in times], **given}
+        plain = memory_of(bag_dir)
+        told = asked(plain, bag_dir, "get_topic_at_time", **several)
+        assert told == asked(recalling(plain, bag_dir), bag_dir, "get_topic_at_time", **several)
+        rows = told.get("results", [told] * len(times))
+        for time, row in zip(times, rows, strict=True):
+            alone = asked(plain, bag_dir, "get_topic_at_time", timestamp=time / S, **given)
+            assert row.get("error") == alone.get("error")
+            assert row.get("value") == alone.get("value")
+            assert row.get("timestamp") == alone.get("timestamp")
