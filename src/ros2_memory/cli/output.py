@@ -54,7 +54,7 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
     lines = Table.grid(padding=(0, 2))
     lines.add_column(style="bold", no_wrap=True)
     lines.add_column(overflow="fold")
-    for key, each in _flattened(value).items():
+    for key, each in _flattened(_with_named_cells(value)).items():
         rows = [row for row in each if isinstance(row, dict)] if isinstance(each, list) else []
         if isinstance(each, list) and rows and len(rows) == len(each):
             lists[key] = rows
@@ -69,6 +69,17 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
     for key, rows in lists.items():
         console.print(Text(f"\n{escape(key)}", style="bold"))
         _print_rows(console, rows)
+
+
+def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
+    """Returns a reply with an object for each row of its table, if it has one."""
+    fields, rows = value.get("fields"), value.get("rows")
+    if not isinstance(fields, list) or not isinstance(rows, list):
+        return value
+    named: list[JsonValue] = [
+        dict(zip(map(str, fields), row, strict=False)) for row in rows if isinstance(row, list)
+    ]
+    return {key: each for key, each in value.items() if key != "fields"} | {"rows": named}
 
 
 def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:

@@ -67,6 +67,18 @@ def test_long_times_are_in_a_unit_that_suits_them() -> None:
     assert output[-3:] == ["days", "/b", "12.25"]
 
 
+def test_the_rows_of_a_table_have_the_names_of_its_columns() -> None:
+    reply: JsonValue = {
+        "total": 2,
+        "fields": ["timestamp", "percentage"],
+        "rows": [[T0, 80.5], [T0 + 1.0, None]],
+    }
+    lines = [line.split() for line in shown(reply).splitlines() if line]
+    assert lines[:3] == [["total", "2"], ["rows"], ["timestamp", "percentage"]]
+    assert [line[-1] for line in lines[-2:]] == ["80.5", "-"]
+    assert " ".join(lines[-1][:2]) == format_time(T0 + 1.0)
+
+
 def test_what_there_is_not_is_reported_in_words() -> None:
     assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
     assert shown([]) == "none"
