@@ -55,6 +55,7 @@ from ros2_memory.history.no_data import (
 )
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.robots import note_robots, note_robots_near
+from ros2_memory.history.silences import describe_silences, silences_of
 from ros2_memory.history.view import (
     AtTime,
     TimeRange,
@@ -244,9 +245,10 @@ def find_last_match(
     now = memory.clock.now()
     view = View(memory, call, now)
     until = _before(before_s)
-    found = ReverseSearch(view, topic, condition).newest(until)
+    search = ReverseSearch(view, topic, condition)
+    found = search.newest(until)
     if found is None:
-        return results.Match(None, notes=not_covered(view, TimeWindow(MIN_NS, until)))
+        return results.Match(None, notes=_never(view, search, until))
     note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
@@ -277,9 +279,10 @@ def value_when(
     now, until = memory.clock.now(), _before(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
-    found = ReverseSearch(view, condition_topic, condition).newest(until)
+    search = ReverseSearch(view, condition_topic, condition)
+    found = search.newest(until)
     if found is None:
-        return results.ValueWhen(None, notes=not_covered(view, TimeWindow(MIN_NS, until)))
+        return results.ValueWhen(None, notes=_never(view, search, until))
     note_unread(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)
     matched = _value(view, found, (), None)
@@ -358,6 +361,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         notes=view.notes.sentences(),
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
+        silences=tuple(silences_of(snapshot, memory.limits.latching)),
     )
 
 
@@ -425,6 +429,12 @@ def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindo
     """Returns what a search went through to reach its match, as far as there can be messages."""
     stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(found.time, max(stop, found.time + 1))
+
+
+def _never(view: View, search: ReverseSearch, until: Ns) -> tuple[str, ...]:
+    """Returns what a search that found nothing did not read, and when its topics were silent."""
+    window = TimeWindow(MIN_NS, until)
+    return (*not_covered(view, window), *describe_silences(view, search.topics, window))
 
 
 def _before(before_s: float | None) -> Ns:

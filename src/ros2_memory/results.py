@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
+    from ros2_memory.analysis.silences import Silence
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.analysis.transform_tree import FrameEdge
     from ros2_memory.bag_dir.moment_file import StoredMoment
@@ -84,6 +85,7 @@ class DataTimeRange(AnswerWithNotes):
     silent_topics: int
     undecodable: tuple[Undecodable, ...] = ()
     clock_faults: tuple[SetAside, ...] = ()
+    silences: tuple[Silence, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,6 +364,7 @@ class Status(AnswerWithNotes):
         missing: topics that it is to record by name, and that no publisher has offered to it.
         never_heard: topics it subscribed to that brought no message.
         fell_silent: topics that brought some, and none lately.
+        silences: when topics with a usual rate were silent although the robot was on.
         damaged: files that cannot be read.
         incomplete: bags that a crash left open.
         unread: files of a kind that is not read here.
@@ -383,6 +386,7 @@ class Status(AnswerWithNotes):
     unread: int
     budget: Budget
     problems: tuple[str, ...]
+    silences: tuple[Silence, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ import numpy as np
 from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.index.split_order import Series, SplitRange
@@ -264,6 +266,16 @@ class Segment:
             return self.bags[0].start, self.latest
         own = [bag for bag in self.bags if bag.recording == recording]
         return own[0].start, max(bag.end for bag in own)
+
+    @cached_property
+    def presences(self) -> dict[str, Presence]:
+        """By topic, when the bags hold it and how often."""
+        return presences_of(self.bags)
+
+    @cached_property
+    def together(self) -> frozenset[frozenset[str]]:
+        """Which topics the bags hold together, each combination once."""
+        return frozenset(frozenset(schema.positions) for schema in self._schemas)
 
     @cached_property
     def silent(self) -> frozenset[str]:

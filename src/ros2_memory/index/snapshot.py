@@ -7,9 +7,11 @@ from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.silences import joined, silences
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
+from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
     StepBack,
@@ -24,6 +26,7 @@ from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from ros2_memory.analysis.silences import Presence, Silence
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
@@ -94,6 +97,31 @@ class Snapshot:
         steps = [StepBack(bag, bag, bag.summary.schema.set_back) for bag in within]
         between = steps_of(self.timeline.segments)
         return check_dates(self.timeline, [*between, *steps], self.scanned_at)
+
+    @cached_property
+    def silences(self) -> tuple[Silence, ...]:
+        """Where topics with a usual rate were silent, in order of time; see `analysis.silences`.
+
+        Logs have no usual rate. Bags that a wrong clock dated do not count.
+        """
+        parts = [*self.timeline.recorded_segments]
+        if misdated := self.dating.misdated:
+            dated = ([bag for bag in each.bags if bag.file not in misdated] for each in parts)
+            parts = [Segment(bags) for bags in dated if bags]
+        presences: dict[str, list[Presence]] = {}
+        for part in parts:
+            for topic, presence in part.presences.items():
+                presences.setdefault(topic, []).append(presence)
+        return tuple(
+            silences(
+                {
+                    topic: joined(each)
+                    for topic, each in presences.items()
+                    if not self.timeline.is_log(topic)
+                },
+                frozenset(chain.from_iterable(part.together for part in parts)),
+            )
+        )
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:

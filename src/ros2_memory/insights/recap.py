@@ -37,7 +37,7 @@ from ros2_memory.catalogue.codec import (
     encode_topic_events,
 )
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
-from ros2_memory.core.text import Reason, counted
+from ros2_memory.core.text import Reason, counted, listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     START_SLACK_NS,
@@ -50,6 +50,7 @@ from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
+from ros2_memory.history.silences import grouped, silences_in
 from ros2_memory.history.view import open_span
 from ros2_memory.results import Event, Recap
 
@@ -76,6 +77,7 @@ _STANDSTILLS_UNKNOWN: Final = (
 )
 _PLURALS: Final = {
     "gap": "gaps",
+    "silence": "silences",
     "error": "errors",
     "stop": "stops",
     "flip": "flips",
@@ -139,6 +141,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         Event("gap", begin, until, "nothing was recorded")
         for begin, until in recording_gaps(view, window)
     ]
+    events += _silences(view, window)
     note_unread(view, window)
     note_edges(view, window)
     counts = Counter(each.kind for each in events)
@@ -253,6 +256,17 @@ def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:
         end = until.get(toggle.path)
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
         until[toggle.path] = toggle.time
+
+
+def _silences(view: View, window: TimeWindow) -> Iterator[Event]:
+    """Yields when topics with a usual rate were silent; several at the same time are one event."""
+    for group in grouped(silences_in(view, window)):
+        topics = listed([each.topic for each in group])
+        were = "was" if len(group) == 1 else "were"
+        first = group[0]
+        yield Event(
+            "silence", first.start, first.end, f"{topics} {were} silent", goes_on=first.goes_on
+        )
 
 
 def _error(error: ReportedError) -> Event:

@@ -30,7 +30,9 @@ from ros2_memory.core.timebase import (
     Ns,
 )
 from ros2_memory.history.coverage import note_unread, unix_text
+from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.silences import describe_silences
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, last_window, ns_argument, open_view
 from ros2_memory.messages.detections import detections_of
@@ -113,6 +115,9 @@ def find_matches(
     if fields:
         found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)
+    if not found:
+        for sentence in describe_silences(view, matching_topics(view, topic), searched):
+            view.notes.add(sentence)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
     if end < start:  # all of it lies before or behind the memory

@@ -35,16 +35,17 @@ _RECAP = ToolDeclaration(
         ToolName("recap", "What happened", Between),
         ToolName("recap_last", "What happened lately", Last),
     ),
-    "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
-    "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], counts}}.",
+    "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps, silences. "
+    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], "
+    "counts}}.",
     WindowArguments,
     recap,
     blocking=True,
 )
 _STATUS = ToolDeclaration(
     (ToolName("memory_status", "How far to trust the memory"),),
-    "Whether the recorder is alive, how old the newest data is, which topics fell silent, what is "
-    "damaged, and for how long the disk lasts.",
+    "Whether the recorder is alive, how old the newest data is, which topics fell silent and when, "
+    "what is damaged, and for how long the disk lasts.",
     NoArguments,
     memory_status,
 )

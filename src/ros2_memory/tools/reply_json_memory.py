@@ -13,6 +13,7 @@ from ros2_memory.tools.reply_json import LocalTimes, moment, render, seconds, wi
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.silences import Silence
     from ros2_memory.bag_dir.moment_file import SaveRequest, StoredMoment
     from ros2_memory.core.model import JsonValue, SetAside
     from ros2_memory.tools.reply_size import JsonObject
@@ -37,6 +38,7 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
     ]
     lists: dict[str, list[JsonValue]] = {
         "gaps": gaps,
+        "silences": [_silence(each) for each in answer.silences],
         "active": _files(answer.active, bag_dir),
         "damaged": _files(answer.damaged, bag_dir),
         "incomplete": _files(answer.incomplete, bag_dir),
@@ -63,6 +65,16 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
             reply[f"{name}_count"] = len(rows)
     reply["silent_topics"] = answer.silent_topics
     return with_notes(reply, notes)
+
+
+def _silence(silence: Silence) -> JsonObject:
+    """Returns a silence; `silent_s` is how long the robot was on in it."""
+    return {
+        "topic": silence.topic,
+        "start": unix_rounded_up(silence.start),
+        "end": None if silence.goes_on else unix_rounded_up(silence.end),
+        "silent_s": seconds(silence.length),
+    }
 
 
 def _local(at: Ns | None) -> str | None:
@@ -93,6 +105,7 @@ def _status(answer: results.Status) -> JsonObject:
             }
             for each in answer.fell_silent
         ],
+        "silences": [_silence(each) for each in reversed(answer.silences)],
         "never_heard": [*answer.never_heard],
         "missing": [*answer.missing],
     }

@@ -1,0 +1,216 @@
+"""Silences: a topic with a usual rate has no message although the robot is on. Pure decisions.
+
+All is decided from when bags hold a topic, never from messages, so a silence is found where it
+reaches over a bag's end. What counts is one rule over the whole memory:
+
+- A topic has a usual rate if bags that hold it hold messages all along. Its period is the mean
+  period of the bags around the median. What is published when something happens has none.
+- It is silent where it has no message for `SHORTEST_NS` and `PERIODS` of its periods, between two
+  of its messages or after the last. Before the first it was not there yet.
+- The robot is on where a third of the topics are heard that have a usual rate and are recorded
+  together with it. Where it is not, nothing was recorded: that is a gap, and no part of a silence.
+- A topic that is silent more often than `SELDOM` times, and for longer than it is heard, has
+  silence as its habit: none of them is reported. Of one that is heard for less than `HABIT_NS`
+  between two, as one that starts late each time, only those count that last `UNUSUAL` times as long
+  as half of them do.
+
+Presences of parts of a memory add up exactly, in whichever parts it is cut.
+"""
+
+from __future__ import annotations
+
+from itertools import accumulate
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+from ros2_memory.core.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+SHORTEST_NS: Final[Ns] = 30 * NS_PER_S
+PERIODS: Final = 20
+SELDOM: Final = 2
+HABIT_NS: Final[Ns] = 3600 * NS_PER_S
+UNUSUAL: Final = 10
+_TOGETHER: Final = 3
+"""The robot is on where one in so many of the topics is heard."""
+
+Span: TypeAlias = "tuple[Ns, Ns]"
+"""Log times, both inclusive."""
+
+
+class Spacing(NamedTuple):
+    """What bags of about the same period add up to: their number, and their spans and intervals."""
+
+    bags: int = 0
+    span: Ns = 0
+    intervals: int = 0
+
+    def __add__(self, other: object) -> Spacing:
+        """Returns the spacing of both."""
+        if not isinstance(other, Spacing):
+            return NotImplemented
+        return Spacing(*(mine + its for mine, its in zip(self, other, strict=True)))
+
+
+class Presence(NamedTuple):
+    """When some bags hold a topic, and how often.
+
+    Attributes:
+        runs: from its first message to its last, in order, parted where bag after bag holds none
+            for more than `SHORTEST_NS`.
+        spacings: those of bags with enough messages, by the octave of the period or a part of it.
+        messages: in all bags.
+        length: of the bags that hold the topic, in all.
+    """
+
+    runs: tuple[Span, ...]
+    spacings: Mapping[int, Spacing]
+    messages: int
+    length: Ns
+
+
+class Silence(NamedTuple):
+    """A topic had no message although the robot was on.
+
+    `length` is how long the robot was on between `start` and `end`. With `goes_on` the topic was
+    not heard again.
+    """
+
+    topic: str
+    start: Ns
+    end: Ns
+    length: Ns
+    goes_on: bool = False
+
+    def within(self, start: Ns, end: Ns) -> Silence | None:
+        """Returns the part in a window with inclusive bounds; None where there is none.
+
+        How long the robot was on in a part is not known: the whole part counts, if that is less.
+        """
+        first, last = max(self.start, start), min(self.end, end)
+        if first >= last:
+            return None
+        goes_on = self.goes_on or last < self.end
+        return Silence(self.topic, first, last, min(self.length, last - first), goes_on)
+
+
+def joined(parts: Sequence[Presence]) -> Presence:
+    """Returns the presence in all of these parts together; at least one."""
+    spacings: dict[int, Spacing] = {}
+    for part in parts:
+        for octave, spacing in part.spacings.items():
+            spacings[octave] = spacings.get(octave, Spacing()) + spacing
+    runs = _merged(sorted(run for part in parts for run in part.runs), SHORTEST_NS)
+    return Presence(
+        tuple(runs),
+        spacings,
+        sum(part.messages for part in parts),
+        sum(part.length for part in parts),
+    )
+
+
+def usual_period(presence: Presence) -> Ns | None:
+    """Returns the usual time between two messages; None for a topic without a usual rate."""
+    octaves = sorted(presence.spacings)
+    bags = [*accumulate(presence.spacings[octave].bags for octave in octaves)]
+    if not bags:
+        return None
+    median = next(
+        octave for octave, upto in zip(octaves, bags, strict=True) if 2 * upto >= bags[-1]
+    )
+    spacing = presence.spacings[median]
+    period = spacing.span // spacing.intervals
+    return period if 2 * presence.messages * period >= presence.length else None
+
+
+def silences(presences: Mapping[str, Presence], together: Iterable[Iterable[str]]) -> list[Silence]:
+    """Returns the silences of all topics, in order of time.
+
+    Args:
+        presences: by topic, in the whole memory.
+        together: the topics of each bag; of bags with the same topics once is enough.
+    """
+    periods = {
+        topic: period
+        for topic, presence in presences.items()
+        if (period := usual_period(presence)) is not None
+    }
+    companions: dict[str, set[str]] = {}
+    for names in {frozenset(periods.keys() & each) for each in together}:
+        for topic in names:
+            companions.setdefault(topic, set()).update(names)
+    on: dict[frozenset[str], list[Span]] = {}
+    found: list[Silence] = []
+    for topic, period in periods.items():
+        others = frozenset(companions.get(topic, ()))
+        if others not in on:
+            on[others] = _heard([presences[each].runs for each in sorted(others)])
+        limit = max(SHORTEST_NS, PERIODS * period)
+        runs = _merged(presences[topic].runs, limit)
+        found += _reported([*_silences_of(topic, runs, on[others], limit)], runs)
+    return sorted(found, key=lambda each: (each.start, each.end, each.topic))
+
+
+def _merged(runs: Iterable[Span], apart: Ns) -> list[Span]:
+    """Returns sorted runs, joined where they are no farther apart."""
+    merged: list[Span] = []
+    for first, last in runs:
+        if merged and first - merged[-1][1] <= apart:
+            merged[-1] = merged[-1][0], max(merged[-1][1], last)
+        else:
+            merged.append((first, last))
+    return merged
+
+
+def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
+    """Returns when one in `_TOGETHER` of the topics is heard besides one that is silent."""
+    enough = max(1, -(-(len(topics) - 1) // _TOGETHER))
+    changes = sorted(
+        change for runs in topics for first, last in runs for change in ((first, -1), (last, 1))
+    )
+    spans: list[Span] = []
+    count, since = 0, 0
+    for at, change in changes:
+        before, count = count, count - change
+        if before < enough <= count:
+            since = at
+        elif count < enough <= before:
+            spans.append((since, at))
+    return _merged(spans, SHORTEST_NS)
+
+
+def _silences_of(
+    topic: str, runs: Sequence[Span], on: Sequence[Span], limit: Ns
+) -> Iterator[Silence]:
+    """Yields where a topic is absent for longer than a limit while the robot is on."""
+    end = max(runs[-1][1], on[-1][1] if on else runs[-1][1])
+    nexts = [first for first, _ in runs[1:]]
+    at = 0
+    for (_, start), stop in zip(runs, [*nexts, end], strict=True):
+        while at < len(on) and on[at][1] <= start:
+            at += 1
+        pieces: list[Span] = []
+        for span in on[at:]:
+            if span[0] >= stop:
+                break
+            first, last = max(span[0], start), min(span[1], stop)
+            if last - first > limit:
+                pieces.append((first, last))
+        if pieces:
+            length = sum(last - first for first, last in pieces)
+            yield Silence(topic, pieces[0][0], pieces[-1][1], length, stop == end)
+
+
+def _reported(found: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
+    """Returns those silences of a topic that are not its habit."""
+    if len(found) <= SELDOM:
+        return found
+    lengths = sorted(each.length for each in found)
+    heard = sum(last - first for first, last in runs)
+    if heard < sum(lengths):
+        return ()
+    if heard >= HABIT_NS * len(found):
+        return found
+    usual = lengths[(len(lengths) - 1) // 2]
+    return [each for each in found if each.length >= UNUSUAL * usual]

@@ -1,0 +1,74 @@
+"""Silences that bear on a question: a topic with a usual rate had no message, the robot was on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.text import MAX_NAMED, listed
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS
+from ros2_memory.history.coverage import unix_text
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+
+    from ros2_memory.analysis.silences import Silence
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Latching
+    from ros2_memory.history.view import View
+    from ros2_memory.index.snapshot import Snapshot
+
+_ALIKE_NS: Final[Ns] = 30 * NS_PER_S
+"""Topics of one node fall silent and return within this of each other."""
+
+
+def silences_of(snapshot: Snapshot, latching: Latching) -> Iterator[Silence]:
+    """Yields all silences in order of time; a latched topic holds, and is never silent."""
+    latched: dict[str, bool] = {}
+    for each in snapshot.silences:
+        if each.topic not in latched:
+            latched[each.topic] = latching.is_latched(snapshot, each.topic)
+        if not latched[each.topic]:
+            yield each
+
+
+def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
+    """Yields the silences in a window, in order, as far as they are inside."""
+    start = window.start + START_SLACK_NS
+    end = max(start, window.stop - 1 - AT_OR_BEFORE_SLACK_NS)
+    for each in silences_of(view.snapshot, view.memory.limits.latching):
+        part = each.within(start, end)
+        if part is not None:
+            yield part
+
+
+def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:
+    """Returns the sentence on when topics were silent in a window, for an answer of "never".
+
+    The longest silences are named. Empty where there was none.
+    """
+    found = [each for each in silences_in(view, window) if each.topic in topics]
+    if not found:
+        return ()
+    longest = sorted(found, key=lambda each: each.start - each.end)[:MAX_NAMED]
+    names = [
+        f"{each.topic} {unix_text(each.start)} to {unix_text(each.end)}"
+        for each in sorted(longest, key=lambda each: each.start)
+    ]
+    return (f"silent while the robot was on, so not searched: {listed(names, len(found))}",)
+
+
+def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:
+    """Returns silences, in order, with those of several topics at about the same time together."""
+    groups: list[list[Silence]] = []
+    for each in silences:
+        for group in reversed(groups):
+            first = group[0]
+            if each.start - first.start > _ALIKE_NS:
+                continue
+            if abs(each.end - first.end) <= _ALIKE_NS:
+                group.append(each)
+                break
+        else:
+            groups.append([each])
+    return groups

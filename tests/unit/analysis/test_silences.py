@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.silences import (
+    HABIT_NS,
+    Presence,
+    Silence,
+    Spacing,
+    joined,
+    silences,
+    usual_period,
+)
+
+S = 10**9
+MINUTE, HOUR = 60 * S, 3600 * S
+ODOM, SEEN = "/odom", "/seen"
+
+
+def heard(*runs: tuple[int, int], hz: int = 1) -> Presence:
+    """A topic that is recorded at a rate during runs."""
+    length = sum(last - first for first, last in runs)
+    count = length * hz // S
+    return Presence(runs, {0: Spacing(len(runs), length, max(count, 1))}, count, length)
+
+
+def found(together: tuple[str, ...] = (ODOM, SEEN), **runs: Presence) -> list[Silence]:
+    return silences({f"/{name}": each for name, each in runs.items()}, [together])
+
+
+def test_a_topic_that_stops_for_a_while_is_silent_then() -> None:
+    seen = heard((0, HOUR), (3 * HOUR, 9 * HOUR))
+    assert found(odom=heard((0, 9 * HOUR)), seen=seen) == [Silence(SEEN, HOUR, 3 * HOUR, 2 * HOUR)]
+
+
+def test_a_topic_that_never_returns_is_silent_up_to_the_end() -> None:
+    assert found(odom=heard((0, 9 * HOUR)), seen=heard((0, HOUR))) == [
+        Silence(SEEN, HOUR, 9 * HOUR, 8 * HOUR, goes_on=True)
+    ]
+
+
+def test_before_its_first_message_a_topic_was_not_there() -> None:
+    assert found(odom=heard((0, 9 * HOUR)), seen=heard((HOUR, 9 * HOUR))) == []
+
+
+def test_a_time_without_any_topic_is_a_gap_and_no_silence() -> None:
+    runs = (0, HOUR), (3 * HOUR, 9 * HOUR)
+    assert found(odom=heard(*runs), seen=heard(*runs)) == []
+
+
+def test_a_gap_inside_a_silence_does_not_count_and_does_not_part_it() -> None:
+    odom = heard((0, 2 * HOUR), (5 * HOUR, 9 * HOUR))
+    assert found(odom=odom, seen=heard((0, HOUR), (6 * HOUR, 9 * HOUR))) == [
+        Silence(SEEN, HOUR, 6 * HOUR, 2 * HOUR)
+    ]
+
+
+def test_a_silence_begins_where_the_robot_is_on_again() -> None:
+    odom = heard((0, 2 * HOUR), (5 * HOUR, 9 * HOUR))
+    assert found(odom=odom, seen=heard((0, 2 * HOUR - S), (6 * HOUR, 9 * HOUR))) == [
+        Silence(SEEN, 5 * HOUR, 6 * HOUR, HOUR)
+    ]
+
+
+def test_half_a_minute_is_no_silence_nor_are_twenty_periods() -> None:
+    odom = heard((0, 9 * HOUR))
+    assert found(odom=odom, seen=heard((0, HOUR), (HOUR + 30 * S, 9 * HOUR))) == []
+    slow = Presence(
+        ((0, HOUR), (HOUR + 3 * MINUTE, 9 * HOUR)), {0: Spacing(9, 9 * HOUR, 3240)}, 3240, 9 * HOUR
+    )
+    assert found(odom=odom, seen=slow) == []
+
+
+def test_what_is_published_when_something_happens_has_no_rate() -> None:
+    burst = Presence(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR)
+    assert usual_period(burst) is None
+    assert found(odom=heard((0, 9 * HOUR)), seen=burst) == []
+
+
+def test_the_period_is_that_of_the_bags_around_the_median() -> None:
+    spacings = {3: Spacing(1, 10 * S, 1), 0: Spacing(5, 50 * S, 500), 1: Spacing(1, 10 * S, 50)}
+    assert usual_period(Presence(((0, 9 * S),), spacings, 600, 70 * S)) == S // 10
+
+
+def test_the_topics_of_another_robot_do_not_make_this_one_silent() -> None:
+    presences = {
+        "/a/odom": heard((0, HOUR)),
+        "/a/seen": heard((0, HOUR)),
+        "/b/odom": heard((0, 9 * HOUR)),
+        "/b/seen": heard((0, 9 * HOUR)),
+    }
+    assert silences(presences, [("/a/odom", "/a/seen"), ("/b/odom", "/b/seen")]) == []
+
+
+def test_one_of_many_topics_does_not_show_that_the_robot_is_on() -> None:
+    many = {f"/{name}": heard((0, HOUR), (5 * HOUR, 9 * HOUR)) for name in "abcde"}
+    presences = {**many, "/battery": heard((0, 9 * HOUR))}
+    assert silences(presences, [presences]) == []
+
+
+def test_a_topic_that_is_mostly_silent_is_so_by_habit() -> None:
+    drives = tuple((at * HOUR, at * HOUR + 10 * MINUTE) for at in range(9))
+    assert found(odom=heard((0, 9 * HOUR)), seen=heard(*drives)) == []
+
+
+def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:
+    days = tuple((at * 24 * HOUR, at * 24 * HOUR + 16 * HOUR) for at in range(5))
+    nights = found(odom=heard((0, 112 * HOUR)), seen=heard(*days))
+    assert [each.length for each in nights] == 4 * [8 * HOUR]
+
+
+def test_of_one_that_starts_late_each_time_only_what_is_much_longer_counts() -> None:
+    odom = tuple((at * HOUR, at * HOUR + 20 * MINUTE) for at in range(9))
+    seen = [(first + MINUTE, last) for first, last in odom if first != 5 * HOUR]
+    assert HABIT_NS > 20 * MINUTE
+    assert found(odom=heard(*odom), seen=heard(*seen)) == [
+        Silence(SEEN, 5 * HOUR, 6 * HOUR + MINUTE, 21 * MINUTE)
+    ]
+
+
+def test_a_part_of_a_silence_is_no_longer_than_its_window() -> None:
+    silence = Silence(SEEN, HOUR, 6 * HOUR, 2 * HOUR)
+    assert silence.within(0, 9 * HOUR) == silence
+    assert silence.within(HOUR, 2 * HOUR) == Silence(SEEN, HOUR, 2 * HOUR, HOUR, goes_on=True)
+    assert silence.within(0, HOUR) is None
+
+
+RUNS = st.lists(st.tuples(st.integers(0, 400), st.integers(1, 60)), min_size=1, max_size=12)
+
+
+@given(RUNS, st.data())
+def test_presences_add_up_however_a_memory_is_cut(
+    drawn: list[tuple[int, int]], data: st.DataObject
+) -> None:
+    parts = [heard((start * S, (start + length) * S)) for start, length in drawn]
+    cut = data.draw(st.integers(0, len(parts) - 1))
+    halves = [joined(half) for half in (parts[:cut], parts[cut:]) if half]
+    assert joined(halves) == joined(parts)
+
+
+@given(RUNS, RUNS)
+def test_a_silence_lies_between_messages_while_others_are_heard(
+    drawn: list[tuple[int, int]], others: list[tuple[int, int]]
+) -> None:
+    seen = joined([heard((a * S, (a + n) * S)) for a, n in drawn])
+    odom = joined([heard((a * S, (a + n) * S)) for a, n in others])
+    for each in found(odom=odom, seen=seen):
+        own, other = (seen, odom) if each.topic == SEEN else (odom, seen)
+        assert all(last <= each.start or first >= each.end for first, last in own.runs)
+        on = [max(0, min(b, each.end) - max(a, each.start)) for a, b in other.runs]
+        # Runs that are half a minute apart count as one.
+        assert 30 * S < each.length <= sum(on) + 30 * S * (len(on) + 1)

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+SPLIT = 10
+
+
+def split(number: int, topics: Sequence[TopicSummary], folder: str = "rec") -> BagFile:
+    start, end = min(each.first for each in topics), max(each.last for each in topics)
+    name = str(Path("/bags") / folder / f"{folder}_{number}.mcap")
+    return BagFile(name, 1, BEGIN, BagState.CLOSED, BagSummary(topics), start, end)
+
+
+def at(topic: str, number: int, hz: float, type_name: str = "std_msgs/msg/Bool") -> TopicSummary:
+    """What a split holds of a topic that is published at a rate."""
+    start = BEGIN + number * SPLIT * S
+    count = round(SPLIT * hz)
+    return TopicSummary(topic, type_name, "cdr", count, start, start + round((count - 1) * S / hz))
+
+
+def day(splits: int, blind: range) -> Iterator[BagFile]:
+    """A robot whose detector is blind for some of the splits, and that logs now and then."""
+    draw = random.Random(7)
+    for number in range(splits):
+        topics = [at("/odom", number, 50), at("/battery", number, 0.5)]
+        if number not in blind:
+            topics.append(at("/seen", number, 1))
+        if draw.random() < 0.2:
+            topics.append(at("/rosout", number, 3, "rcl_interfaces/msg/Log"))
+        if draw.random() < 0.1:
+            start = BEGIN + number * SPLIT * S
+            topics.append(TopicSummary("/bump", "b", "cdr", 3, start + S, start + 2 * S))
+        yield split(number, topics)
+
+
+def test_the_blind_time_of_a_detector_is_found_and_nothing_else() -> None:
+    bags = [*day(1200, range(500, 600))]
+    [silence] = Snapshot(Timeline.of(bags)).silences
+    assert silence.topic == "/seen"
+    assert silence.start == BEGIN + 4999 * S
+    assert silence.end == BEGIN + 6000 * S
+
+
+def test_silences_do_not_depend_on_how_bags_are_kept_in_segments() -> None:
+    bags = [*day(700, range(300, 400))]
+    grown = Timeline.of(bags[:100])
+    for more in (bags[100:101], bags[101:350], bags[350:]):
+        grown = grown.changed((), more)
+    grown = grown.changed(bags[:200], ())
+    assert len(grown.segments) != len(Timeline.of(bags[200:]).segments)
+    assert Snapshot(grown).silences == Snapshot(Timeline.of(bags[200:])).silences != ()
+
+
+def test_a_topic_of_two_types_is_heard_under_either() -> None:
+    bags = [
+        split(n, [at("/odom", n, 50), at("/seen", n, 1, "a" if n % 2 else "b")]) for n in range(100)
+    ]
+    assert Snapshot(Timeline.of(bags)).silences == ()
+
+
+def test_bags_that_a_wrong_clock_dated_show_no_silence() -> None:
+    bags = [*day(600, range(0))]
+    unset = TopicSummary("/odom", "std_msgs/msg/Bool", "cdr", 3000, 0, 60 * S)
+    dated = [*bags, split(0, [unset], "early")]
+    assert Snapshot(Timeline.of(dated), scanned_at=BEGIN + 10**6 * S).silences == ()

@@ -1,0 +1,124 @@
+"""A detector that was blind for a while, as each tool reports it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.support.bags import Msg, boolean, detections, odom, write_mcap
+from tests.support.clocks import SettableClock
+from tests.support.memories import asked, memory_of, recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000
+SEEN = "/vision/scene/scene_objects"
+SPLITS, SPLIT = 30, 10
+BLIND = range(10, 19)
+
+
+def _split(number: int) -> list[Msg]:
+    begin = (BEGIN + number * SPLIT) * S
+    messages = [odom(begin + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLIT)]
+    if number == 25:
+        messages.append(boolean(begin + S, data=True))
+    if number not in BLIND:
+        messages += [
+            detections(begin + at * S + 1, ["cup"] if number < 5 else [], topic=SEEN)
+            for at in range(SPLIT)
+        ]
+    return sorted(messages, key=lambda each: each.log_time)
+
+
+@pytest.fixture(params=[False, True], ids=["without catalogue", "with catalogue"])
+def memory(request: pytest.FixtureRequest, tmp_path: Path) -> Memory:
+    for number in range(SPLITS):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", _split(number))
+    clock = SettableClock((BEGIN + SPLITS * SPLIT + 5) * S)
+    found = memory_of(tmp_path, clock=clock)
+    return recalling(found, tmp_path) if request.param else found
+
+
+def row(end: float | None) -> dict[str, Any]:
+    return {
+        "topic": SEEN,
+        "start": BEGIN + 99.000001,
+        "end": end,
+        "silent_s": pytest.approx(91.0),
+    }
+
+
+def test_the_span_of_the_memory_lists_the_silence(memory: Memory, tmp_path: Path) -> None:
+    reply = asked(memory, tmp_path, "data_time_range")
+    assert reply["silences"] == [row(BEGIN + 190.000001)]
+    assert reply["gaps"] == []
+
+
+def test_the_status_lists_it(memory: Memory, tmp_path: Path) -> None:
+    assert asked(memory, tmp_path, "memory_status")["silences"] == [row(BEGIN + 190.000001)]
+
+
+def test_a_recap_has_it_as_an_event(memory: Memory, tmp_path: Path) -> None:
+    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 300)
+    [event] = [each for each in reply["events"] if "silent" in each["text"]]
+    assert event["text"] == f"{SEEN} was silent"
+    assert (event["timestamp"], event["duration_s"]) == (BEGIN + 99.000001, pytest.approx(91.0))
+    assert reply["counts"]["silences"] == 1
+    within = asked(memory, tmp_path, "recap", start=BEGIN + 120, end=BEGIN + 150)
+    assert [each["timestamp"] for each in within["events"] if "silent" in each["text"]] == [
+        BEGIN + 120
+    ]
+    before = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 90)
+    assert "silences" not in before["counts"]
+
+
+NEVER = {"topic": SEEN, "condition_type": "contains", "value": "unicorn"}
+
+
+def test_never_seen_names_when_the_detector_was_silent(memory: Memory, tmp_path: Path) -> None:
+    note = (
+        f"silent while the robot was on, so not searched: {SEEN} "
+        f"{BEGIN + 99}.000001 to {BEGIN + 190}.000001"
+    )
+    assert asked(memory, tmp_path, "find_last_match", **NEVER)["notes"] == [note]
+    assert asked(memory, tmp_path, "find_matches", **NEVER)["notes"] == [note]
+    held = {"value_topic": "/odom", "condition_topic": SEEN}
+    when = {**held, "condition_type": "contains", "value": "unicorn"}
+    assert asked(memory, tmp_path, "get_value_when", **when)["notes"] == [note]
+
+
+def test_what_was_searched_without_the_silence_does_not_name_it(
+    memory: Memory, tmp_path: Path
+) -> None:
+    early = asked(memory, tmp_path, "find_last_match", **NEVER, before=BEGIN + 80)
+    late = asked(memory, tmp_path, "find_matches", **NEVER, start=BEGIN + 200, end=BEGIN + 290)
+    assert early is None
+    assert "silent" not in str(late.get("notes"))
+    other = {"topic": "/bumper", "condition_type": "equals", "value": False}
+    assert asked(memory, tmp_path, "find_last_match", **other) is None
+
+
+def test_several_topics_that_fall_silent_together_are_one_event(tmp_path: Path) -> None:
+    names = [f"/sensor_{number}" for number in range(5)]
+    for number in range(SPLITS):
+        begin = (BEGIN + number * SPLIT) * S
+        messages = [odom(begin + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLIT)]
+        messages += [boolean(begin + at * S, data=True, topic="/a") for at in range(SPLIT)]
+        if number not in BLIND:
+            for offset, name in enumerate(names):
+                messages += [
+                    boolean(begin + at * S + offset, data=True, topic=name) for at in range(SPLIT)
+                ]
+        write_mcap(
+            tmp_path / "rec" / f"rec_{number}.mcap",
+            sorted(messages, key=lambda each: each.log_time),
+        )
+    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 400) * S))
+    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 300)
+    [event] = [each for each in reply["events"] if "silent" in each["text"]]
+    assert event["text"] == "/sensor_0, /sensor_1, /sensor_2 and 2 more were silent"
