@@ -38,7 +38,7 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
     ]
     lists: dict[str, list[JsonValue]] = {
         "gaps": gaps,
-        "silences": [_silence(each) for each in answer.silences],
+        "silences": [_silence(each, local) for each in answer.silences],
         "active": _files(answer.active, bag_dir),
         "damaged": _files(answer.damaged, bag_dir),
         "incomplete": _files(answer.incomplete, bag_dir),
@@ -67,13 +67,14 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
     return with_notes(reply, notes)
 
 
-def _silence(silence: Silence) -> JsonObject:
+def _silence(silence: Silence, local: LocalTimes) -> JsonObject:
     """Returns a silence; `silent_s` is how long the robot was on in it."""
     return {
         "topic": silence.topic,
         "start": unix_rounded_up(silence.start),
         "end": None if silence.goes_on else unix_rounded_up(silence.end),
         "silent_s": seconds(silence.length),
+        **local.of(silence.start, None if silence.goes_on else silence.end),
     }
 
 
@@ -105,7 +106,7 @@ def _status(answer: results.Status) -> JsonObject:
             }
             for each in answer.fell_silent
         ],
-        "silences": [_silence(each) for each in reversed(answer.silences)],
+        "silences": [_silence(each, local) for each in reversed(answer.silences)],
         "never_heard": [*answer.never_heard],
         "missing": [*answer.missing],
     }
