@@ -3,7 +3,7 @@
 A detection is an object with a name under one of `NAMES`: an entry of a list, or the whole message.
 A string that is JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The
 position is a point in metres: `point` or `position`, vision_msgs' pose or the centre of a 3D box.
-Boxes in an image are in pixels, and give no position.
+Boxes in an image are in pixels, and give no position. The score is a number under one of `SCORES`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, Vector3
 
 NAMES: Final = ("label", "class_id", "class_name", "class", "object")
+SCORES: Final = ("score", "confidence", "probability")
 LISTS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 """A list of strings under one of these names is a list of detections."""
 
@@ -35,11 +36,15 @@ _MAX_DEPTH: Final = 4
 
 
 class Detection(NamedTuple):
-    """An object that was seen: `place` (m) is in `frame_id`, empty where the message names none."""
+    """An object that was seen: `place` (m) is in `frame_id`, empty where the message names none.
+
+    `score` is the detector's own, in its own unit; None where it gives none.
+    """
 
     label: str
     place: Vector3 | None = None
     frame_id: str = ""
+    score: float | None = None
 
 
 def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
@@ -83,14 +88,14 @@ def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
     """Returns the detection that an object is; None where it is none."""
     label = _label(value)
     if label is not None:
-        return Detection(label, _position(value), frame_id)
+        return Detection(label, _position(value), frame_id, _score(value))
     best = _best_result(value.get("results"))
     if best is None:
         return None
-    hypothesis = best.get("hypothesis")
-    label = _label(hypothesis if isinstance(hypothesis, dict) else best)
+    label = _label(_hypothesis(best))
     position = _position(best) or _position(value)
-    return None if label is None else Detection(label, position, frame_id)
+    score = _score(_hypothesis(best))
+    return None if label is None else Detection(label, position, frame_id, score)
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
@@ -108,13 +113,25 @@ def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
     among = (
         [each for each in results if isinstance(each, dict)] if isinstance(results, list) else []
     )
-    return max(among, key=_score, default=None)
+    return max(among, key=_rank, default=None)
 
 
-def _score(result: dict[str, JsonValue]) -> float:
+def _rank(result: dict[str, JsonValue]) -> float:
+    score = _score(_hypothesis(result))
+    return -math.inf if score is None else score
+
+
+def _hypothesis(result: dict[str, JsonValue]) -> dict[str, JsonValue]:
     hypothesis = result.get("hypothesis")
-    score = (hypothesis if isinstance(hypothesis, dict) else result).get("score")
-    return score if isinstance(score, int | float) and not math.isnan(score) else -math.inf
+    return hypothesis if isinstance(hypothesis, dict) else result
+
+
+def _score(value: dict[str, JsonValue]) -> float | None:
+    for name in SCORES:
+        score = value.get(name)
+        if isinstance(score, int | float) and not isinstance(score, bool) and not math.isnan(score):
+            return score
+    return None
 
 
 def _frame(value: dict[str, JsonValue]) -> str:

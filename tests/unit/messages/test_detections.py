@@ -16,7 +16,7 @@ def test_detections_with_a_label_and_a_point_are_things_in_the_frame_of_the_mess
         ]
     }
     assert detections_of(value, "base_link") == (
-        Detection("cup", (1.0, -2.0, 0.5), "base_link"),
+        Detection("cup", (1.0, -2.0, 0.5), "base_link", 0.9),
         Detection("table", None, "base_link"),
     )
 
@@ -38,7 +38,7 @@ def test_a_detection_of_vision_msgs_is_its_best_hypothesis() -> None:
             }
         ],
     }
-    assert detections_of(value) == (Detection("cup", (1.0, 2.0, 3.0), "camera"),)
+    assert detections_of(value) == (Detection("cup", (1.0, 2.0, 3.0), "camera", 0.7),)
 
 
 def test_the_centre_of_a_box_in_an_image_is_no_place() -> None:
@@ -50,7 +50,7 @@ def test_the_centre_of_a_box_in_an_image_is_no_place() -> None:
             }
         ]
     }
-    assert detections_of(value) == (Detection("cup"),)
+    assert detections_of(value) == (Detection("cup", score=0.7),)
 
 
 def test_a_point_that_nobody_filled_in_is_no_place() -> None:
@@ -65,6 +65,25 @@ def test_a_text_that_is_json_is_looked_into() -> None:
 
 def test_a_list_of_names_is_a_list_of_things() -> None:
     assert detections_of({"labels": ["cup", "", "fork"]}) == (Detection("cup"), Detection("fork"))
+
+
+@pytest.mark.parametrize(
+    ("said", "score"),
+    [
+        ({"score": 0.5}, 0.5),
+        ({"confidence": 1}, 1),
+        ({"probability": 0.25}, 0.25),
+        ({"score": True, "confidence": 0.5}, 0.5),
+        ({"score": "high"}, None),
+        ({"score": float("nan")}, None),
+        ({}, None),
+    ],
+    ids=str,
+)
+def test_a_score_is_a_number_under_one_of_its_names(
+    said: dict[str, JsonValue], score: float | None
+) -> None:
+    assert detections_of([{"label": "cup", **said}]) == (Detection("cup", score=score),)
 
 
 @pytest.mark.parametrize(
