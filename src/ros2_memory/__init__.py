@@ -27,6 +27,7 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     recorder        the recorder; recorder.process: the child; recorder.handover: rotation
     catalogue       SQLite digests of closed bags; derived, disposable
     history         one call's view across many bags
+    things          what detectors saw, as instances with places and a history
     insights        the tools beyond the specification
     tools           declarations, arguments, replies as JSON
     serving         dispatch, MCP, HTTP, access, limits, health
@@ -35,7 +36,7 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     cli             `ros2-memory`
 
 A call: `serving.mcp_server` -> `serving.dispatch` -> a declaration in `tools` -> a function in
-`queries` or `insights` -> `history.view` over `index.snapshot` -> a `storage` adapter ->
+`queries`, `insights` or `things` -> `history.view` over `index.snapshot` -> a `storage` adapter ->
 `extract` -> `results` -> `tools.replies`. docs/architecture.md has the whole picture.
 """
 

@@ -1,0 +1,1 @@
+"""Things: what detectors saw, as instances with places and a history."""

@@ -1,0 +1,92 @@
+"""Canonical labels: one name for what detectors call `Mug`, `mugs` and `coffee_mug`.
+
+Case, spacing (also `_` and `-`) and a simple English plural are of no matter; other spellings are
+declared by the owner.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+_SPACING: Final = re.compile(r"[\s_\-]+")
+_IRREGULAR: Final = {
+    "people": "person",
+    "men": "man",
+    "women": "woman",
+    "children": "child",
+    "mice": "mouse",
+    "geese": "goose",
+    "feet": "foot",
+    "teeth": "tooth",
+    "knives": "knife",
+    "shelves": "shelf",
+    "loaves": "loaf",
+    "leaves": "leaf",
+    "scarves": "scarf",
+    "wolves": "wolf",
+    "bookshelves": "bookshelf",
+}
+_NO_PLURALS: Final = ("ss", "us", "is", "as", "os")
+_SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
+
+
+def plain(label: str) -> str:
+    """Returns a label in lower case with single spaces."""
+    return _SPACING.sub(" ", label).strip().casefold()
+
+
+def singular(name: str) -> str:
+    """Returns a plain name with its last word in the singular, as far as simple rules know it."""
+    before, space, word = name.rpartition(" ")
+    return before + space + _singular(word)
+
+
+def _singular(word: str) -> str:
+    if word in _IRREGULAR:
+        return _IRREGULAR[word]
+    if len(word) > 4 and word.endswith("ies"):
+        return word[:-3] + "y"
+    if word.endswith(_SIBILANTS):
+        return word[:-2]
+    if len(word) > 5 and word.endswith("oes"):
+        return word[:-2]
+    if len(word) > 3 and word.endswith("s") and not word.endswith(_NO_PLURALS):
+        return word[:-1]
+    return word
+
+
+class Labels:
+    """Maps labels as detectors write them to keys, which are equal for equal things.
+
+    Args:
+        spellings: other spellings, by the name that is to be shown.
+    """
+
+    def __init__(self, spellings: Mapping[str, Iterable[str]] | None = None) -> None:
+        self._keys: dict[str, str] = {}
+        self._shown: dict[str, str] = {}
+        for name, variants in (spellings or {}).items():
+            key = singular(plain(name))
+            self._shown[key] = name
+            for each in (name, *variants):
+                self._keys[singular(plain(each))] = key
+
+    def key(self, label: str) -> str:
+        """Returns the key of a label."""
+        own = singular(plain(label))
+        return self._keys.get(own, own)
+
+    def name(self, key: str, counts: Mapping[str, int]) -> str:
+        """Returns the name to show for a key: declared, or the plain label seen most often."""
+        declared = self._shown.get(key)
+        if declared is not None or not counts:
+            return declared or key
+        plains: dict[str, int] = {}
+        for label, count in counts.items():
+            plains[plain(label)] = plains.get(plain(label), 0) + count
+        # A plural is not what one thing is called, unless no detector writes anything else.
+        return min(plains, key=lambda each: (each != key, -plains[each], each))

@@ -1,0 +1,135 @@
+"""Places of one label: clusters of the spots at which it was seen, over all time.
+
+Places are what detections scatter around. They are found heaviest first on a grid, and every spot
+then belongs to the nearest one, so that two things a metre apart stay two although the noise of
+far detections overlaps.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ros2_memory.analysis.sights import Ints
+
+    Floats = NDArray[np.float64]
+
+_CELL_MM: Final = 100
+_PEAK_MM: Final = 300
+"""Spots this near to each other make a peak."""
+_CLAIM_MM: Final = 600
+"""Spots this near to a place are of it before another place is looked for."""
+_GATE_MM: Final = 900
+_HALO_MM: Final = 950
+_HALO_SHARE: Final = 0.1
+"""A peak this near to another one, and lighter than this share of it, is its noise."""
+_SCATTER_MM: Final = 800
+_FEW: Final = 25.0
+"""So few detections, far away, may scatter as widely."""
+_MAX_PLACES: Final = 512
+_FULL_WEIGHT: Final = 10
+"""A spot of more detections weighs no more: all of one bag share its error of localisation."""
+
+
+def places_of(x: Ints, y: Ints, n: Ints) -> tuple[Ints, Floats]:
+    """Returns the place of each spot (-1: of none), and the places' x and y (mm) as rows."""
+    weight = np.minimum(n, _FULL_WEIGHT).astype(np.float64)
+    cells, cell_of = np.unique(
+        np.stack((x // _CELL_MM, y // _CELL_MM), axis=1), axis=0, return_inverse=True
+    )
+    cell_of = cell_of.reshape(-1)
+    mass = np.bincount(cell_of, weight).astype(np.float64)
+    centre = np.stack([np.bincount(cell_of, weight * each) / mass for each in (x, y)], axis=1)
+    peaks = _peaks(cells, centre, mass)
+    if not len(peaks):
+        return np.full(len(x), -1, np.int64), peaks
+    place, away = _nearest(np.stack((x, y), axis=1).astype(np.float64), peaks)
+    place[away > _GATE_MM] = -1
+    return place, _means(place, x, y, weight, peaks)
+
+
+def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
+    """Returns where the spots are densest, the densest first, `_CLAIM_MM` or more apart."""
+    density = _density(cells, mass)
+    order = np.argsort(-density, kind="stable")
+    free = np.ones(len(cells), bool)
+    found: list[Floats] = []
+    masses: list[float] = []
+    for at in order.tolist():
+        if not free[at]:
+            continue
+        middle = centre[at]
+        for _ in range(3):
+            near = free & (_away(centre, middle) <= _PEAK_MM)
+            if not near.any():
+                break
+            middle = np.average(centre[near], axis=0, weights=mass[near])
+        claimed = free & (_away(centre, middle) <= _CLAIM_MM)
+        claimed[at] = True
+        free &= ~claimed
+        weight = float(mass[claimed].sum())
+        if not _is_halo(middle, weight, found, masses):
+            found.append(middle)
+            masses.append(weight)
+        if len(found) == _MAX_PLACES:
+            break
+    return np.array(found).reshape(-1, 2)
+
+
+def _is_halo(middle: Floats, weight: float, peaks: list[Floats], masses: list[float]) -> bool:
+    if not peaks:
+        return False
+    away, mass = _away(np.array(peaks), middle), np.array(masses)
+    noise = (away <= _HALO_MM) & (mass > weight / _HALO_SHARE)
+    scattered = (away <= _SCATTER_MM) & (mass + weight < _FEW)
+    return bool((noise | scattered).any())
+
+
+def _density(cells: Ints, mass: Floats) -> Floats:
+    """Returns for each cell the mass of the cells around it."""
+    reach = _PEAK_MM // _CELL_MM
+    known = {(int(a), int(b)): nth for nth, (a, b) in enumerate(cells)}
+    density = np.zeros(len(cells))
+    for (a, b), nth in known.items():
+        total = 0.0
+        for da in range(-reach, reach + 1):
+            for db in range(-reach, reach + 1):
+                if da * da + db * db <= reach * reach:
+                    other = known.get((a + da, b + db))
+                    if other is not None:
+                        total += float(mass[other])
+        density[nth] = total
+    return density
+
+
+def _away(points: Floats, middle: Floats) -> Floats:
+    away: Floats = np.hypot(points[:, 0] - middle[0], points[:, 1] - middle[1])
+    return away
+
+
+def _nearest(points: Floats, peaks: Floats) -> tuple[Ints, Floats]:
+    """Returns the nearest peak of each point, and how far away (mm) it is."""
+    nearest = np.zeros(len(points), np.int64)
+    least = np.full(len(points), np.inf)
+    for nth, peak in enumerate(peaks):
+        away = _away(points, peak)
+        closer = away < least
+        nearest[closer] = nth
+        least[closer] = away[closer]
+    return nearest, least
+
+
+def _means(place: Ints, x: Ints, y: Ints, weight: Floats, peaks: Floats) -> Floats:
+    """Returns the mean of each place's spots; its peak where it has none."""
+    inside = place >= 0
+    mass = np.bincount(place[inside], weight[inside], len(peaks))
+    means = peaks.copy()
+    has = mass > 0
+    for column, values in enumerate((x, y)):
+        sums = np.bincount(place[inside], (weight * values)[inside], len(peaks))
+        means[has, column] = sums[has] / mass[has]
+    return means

@@ -1,0 +1,341 @@
+"""When a label was at a place: from what was seen there, and from what was not seen.
+
+A *cell* is a pose of the robot, to 25 cm and 10 degrees, from which the place was seen at least
+once. How often a message from a cell has the label, while it is there, is its rate. A look from
+such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is evidence
+of presence, as strong as false detections are rare. The likeliest sequence of being there and not
+being there (Viterbi, two states) gives the stays.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Look
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.analysis.sights import Ints, Sights
+    from ros2_memory.core.timebase import Ns
+
+    Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+
+_FALSE_RATE: Final = 0.01
+"""How often a message has a label at a place where there is no such thing."""
+_SWITCH: Final = 4.0
+"""Natural logarithm of the odds against a change between two bags."""
+_MOST_BY_BAG: Final = 10.0
+"""What one bag can add to the evidence: its messages share their errors."""
+_STANDING: Final = 0.2
+"""A robot that stands looks at the same thing behind the same obstacle."""
+_LEAST_BLIND: Final = -2.0
+_CLEAR: Final = 1.5
+_FIRM: Final = 5.0
+"""A bag with evidence above this has more than one detection, which is hardly ever false."""
+_PRIOR: Final = 0.5
+_MISSED_BY_CHANCE: Final = 0.01
+_LEFT_BY_CHANCE: Final = 0.05
+_VIEW_SHARE: Final = 0.02
+_VIEW_MARGIN_DEG: Final = 2.0
+_VIEW_MARGIN_MM: Final = 100.0
+
+
+class Cells:
+    """The looks of all bags by cell: which looks were from where.
+
+    Args:
+        sights: of all bags, in order of time.
+        epoch: by bag, which odometry its poses are in; the same for all that are in a map.
+    """
+
+    def __init__(self, sights: Sights, epoch: Ints) -> None:
+        looks = sights.looks
+        self.bag, self.n = looks[:, Look.BAG], looks[:, Look.N]
+        self.first, self.last = looks[:, Look.FIRST], looks[:, Look.LAST]
+        self.topic = looks[:, Look.TOPIC]
+        self.x = looks[:, Look.X].astype(np.float64)
+        self.y = looks[:, Look.Y].astype(np.float64)
+        self.yaw = looks[:, Look.YAW] / 10.0
+        keys = np.stack(
+            (
+                self.topic,
+                epoch[self.bag],
+                looks[:, Look.X] // CELL_MM,
+                looks[:, Look.Y] // CELL_MM,
+                looks[:, Look.YAW] // CELL_DECIDEG,
+            ),
+            axis=1,
+        )
+        _, cell = np.unique(keys, axis=0, return_inverse=True)
+        self.cell: Ints = cell.reshape(-1).astype(np.int64)
+        order = np.argsort(self.cell, kind="stable")
+        self._order = order
+        self._starts = np.searchsorted(self.cell[order], np.arange(self.cell.max(initial=-1) + 2))
+
+    def looks_from(self, cells: Ints) -> Ints:
+        """Returns the looks from some cells, in order of time."""
+        parts = [self._order[self._starts[each] : self._starts[each + 1]] for each in cells]
+        return np.sort(np.concatenate(parts)) if parts else np.zeros(0, np.int64)
+
+    def seen_at(self, looks: Ints, x: float, y: float) -> tuple[Floats, Floats]:
+        """Returns how far (mm) and in which direction (degrees from ahead) a place was."""
+        dx, dy = x - self.x[looks], y - self.y[looks]
+        bearing = (np.degrees(np.arctan2(dy, dx)) - self.yaw[looks] + 180.0) % 360.0 - 180.0
+        return np.hypot(dx, dy), bearing
+
+
+@dataclass(frozen=True, slots=True)
+class FieldOfView:
+    """The distances (mm) and directions (degrees) at which a detector sees nearly all it sees."""
+
+    most_mm: float
+    least_deg: float
+    most_deg: float
+
+    def covers(self, away: Floats, bearing: Floats) -> Flags:
+        """Returns which of some places lie inside."""
+        inside: Flags = (
+            (away <= self.most_mm) & (bearing >= self.least_deg) & (bearing <= self.most_deg)
+        )
+        return inside
+
+
+def field_of_view(away: Floats, bearing: Floats, n: Ints) -> FieldOfView:
+    """Returns the field of view in which all but a few of the detections lie."""
+    far, low, high = (
+        _weighted_quantile(values, n, share)
+        for values, share in (
+            (away, 1 - _VIEW_SHARE),
+            (bearing, _VIEW_SHARE),
+            (bearing, 1 - _VIEW_SHARE),
+        )
+    )
+    return FieldOfView(far, low, high)
+
+
+def _weighted_quantile(values: Floats, n: Ints, share: float) -> float:
+    order = np.argsort(values, kind="stable")
+    running = np.cumsum(n[order])
+    at = int(np.searchsorted(running, share * running[-1]))
+    return float(values[order[min(at, len(order) - 1)]])
+
+
+class Evidence(NamedTuple):
+    """What is known of one place: looks at it, and what of them saw the label there.
+
+    Attributes:
+        looks: numbers of looks from cells that saw it at least once, in order of time.
+        cell: of each look, numbered from 0 within the place.
+        hits: how many messages of each of these looks have the label there.
+        blind: hits of messages without a known pose, by bag.
+        fair: whether a look without a hit had the place well inside its field of view.
+    """
+
+    looks: Ints
+    cell: Ints
+    hits: Ints
+    blind: dict[int, int]
+    fair: Flags
+
+
+class Stay(NamedTuple):
+    """A time at a place: the bags of the first and the last sighting, and what came after.
+
+    `messages` are those of the looks that saw it. `firm_first` and `firm_last` are the bags between
+    which single detections, which may be false, are not needed to see it there.
+    `left` is the bag by which it was seen to be gone (chance of missing it below 5 %), or None.
+    """
+
+    first_bag: int
+    last_bag: int
+    firm_first: int
+    firm_last: int
+    hits: int
+    messages: int
+    left: int | None
+
+
+def evidence_at(
+    cells: Cells, view: dict[int, FieldOfView], x: float, y: float, rows: Ints
+) -> Evidence:
+    """Returns the evidence on a place (mm) from its rows of `Hit` with `SPOT` as the bag."""
+    placed = rows[rows[:, Hit.LOOK] >= 0]
+    blind: dict[int, int] = {}
+    for bag, look, n in rows.tolist():
+        if look < 0:
+            blind[bag] = blind.get(bag, 0) + n
+    known = np.unique(cells.cell[placed[:, Hit.LOOK]])
+    looks = cells.looks_from(known)
+    cell = np.searchsorted(known, cells.cell[looks])
+    hits = np.zeros(len(looks), np.int64)
+    np.add.at(hits, np.searchsorted(looks, placed[:, Hit.LOOK]), placed[:, Hit.N])
+    np.minimum(hits, cells.n[looks], out=hits)
+    away, bearing = cells.seen_at(looks, x, y)
+    fair = np.zeros(len(looks), bool)
+    for topic, each in view.items():
+        fair |= (cells.topic[looks] == topic) & each.covers(away, bearing)
+    return Evidence(looks, cell, hits, blind, fair)
+
+
+def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
+    """Returns the stays at a place, in order of time."""
+    looks, hits = evidence.looks, evidence.hits
+    bag, n = cells.bag[looks], cells.n[looks]
+    if not hits.any() and not evidence.blind:
+        return []
+    bags, at = _numbered(bag, evidence.blind)
+    seen = np.bincount(at, hits, len(bags))
+    for each, count in evidence.blind.items():
+        seen[int(np.searchsorted(bags, each))] += count
+    rate = _rates(evidence.cell, n, hits, seen[at] > 0)
+    odds = hits * np.log(rate / _FALSE_RATE) + (n - hits) * np.log((1 - rate) / (1 - _FALSE_RATE))
+    odds[~evidence.fair & (hits == 0)] = 0.0
+    odds[~evidence.fair] = odds[~evidence.fair].clip(_LEAST_BLIND)
+    odds[_stood_on(evidence.cell, bag, hits)] *= _STANDING
+    by_bag = np.bincount(at, odds, len(bags))
+    messages = np.bincount(at, np.where(hits > 0, n, 0), len(bags))
+    for each, count in evidence.blind.items():
+        nth = int(np.searchsorted(bags, each))
+        by_bag[nth] += 2.0 * count
+        messages[nth] += count
+    by_bag = by_bag.clip(-_MOST_BY_BAG, _MOST_BY_BAG)
+    stays = []
+    for start, stop in _present(by_bag.astype(np.float64)):
+        inside = np.flatnonzero(seen[start:stop]) + start
+        clear = inside[by_bag[inside] >= _CLEAR]
+        if not len(inside):
+            continue
+        # A false detection or two beside a stay are no part of it.
+        inside = clear if len(clear) else inside
+        first, last = int(inside[0]), int(inside[-1])
+        firm = inside[by_bag[inside] >= _FIRM]
+        firm = firm if len(firm) else inside
+        gone = np.cumsum(by_bag[firm[-1] + 1 :]) < math.log(_LEFT_BY_CHANCE)
+        left = int(bags[firm[-1] + 1 + int(gone.argmax())]) if gone.any() else None
+        stays.append(
+            Stay(
+                int(bags[first]),
+                int(bags[last]),
+                int(bags[firm[0]]),
+                int(bags[firm[-1]]),
+                int(seen[first : last + 1].sum()),
+                int(messages[first : last + 1].sum()),
+                left,
+            )
+        )
+    return stays
+
+
+def chance_of_missing(
+    cells: Cells, evidence: Evidence, stay: Stay, after: Ns
+) -> tuple[float, int, Ns | None]:
+    """Returns how likely it is that a thing which is still at its place was missed since.
+
+    By the looks after a time (ns) from cells that saw it during the stay; each cell's own rate is
+    known as well as its messages make it (a uniform prior). With the number of messages of these
+    looks, and when the chance fell below 1 %; None where it did not.
+    """
+    looks, hits = evidence.looks, evidence.hits
+    cell, bag = evidence.cell, cells.bag[looks]
+    during = (bag >= stay.first_bag) & (bag <= stay.last_bag) & (cells.last[looks] <= after)
+    during |= (bag >= stay.first_bag) & (bag <= stay.last_bag) & (hits > 0)
+    since = (cells.first[looks] > after) & evidence.fair & ~during
+    known: dict[int, list[float]] = {}
+    for each, n, hit in zip(
+        cell[during].tolist(), cells.n[looks[during]].tolist(), hits[during].tolist(), strict=True
+    ):
+        entry = known.setdefault(each, [1.0, 1.0])
+        entry[0] += hit
+        entry[1] += n - hit
+    chance, messages = 0.0, 0
+    crossed: Ns | None = None
+    for each, n, hit, last in zip(
+        cell[since].tolist(),
+        cells.n[looks[since]].tolist(),
+        hits[since].tolist(),
+        cells.last[looks[since]].tolist(),
+        strict=True,
+    ):
+        entry = known.get(each, [0.0, 0.0])
+        if entry[0] <= 1.0 or hit:
+            continue
+        seen, missed = entry
+        # The chance of n misses in a row, by a beta distribution of the rate.
+        chance += (
+            math.lgamma(missed + n)
+            - math.lgamma(missed)
+            + math.lgamma(seen + missed)
+            - math.lgamma(seen + missed + n)
+        )
+        entry[1] += n
+        messages += n
+        if crossed is None and chance < math.log(_MISSED_BY_CHANCE):
+            crossed = last
+    return math.exp(chance), messages, crossed
+
+
+def _rates(cell: Ints, n: Ints, hits: Ints, there: Flags) -> Floats:
+    """Returns for each look how often its cell sees the thing while that is there."""
+    seen = np.bincount(cell[there], hits[there], int(cell.max(initial=-1)) + 1)
+    of = np.bincount(cell[there], n[there], len(seen))
+    rate: Floats = (seen + _PRIOR) / (of + 2 * _PRIOR)
+    return rate[cell].clip(2 * _FALSE_RATE, 0.98)
+
+
+def _numbered(bag: Ints, blind: Iterable[int]) -> tuple[Ints, Ints]:
+    """Returns the bags of looks, which ascend, and of blind hits; and the number of each look's."""
+    more = np.array([*blind], np.int64)
+    if len(more):
+        bags = np.union1d(bag, more)
+        return bags, np.searchsorted(bags, bag)
+    fresh = np.ones(len(bag), bool)
+    fresh[1:] = bag[1:] != bag[:-1]
+    return bag[fresh], np.cumsum(fresh) - 1
+
+
+def _stood_on(cell: Ints, bag: Ints, hits: Ints) -> Flags:
+    """Returns which looks without a hit go on where the bag before looked in vain."""
+    order = np.argsort(cell, kind="stable")
+    after, before = order[1:], order[:-1]
+    same = (cell[after] == cell[before]) & (bag[after] - bag[before] <= 1)
+    stood = np.zeros(len(cell), bool)
+    stood[after[same & (hits[after] == 0) & (hits[before] == 0)]] = True
+    return stood
+
+
+def _present(by_bag: Floats) -> list[tuple[int, int]]:
+    """Returns the likeliest runs of bags in which a thing was there, as [start, stop)."""
+    # Runs of one sign have one state: fewer steps than bags.
+    sign = by_bag >= 0
+    starts = np.concatenate(([0], np.flatnonzero(np.diff(sign)) + 1))
+    sums = np.add.reduceat(by_bag, starts).tolist()
+    absent, present = 0.0, -_SWITCH / 4
+    came_from: list[tuple[bool, bool]] = []
+    for value in sums:
+        to_absent, to_present = present - _SWITCH, absent - _SWITCH
+        came_from.append((to_absent > absent, to_present <= present))
+        absent, present = max(absent, to_absent), max(present, to_present) + value
+    state = present > absent
+    states = []
+    for from_present, stays_present in reversed(came_from):
+        states.append(state)
+        state = stays_present if state else from_present
+    states.reverse()
+    stops = [*starts[1:].tolist(), len(by_bag)]
+    runs: list[tuple[int, int]] = []
+    for inside, start, stop in zip(states, starts.tolist(), stops, strict=True):
+        if not inside:
+            continue
+        if runs and runs[-1][1] == start:
+            runs[-1] = (runs[-1][0], stop)
+        else:
+            runs.append((start, stop))
+    return runs
