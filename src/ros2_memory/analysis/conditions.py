@@ -102,11 +102,12 @@ class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
     1 and 0 equal true and false. A number equals itself and its float32 rounding, which is what a
-    float32 field stores of it. Strings are compared exactly; one that spells a boolean or a number
-    equals that too, since planners put values in quotes.
+    float32 field stores of it. Strings are compared without regard to case; one that spells a
+    boolean or a number equals that too, since planners put values in quotes.
     """
 
     value: Scalar
+    _folded: str | None = field(init=False, repr=False, compare=False)
     _boolean: bool | None = field(init=False, repr=False, compare=False)
     _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
 
@@ -114,6 +115,8 @@ class Equals:
         meant = _meaning(self.value)
         boolean = bool(meant) if meant is not None and meant in (0, 1) else None
         numbers = () if meant is None else (meant, _float32(meant))
+        folded = self.value.casefold() if isinstance(self.value, str) else None
+        object.__setattr__(self, "_folded", folded)
         object.__setattr__(self, "_boolean", boolean)
         object.__setattr__(self, "_numbers", numbers)
 
@@ -123,7 +126,7 @@ class Equals:
 
     def can_match(self, zone_map: ZoneMap) -> bool:
         """Returns whether some value of this zone map may have such a leaf."""
-        if isinstance(self.value, str) and zone_map.can_contain_text(self.value.casefold()):
+        if self._folded is not None and zone_map.can_contain_text(self._folded):
             return True
         if self._boolean is not None and zone_map.can_contain_boolean(self._boolean):
             return True
@@ -135,7 +138,7 @@ class Equals:
             return leaf is self._boolean
         if isinstance(leaf, int | float):
             return any(leaf == number for number in self._numbers)
-        return isinstance(leaf, str) and leaf == self.value
+        return isinstance(leaf, str) and leaf.casefold() == self._folded
 
 
 @dataclass(frozen=True, slots=True)

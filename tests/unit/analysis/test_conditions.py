@@ -199,10 +199,20 @@ def test_nothing_equals_nan_or_null(asked: Scalar) -> None:
     assert not Equals(math.nan).matches([asked, math.nan, None])
 
 
-def test_a_string_is_equal_to_the_letter_and_as_a_whole() -> None:
-    assert Equals("docked").matches({"state": "docked"})
-    assert not Equals("docked").matches({"state": "Docked"})
-    assert not Equals("docked").matches({"state": "undocked"})
+@pytest.mark.parametrize("held", ["docked", "Docked", "DOCKED"])
+def test_a_string_is_equal_as_a_whole_without_regard_to_case(held: str) -> None:
+    assert Equals("docked").matches({"state": held})
+    assert Equals(held).matches({"state": "docked"})
+    assert not Equals(held).matches({"state": "undocked"})
+    assert not Equals(f"un{held}").matches({"state": held})
+
+
+@given(st.text(), json_values)
+def test_what_is_equal_to_a_text_contains_it(asked: str, value: JsonValue) -> None:
+    for held in (asked, asked.upper(), asked.casefold()):
+        if Equals(held).matches([asked, value]):
+            assert Contains(held).matches([asked, value])
+    assert Equals(asked.casefold()).matches([asked])
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,9 @@ needles = st.one_of(
     st.booleans(),
     st.integers(-5, 5),
     st.floats(allow_nan=False),
-    st.sampled_from(["a", "AB", "b", "1", " a", "b c", "true", "-3", "0.5", "ß", "-"]),
+    st.sampled_from(
+        ["a", "AB", "A B", "aB_c", "b", "1", " a", "b c", "true", "-3", "0.5", "ß", "-"]
+    ),
     st.text(max_size=3),
 )
 texts = st.one_of(
@@ -61,6 +63,8 @@ conditions = st.builds(
 @given(st.lists(values, max_size=4), values, conditions)
 @example([], [{"point": {"x": 10**400, "y": 0.0}}], Condition(Equals(math.inf)))
 @example([], ["STRASSE"], Condition(Contains("straße")))
+@example([], ["STRASSE"], Condition(Equals("straße")))
+@example([], ["Ab_c"], Condition(Equals("aB_C")))
 @example([], {"x": [True, 2]}, Condition(Contains(1), "x"))
 @example([], {"x": [True, 2]}, Condition(Contains("2"), "x"))
 @example([], {"x": False}, Condition(Equals(0)))

@@ -64,6 +64,7 @@ CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
     ("equals", "0"),
     ("equals", 0.4),
     ("equals", "cup"),
+    ("equals", "CUP"),
     ("equals", 3),
     ("above", 0.4),
     ("below", "2.5"),
