@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 
 from ros2_memory import PACKAGE, package_version
-from ros2_memory.config import NullRecorderNode, load_message_schemas
+from ros2_memory.config import NullRecorderNode, load_labels, load_message_schemas
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.telemetry import SILENT, Telemetry
@@ -161,7 +161,7 @@ def build_memory(settings: Settings) -> Memory:
     """Returns the memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
 
     Raises:
-        ConfigError: the reader cannot be built, or the schema map is refused.
+        ConfigError: the reader cannot be built, or the schema map or the labels are refused.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.catalogue.lookup import DigestCache
@@ -255,7 +255,11 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:
-    """Returns what queries need of the configuration."""
+    """Returns what queries need of the configuration.
+
+    Raises:
+        ConfigError: the labels are refused.
+    """
     from ros2_memory.history.context import Latching, QuerySettings
 
     data = settings.data
@@ -276,6 +280,8 @@ def query_settings_of(settings: Settings) -> QuerySettings:
         latching=Latching(
             data.tf_static_topics, data.latched_topics.include, data.latched_topics.exclude
         ),
+        min_score=data.min_score,
+        labels=load_labels(settings),
     )
 
 

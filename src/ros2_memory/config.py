@@ -19,7 +19,16 @@ import sys
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias, get_args, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Final,
+    Literal,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    get_type_hints,
+)
 
 from hydra import compose, initialize_config_dir
 from omegaconf import ListConfig, OmegaConf
@@ -44,6 +53,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from ros2_memory.core.model import JsonValue
+
+_T = TypeVar("_T")
 
 EXIT_CODE: Final = 2
 
@@ -74,6 +85,23 @@ def _dot_path(path: str) -> str:
     if not re.fullmatch(r"\w+(\.\w+)*", path):
         raise ValueError("must be a dot-path such as pose.pose.position")
     return path
+
+
+def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Checks that no spelling leads to two names; case and spacing distinguish none."""
+    names: dict[str, str] = {}
+    for name, spellings in labels.items():
+        for each in (name, *spellings):
+            plain = " ".join(re.split(r"[\s_-]+", each.casefold().strip()))
+            if not plain.strip():
+                raise ValueError(f"must not hold an empty spelling, as under {name!r}")
+            other = names.setdefault(plain, name)
+            if other != name:
+                raise ValueError(
+                    f"must hold each spelling under one label: {each!r} is under {other!r} and "
+                    f"{name!r}"
+                )
+    return labels
 
 
 Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
@@ -119,13 +147,16 @@ class LatchedTopics:
 class DataSettings:
     """How recorded data is interpreted.
 
-    Positions are given in `map_frame` where transforms lead there. "Ago" is relative to `now`: the
-    wall clock, or the newest message. `tf_clock` is the time that orders transforms: header stamps,
+    Positions are given in `map_frame` where transforms lead there. Detections whose score is below
+    `min_score` count only where a call asks for them. "Ago" is relative to `now`: the wall clock,
+    or the newest message. `tf_clock` is the time that orders transforms: header stamps,
     log time, or stamps where the two agree.
     """
 
     max_array_length: Count
     position_tolerance_m: Tolerance
+    min_score: Tolerance
+    labels_file: ConfigFile | None
     time_tolerance_s: Tolerance
     pose_topic: Text
     map_frame: Text | None
@@ -266,6 +297,13 @@ class MessageSchemas:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class Labels:
+    """Other spellings of labels: for each name that is to be shown, what detectors write for it."""
+
+    labels: Annotated[dict[Text, tuple[Text, ...]], AfterValidator(_each_spelling_once)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class Settings:
     """The whole configuration, validated."""
 
@@ -363,14 +401,28 @@ def load_message_schemas(settings: Settings) -> Mapping[str, Mapping[str, str]]:
     Raises:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
-    path = settings.reader.schemas_file
+    return _load_file(MessageSchemas, "reader.schemas_file", settings.reader.schemas_file).schemas
+
+
+def load_labels(settings: Settings) -> Mapping[str, Sequence[str]]:
+    """Returns the spellings of `data.labels_file` by the name to show; none where it is null.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or its content is refused.
+    """
+    path = settings.data.labels_file
+    return {} if path is None else _load_file(Labels, "data.labels_file", path).labels
+
+
+def _load_file(model: type[_T], key: str, path: Path) -> _T:
+    """Returns the content of a YAML file that a key names, as an instance of a model."""
 
     def source(_key: str) -> str:
-        return f"in {path}, which reader.schemas_file names"
+        return f"in {path}, which {key} names"
 
-    with foreign_errors_as_config_error(f"reader.schemas_file: {path}", source):
+    with foreign_errors_as_config_error(f"{key}: {path}", source):
         data = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    return validated(MessageSchemas, data, config_dir=path.parent, source=source).schemas
+    return validated(model, data, config_dir=path.parent, source=source)
 
 
 @contextmanager

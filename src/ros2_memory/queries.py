@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
-from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.core.errors import (
@@ -53,7 +52,7 @@ from ros2_memory.history.no_data import (
     seconds,
     with_notes,
 )
-from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.silences import describe_silences, silences_of
 from ros2_memory.history.view import (
@@ -236,19 +235,22 @@ def find_last_match(
     field: str | None = None,
     fields: Sequence[str] = (),
     before_s: float | None = None,
+    min_score: float | None = None,
 ) -> results.Match:
     """Returns the newest message of a topic, or of all topics of a glob, that meets a condition.
 
-    With `before_s` (Unix seconds) only messages up to and including then are searched.
+    With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
+    of a score below `min_score` do not count.
     """
-    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    condition = condition_of(memory.limits, condition_type, value, field, min_score)
     now = memory.clock.now()
     view = View(memory, call, now)
     until = _before(before_s)
     search = ReverseSearch(view, topic, condition)
     found = search.newest(until)
     if found is None:
-        return results.Match(None, notes=_never(view, search, until))
+        notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+        return results.Match(None, notes=notes)
     note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
@@ -270,19 +272,22 @@ def value_when(
     field: str | None = None,
     fields: Sequence[str] = (),
     before_s: float | None = None,
+    min_score: float | None = None,
 ) -> results.ValueWhen:
     """Returns a topic's value at or before the last time that another topic met a condition.
 
-    With `before_s` (Unix seconds) the condition is looked for up to and including then.
+    With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
+    of a score below `min_score` do not count.
     """
-    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    condition = condition_of(memory.limits, condition_type, value, field, min_score)
     now, until = memory.clock.now(), _before(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
     search = ReverseSearch(view, condition_topic, condition)
     found = search.newest(until)
     if found is None:
-        return results.ValueWhen(None, notes=_never(view, search, until))
+        notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+        return results.ValueWhen(None, notes=notes)
     note_unread(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)
     matched = _value(view, found, (), None)

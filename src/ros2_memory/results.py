@@ -247,6 +247,7 @@ class Sighting:
         thing: where the thing itself was then, if the message has that.
         matched: the texts of the last message that met the condition, where that is on texts.
         value: the requested fields of the last message; None where none were, or it has none.
+        score: of the detection, if the message has that; the best of several.
     """
 
     topic: str
@@ -258,6 +259,7 @@ class Sighting:
     thing: LabelledPlace | None
     matched: tuple[str, ...] = ()
     value: JsonValue = None
+    score: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,7 +229,11 @@ def test_every_yaml_is_what_its_reader_takes(block: Block, tmp_path: Path) -> No
             assert re.fullmatch(rf"https?://[\w.-]+{port}{STREAM_PATH}", entry["url"])
         return
     [(key, value)] = content.items()
-    shipped = {"topics": "topics.yaml", "schemas": "message_schemas.yaml"}[key]
+    shipped = {
+        "topics": "topics.yaml",
+        "schemas": "message_schemas.yaml",
+        "labels": "labels.yaml",
+    }[key]
     like = yaml.safe_load((ROOT / "config" / shipped).read_text(encoding="utf-8"))[key]
     assert type(value) is type(like)
     if key == "schemas":

@@ -309,6 +309,7 @@ def detections(
     *,
     topic: str = "/vision/scene/scene_objects",
     at: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    score: float = 0.9,
 ) -> Msg:
     """A VisionDetectionArray in base_link with one detection for each label."""
     body = make(
@@ -319,7 +320,7 @@ def detections(
             make(
                 "ros2_vision_interfaces/msg/VisionDetection",
                 label=label,
-                score=0.9,
+                score=score,
                 point=point(*at),
                 bbox=np.array([10, 20, 100, 120], dtype=np.int32),
             )

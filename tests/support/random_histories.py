@@ -77,7 +77,13 @@ class _Robot:
         if kind == 7:
             topic = draw.choice(["/vision/a", "/vision/b"])
             labels = draw.sample(WORDS, draw.randint(0, 3))
-            return detections(at, labels, topic=topic, at=(x, 0.5, draw.choice([0.0, 1.0])))
+            return detections(
+                at,
+                labels,
+                topic=topic,
+                at=(x, 0.5, draw.choice([0.0, 1.0])),
+                score=at // 1000 % 10 / 10,
+            )
         if kind == 8:
             return boolean(at, draw.random() < 0.5)
         if kind == 9:

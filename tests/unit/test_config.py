@@ -36,6 +36,8 @@ class TestDefaults:
             "data": {
                 "max_array_length": 50,
                 "position_tolerance_m": 0.5,
+                "min_score": 0.0,
+                "labels_file": ROOT / "config/labels.yaml",
                 "time_tolerance_s": 0.1,
                 "pose_topic": "/odom",
                 "map_frame": "map",

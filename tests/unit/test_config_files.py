@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.config import config_dir, load_message_schemas, load_settings
+from ros2_memory.bootstrap import query_settings_of
+from ros2_memory.config import config_dir, load_labels, load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
 from tests.support.config_folders import ROOT, copied, edit, refusal
 
@@ -130,3 +131,65 @@ class TestMessageSchemas:
         with pytest.raises(ConfigError, match="No such file") as caught:
             load_message_schemas(settings)
         assert f"reader.schemas_file: {path}" in str(caught.value)
+
+
+class TestLabels:
+    @staticmethod
+    def load(text: str, tmp_path: Path) -> object:
+        path = tmp_path / "labels.yaml"
+        path.write_text(text)
+        return load_labels(load_settings([f"data.labels_file='{path}'"], {}))
+
+    def test_are_spellings_by_the_name_that_is_shown(self, tmp_path: Path) -> None:
+        text = "labels: {mug: [coffee mug, Mug], remote control: [tv-remote]}\n"
+        assert self.load(text, tmp_path) == {
+            "mug": ("coffee mug", "Mug"),
+            "remote control": ("tv-remote",),
+        }
+
+    def test_are_none_as_shipped_and_without_a_file(self) -> None:
+        assert load_labels(load_settings((), {})) == {}
+        assert load_labels(load_settings(["data.labels_file=null"], {})) == {}
+
+    def test_reach_the_queries(self, tmp_path: Path) -> None:
+        path = tmp_path / "labels.yaml"
+        path.write_text("labels: {mug: [coffee mug]}")
+        settings = load_settings([f"data.labels_file='{path}'", "data.min_score=0.3"], {})
+        limits = query_settings_of(settings)
+        assert limits.labels == {"mug": ("coffee mug",)}
+        assert limits.min_score == 0.3
+
+    @pytest.mark.parametrize(
+        ("text", "fragment"),
+        [
+            ("labels: {mug: [cup], Glass: [CUP]}", "'CUP' is under 'mug' and 'Glass'"),
+            ("labels: {mug: [tea_cup], cup: [Tea cup]}", "'Tea cup' is under 'mug' and 'cup'"),
+            ("labels: {mug: [cup], cup: []}", "'cup' is under 'mug' and 'cup'"),
+            ("labels: {mug: cup}", "labels.mug: 'cup' is not allowed; must be a list"),
+            ("labels: {mug: [3]}", "labels.mug.0: 3 is not allowed"),
+            ("labels: {mug: ['']}", "must not be empty"),
+            ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
+            ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
+            ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
+            ("label: {}", "label: there is no such key; use one of: labels"),
+            ("", "labels: missing"),
+        ],
+    )
+    def test_a_wrong_file_is_refused_by_file_and_key(
+        self, text: str, fragment: str, tmp_path: Path
+    ) -> None:
+        with pytest.raises(ConfigError) as caught:
+            self.load(text, tmp_path)
+        assert fragment in str(caught.value)
+        assert str(tmp_path / "labels.yaml") in str(caught.value)
+        assert "data.labels_file" in str(caught.value)
+
+    def test_the_shipped_examples_are_valid(self, tmp_path: Path) -> None:
+        shipped = (ROOT / "config/labels.yaml").read_text()
+        _, commented = shipped.split("labels: {}\n\n")
+        uncommented = "".join(line.removeprefix("# ") for line in commented.splitlines(True))
+        assert self.load(uncommented, tmp_path) == {
+            "mug": ("coffee mug", "tea cup"),
+            "sofa": ("couch", "settee"),
+            "remote control": ("remote", "tv controller"),
+        }

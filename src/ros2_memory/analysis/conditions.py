@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
+from ros2_memory.messages.detections import without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -201,13 +202,33 @@ Test: TypeAlias = Contains | Equals | Beyond | NearPosition
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A test, and the dot-path of the part of the value that it is applied to (None: all of it)."""
+    """A test, and the dot-path of the part of the value that it is applied to (None: all of it).
+
+    Where `min_score` is above 0, detections of a lower score do not count.
+    """
 
     test: Test
     field: str | None = None
+    min_score: float = 0.0
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether the value, or any target of the field in it, passes the test."""
+        if not self._passes(value):
+            return False
+        # Both have to pass, since a zone map bounds the whole value alone.
+        counted = self.counted(value)
+        return counted is value or self._passes(counted)
+
+    def counted(self, value: JsonValue) -> JsonValue:
+        """Returns what of a value counts; see `without_low_scores`.
+
+        A limit is met by its float32 rounding, too, which is what most detectors store.
+        """
+        if self.min_score <= 0:
+            return value
+        return without_low_scores(value, min(self.min_score, _float32(self.min_score)))
+
+    def _passes(self, value: JsonValue) -> bool:
         if self.field is None:
             return self.test.matches(value)
         return any(self._meets(target) for target in at_field(value, self.field))
@@ -261,7 +282,11 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
 
 
 def parse_condition(
-    condition_type: str, value: JsonValue, tolerance_m: float, field: str | None = None
+    condition_type: str,
+    value: JsonValue,
+    tolerance_m: float,
+    field: str | None = None,
+    min_score: float = 0.0,
 ) -> Condition:
     """Returns the condition that a planner's arguments describe.
 
@@ -272,6 +297,7 @@ def parse_condition(
         tolerance_m: how near `near_position` is.
         field: dot-path in the value that narrows the test; None or blank for all of it. `above`
             and `below` need one: most messages have numbers of many kinds.
+        min_score: detections of a lower score do not count.
 
     Raises:
         InvalidArgumentsError: the sentence says what is wrong and gives an example.
@@ -283,7 +309,7 @@ def parse_condition(
             f"'{condition_type}' needs field, the dot-path of the number that is meant;"
             f" for example {_EXAMPLES[condition_type]}"
         )
-    return Condition(test, path)
+    return Condition(test, path, min_score)
 
 
 def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:

@@ -12,7 +12,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
@@ -36,7 +36,7 @@ class QuerySettings:
     """The part of the configuration that queries need.
 
     Units are the last word of each name. `kept` is how much the recorder keeps; None where nothing
-    is recorded, and nothing deleted.
+    is recorded, and nothing deleted. `labels` has other spellings by the name that is to be shown.
     """
 
     position_tolerance_m: float = 0.5
@@ -52,6 +52,8 @@ class QuerySettings:
     include_active: bool = False
     kept: RetentionLimits | None = None
     latching: Latching = field(default_factory=lambda: Latching(("/tf_static",)))
+    min_score: float = 0.0
+    labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 class SnapshotSource(Protocol):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.analysis.conditions import refusal_for
+from ros2_memory.analysis.conditions import parse_condition, refusal_for
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
@@ -26,11 +26,36 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
+
+
+def condition_of(
+    settings: QuerySettings,
+    condition_type: str,
+    value: JsonValue,
+    field: str | None,
+    min_score: float | None,
+) -> Condition:
+    """Returns the condition of a question; without a `min_score` of its own the configured one.
+
+    Raises:
+        InvalidArgumentsError: it is no condition.
+    """
+    least = settings.min_score if min_score is None else min_score
+    return parse_condition(condition_type, value, settings.position_tolerance_m, field, least)
+
+
+def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
+    """Returns the note on a limit of scores that the question does not have, for "never"."""
+    if min_score is not None or not condition.min_score:
+        return ()
+    least = f"{condition.min_score:g}"
+    return (f"detections with a score below {least} do not count here, unless min_score is given",)
 
 
 class ReverseSearch:

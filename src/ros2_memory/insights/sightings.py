@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.conditions import NearPosition, matched_texts, parse_condition
+from ros2_memory.analysis.conditions import NearPosition, matched_texts
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -31,7 +31,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics
-from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
 from ros2_memory.history.silences import describe_silences
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, last_window, ns_argument, open_view
@@ -85,12 +85,14 @@ def find_matches(
     last_s: float | None = None,
     limit: int = 5,
     oldest_first: bool = False,
+    min_score: float | None = None,
 ) -> Sightings:
     """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
 
     `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound what is
     searched. With `oldest_first` all of it is searched, and the oldest sightings are returned. A
-    sighting has the `fields` (dot-paths) of its last message.
+    sighting has the `fields` (dot-paths) of its last message. Detections of a score below
+    `min_score` do not count.
 
     Raises:
         InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or no
@@ -98,7 +100,7 @@ def find_matches(
         NoDataError: the memory holds nothing, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
-    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    condition = condition_of(memory.limits, condition_type, value, field, min_score)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(_window(span, wall).stop, wall))
@@ -116,7 +118,8 @@ def find_matches(
         found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)
     if not found:
-        for sentence in describe_silences(view, matching_topics(view, topic), searched):
+        silences = describe_silences(view, matching_topics(view, topic), searched)
+        for sentence in (*silences, *unasked_limit(condition, min_score)):
             view.notes.add(sentence)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
@@ -320,9 +323,9 @@ def _sighting(view: View, condition: Condition, matches: _Matches) -> Sighting:
     """Returns the result, with where the robot and the thing were at the newest match."""
     newest = matches.newest
     message = view.memory.reader.decode(newest.record)
-    value = view.memory.extractor.exact(message, newest.record.channel.type)
+    value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
     robot = _robot(view, newest)
-    things = detections_of(value, view.memory.extractor.frame(message))
+    thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
     return Sighting(
         topic=newest.record.channel.topic,
         first=matches.first,
@@ -330,8 +333,9 @@ def _sighting(view: View, condition: Condition, matches: _Matches) -> Sighting:
         messages=matches.messages,
         begun=matches.begun,
         robot=robot,
-        thing=_spot(view, _matching(things, condition), newest, robot),
+        thing=_spot(view, thing, newest, robot),
         matched=matched_texts(condition, value),
+        score=None if thing is None else thing.score,
     )
 
 
@@ -401,7 +405,10 @@ def _spot(
 
 
 def _matching(detections: Sequence[Detection], condition: Condition) -> Detection | None:
-    """Returns the detection that a condition is about: by label or place, or the only one."""
+    """Returns the detection that a condition is about: by label or place, or the only one.
+
+    Of several it is one with a place, and of these the one with the best score.
+    """
     test = condition.test
     if isinstance(test, NearPosition):
         about = [
@@ -411,4 +418,8 @@ def _matching(detections: Sequence[Detection], condition: Condition) -> Detectio
         about = [each for each in detections if test.matches(each.label)]
     if not about and len(detections) == 1:
         about = list(detections)
-    return max(about, key=lambda thing: thing.place is not None, default=None)
+    return max(about, key=_rank, default=None)
+
+
+def _rank(detection: Detection) -> tuple[bool, float]:
+    return detection.place is not None, -math.inf if detection.score is None else detection.score

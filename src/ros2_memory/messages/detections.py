@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.messages.conversions import triple, xyz
@@ -52,6 +53,16 @@ def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]
     return tuple(_detections(value, frame_id, _MAX_DEPTH))
 
 
+def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
+    """Returns an extracted value without the detections whose score is below a limit.
+
+    Null takes their place, so that the others keep theirs; in a detection with several hypotheses
+    also the place of each that scores less. What has no score stays. A value without any such
+    detection is returned as it is.
+    """
+    return _without(value, min_score, _MAX_DEPTH)
+
+
 def depends_on_numbers(value: JsonValue) -> bool:
     """Returns whether other scores in the same message could change the detections' names."""
     if isinstance(value, list):
@@ -82,6 +93,50 @@ def _detections(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detecti
             if name in LISTS and isinstance(inner, list):
                 yield from (Detection(each) for each in inner if isinstance(each, str) and each)
             yield from _detections(inner, frame, depth - 1)
+
+
+def _without(value: JsonValue, least: float, depth: int) -> JsonValue:
+    # It goes where `_detections` goes.
+    if depth == 0:
+        return value
+    if isinstance(value, str):
+        parsed = _from_json(value)
+        kept = _without(parsed, least, depth - 1)
+        return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
+    if isinstance(value, list):
+        parts = [
+            _without(each, least, depth - 1) if isinstance(each, dict) else each for each in value
+        ]
+        return value if all(map(is_, parts, value)) else parts
+    return _without_in_object(value, least, depth) if isinstance(value, dict) else value
+
+
+def _without_in_object(value: dict[str, JsonValue], least: float, depth: int) -> JsonValue:
+    if _label(value) is not None:
+        return None if _is_below(value, least) else value
+    best = _best_result(value.get("results"))
+    if best is not None and _label(_hypothesis(best)) is not None:
+        return _without_hypotheses(value, best, least)
+    fields = {name: _without(inner, least, depth - 1) for name, inner in value.items()}
+    return value if all(map(is_, fields.values(), value.values())) else fields
+
+
+def _without_hypotheses(
+    value: dict[str, JsonValue], best: dict[str, JsonValue], least: float
+) -> JsonValue:
+    if _is_below(_hypothesis(best), least):
+        return None
+    results = value["results"]
+    kept: list[JsonValue] = [
+        None if isinstance(each, dict) and _is_below(_hypothesis(each), least) else each
+        for each in (results if isinstance(results, list) else ())
+    ]
+    return {**value, "results": kept} if None in kept else value
+
+
+def _is_below(value: dict[str, JsonValue], least: float) -> bool:
+    score = _score(value)
+    return score is not None and score < least
 
 
 def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:

@@ -142,6 +142,7 @@ def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> Js
 
 _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
 _Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+_Score: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _Time: TypeAlias = Annotated[
@@ -312,6 +313,7 @@ class ConditionArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
+    min_score: _Score | None = None
 
 
 class LastMatchArguments(ConditionArguments):
@@ -331,6 +333,7 @@ class ValueWhenArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
+    min_score: _Score | None = None
     fields: _Fields = ()
     before_s: _Time | None = Field(default=None, alias="before", description="Nothing after.")
 

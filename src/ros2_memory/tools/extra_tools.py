@@ -25,7 +25,7 @@ _SIGHTINGS = ToolDeclaration(
     "When, where, how often and how long a condition (as in find_last_match) held, newest first; "
     "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: where it "
-    "was then, place: of the thing}}], total}}.",
+    "was then, place: of the thing, score}}], total}}.",
     MatchesArguments,
     find_matches,
     blocking=True,

@@ -252,6 +252,8 @@ def _sighting(sighting: results.Sighting, now: Ns, local: LocalTimes) -> JsonObj
     if sighting.thing is not None:
         spot = sighting.thing
         reply["place"] = {**metres(spot.position), "frame_id": spot.frame_id or None}
+    if sighting.score is not None:
+        reply["score"] = rounded(sighting.score, 3)
     return with_notes(reply, (), began_earlier=not sighting.begun)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import TYPE_CHECKING
 
@@ -41,7 +42,16 @@ places = st.builds(
     st.floats(-5, 5),
     st.dictionaries(st.just("z"), st.floats(), max_size=1),
 )
-values = st.one_of(json_values, st.lists(st.one_of(texts, places, json_values), max_size=4))
+seen = st.fixed_dictionaries(
+    {"label": texts, "score": st.sampled_from([0.4, 0.5, None])},
+    optional={"position": json_values, "x": json_values},
+)
+values = st.one_of(
+    json_values,
+    st.lists(st.one_of(texts, places, json_values), max_size=4),
+    st.lists(st.one_of(seen, places), max_size=4),
+    st.lists(seen, max_size=2).map(json.dumps),
+)
 conditions = st.builds(
     Condition,
     st.one_of(
@@ -57,6 +67,7 @@ conditions = st.builds(
         ),
     ),
     st.sampled_from([None, "x", "position", "label", "velocity", "0", "position.x"]),
+    st.sampled_from([0.0, 0.0, 0.5]),
 )
 
 

@@ -106,6 +106,11 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
                     partial(_match, topic, kind, wanted, field, before),
                 )
         yield f"all {topic} {kind} {wanted}", partial(_matches, topic, kind, wanted, before)
+    for topic, label in (("/vision/*", "cup"), ("/*", "person")):
+        yield (
+            f"sure {topic} {label}",
+            partial(_matches, topic, "contains", label, None, min_score=0.4),
+        )
     yield "odom when", partial(_when, "/chatter")
 
 
@@ -158,9 +163,16 @@ def _match(
 
 
 def _matches(
-    topic: str, kind: str, wanted: JsonValue, end: float | None, memory: Memory, call: Call
+    topic: str,
+    kind: str,
+    wanted: JsonValue,
+    end: float | None,
+    memory: Memory,
+    call: Call,
+    *,
+    min_score: float | None = None,
 ) -> object:
-    return find_matches(memory, call, topic, kind, wanted, end_s=end, limit=3)
+    return find_matches(memory, call, topic, kind, wanted, end_s=end, limit=3, min_score=min_score)
 
 
 def _when(topic: str, memory: Memory, call: Call) -> object:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory import queries
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -28,7 +29,7 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import boolean, detections, odom, tf, transform, write_mcap
+from tests.support.bags import boolean, detections, odom, text, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.memories import asked, memory_of, recalling
@@ -105,6 +106,53 @@ def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
 def seconds(memory: Memory, value: str, topic: str, **given: object) -> list[tuple[float, float]]:
     answer = find_matches(memory, Call(), topic, "contains", value, **given)  # type: ignore[arg-type]
     return [((each.first - BEGIN) / S, (each.last - BEGIN) / S) for each in answer.sightings]
+
+
+@each_way
+def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
+    tmp_path: Path, recalls: bool
+) -> None:
+    scores = (0.9, 0.9, 0.4, 0.4, 0.9, 0.3)
+    write_mcap(
+        tmp_path / "bag.mcap",
+        [detections(BEGIN + at * S, ["cup"], score=score) for at, score in enumerate(scores)],
+    )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(memory, tmp_path)
+    assert seconds(memory, "cup", OBJECTS) == [(0, 5)]
+    assert seconds(memory, "cup", OBJECTS, min_score=0.4) == [(0, 4)]
+    assert seconds(memory, "cup", OBJECTS, min_score=0.9) == [(4, 4), (0, 1)]
+    assert seconds(memory, "cup", OBJECTS, min_score=0.95) == []
+    strict = replace(memory, limits=replace(memory.limits, min_score=0.5))
+    assert seconds(strict, "cup", OBJECTS) == [(4, 4), (0, 1)]
+    assert seconds(strict, "cup", OBJECTS, min_score=0) == [(0, 5)]
+    found = queries.find_last_match(strict, Call(), OBJECTS, "contains", "cup").found
+    assert found is not None
+    assert found.sample.time == BEGIN + 4 * S
+    [unsure] = find_matches(memory, Call(), OBJECTS, "contains", "cup").sightings
+    assert unsure.score == pytest.approx(0.3)
+
+
+def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["cup"], score=0.2)])
+    memory = memory_of(tmp_path, limits=QuerySettings(min_score=0.5))
+    note = "detections with a score below 0.5 do not count here, unless min_score is given"
+    asked = (memory, Call(), OBJECTS, "contains", "cup")
+    assert find_matches(*asked).notes == (note,)
+    assert find_matches(*asked, min_score=0.5).notes == ()
+    assert note in queries.find_last_match(*asked).notes
+
+
+def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Path) -> None:
+    def seen(label: str, score: float, x: float) -> dict[str, JsonValue]:
+        return {"label": label, "score": score, "position": {"x": x, "y": 1.0, "z": 0.0}}
+
+    things = [seen("headphones", 0.4, 1.0), seen("phone", 0.8, 2.0), seen("mug", 0.9, 3.0)]
+    write_mcap(tmp_path / "bag.mcap", [text(BEGIN, json.dumps(things), topic="/seen")])
+    [sighting] = find_matches(memory_of(tmp_path), Call(), "/seen", "contains", "phone").sightings
+    assert sighting.thing is not None
+    assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
 
 def test_a_message_without_the_thing_ends_a_sighting(tmp_path: Path) -> None:

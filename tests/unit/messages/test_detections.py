@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import json
+import math
+
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.core.model import JsonValue
-from ros2_memory.messages.detections import Detection, detections_of
+from ros2_memory.messages.detections import Detection, detections_of, without_low_scores
 from tests.support.strategies import json_values
 
 
@@ -84,6 +88,69 @@ def test_a_score_is_a_number_under_one_of_its_names(
     said: dict[str, JsonValue], score: float | None
 ) -> None:
     assert detections_of([{"label": "cup", **said}]) == (Detection("cup", score=score),)
+
+
+SCORED: JsonValue = {
+    "detections": [
+        {"label": "cup", "score": 0.4},
+        {"label": "fork", "score": 0.5},
+        {"label": "table"},
+        {
+            "results": [
+                {"hypothesis": {"class_id": "mug", "score": 0.2}},
+                {"hypothesis": {"class_id": "vase", "score": 0.6}},
+            ]
+        },
+        {"results": [{"class_id": "bowl", "score": 0.4}]},
+    ],
+    "labels": ["lamp"],
+    "score": 0.1,
+}
+
+
+def test_detections_of_a_low_score_leave_their_places_empty() -> None:
+    assert without_low_scores(SCORED, 0.5) == {
+        "detections": [
+            None,
+            {"label": "fork", "score": 0.5},
+            {"label": "table"},
+            {"results": [None, {"hypothesis": {"class_id": "vase", "score": 0.6}}]},
+            None,
+        ],
+        "labels": ["lamp"],
+        "score": 0.1,
+    }
+    assert without_low_scores(SCORED, 0.1) is SCORED
+    assert without_low_scores({"class": "cup", "score": 0.4}, 0.5) is None
+
+
+def test_detections_of_a_low_score_are_left_out_of_json_in_a_text() -> None:
+    text = '[{"label": "cup", "score": 0.4}, {"label": "f\u00fcrk"}]'
+    assert without_low_scores({"data": text}, 0.3) == {"data": text}
+    kept = without_low_scores({"data": text}, 0.5)
+    assert detections_of(kept) == (Detection("f\u00fcrk"),)
+
+
+_scores = st.none() | st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, math.nan])
+_named = st.fixed_dictionaries({"label": st.sampled_from(["cup", "fork"]), "score": _scores})
+_several = st.builds(lambda parts: {"results": [*parts]}, st.lists(_named, max_size=3))
+_seen = st.recursive(
+    _named | _several | json_values,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["x", "labels", "results"]), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@given(_seen, st.sampled_from([0.25, 0.5, 0.75]))
+def test_what_is_left_are_the_detections_that_do_not_score_less(
+    value: JsonValue, least: float
+) -> None:
+    for each in (value, json.dumps(value)):
+        enough = [one for one in detections_of(each) if one.score is None or one.score >= least]
+        assert [*detections_of(without_low_scores(each, least))] == enough
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,16 @@ BLOCKING = {
 OPTIONAL = {
     "remember_moment": {"seconds_before", "seconds_after"},
     "visits": {"frame_id", "radius_m", "limit"},
-    "find_matches": {"field", "fields", "seconds", "start", "end", "oldest_first", "limit"},
+    "find_matches": {
+        "field",
+        "min_score",
+        "fields",
+        "seconds",
+        "start",
+        "end",
+        "oldest_first",
+        "limit",
+    },
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
@@ -75,8 +84,8 @@ OPTIONAL = {
     "get_velocity_at": {"timestamps", "topic", "tolerance_s"},
     "get_transform_at": {"timestamps"},
     "get_velocity_seconds_ago": {"topic", "tolerance_s"},
-    "find_last_match": {"field", "fields", "before"},
-    "get_value_when": {"field", "fields", "before"},
+    "find_last_match": {"field", "min_score", "fields", "before"},
+    "get_value_when": {"field", "min_score", "fields", "before"},
     "trajectory_summary": {"topic", "max_waypoints"},
     "recent_trajectory_summary": {"topic", "max_waypoints"},
 }
