@@ -30,6 +30,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     by_remark,
     describe_misdated,
@@ -352,6 +353,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
         view.notes.add(sentence)
     undecodable = undecodable_topics(view)
+    steps = clock_steps(view)
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
@@ -367,6 +369,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
         silences=tuple(silences_of(snapshot, memory.limits.latching)),
+        clock_steps=steps,
     )
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
+    from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.silences import Silence
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.analysis.transform_tree import FrameEdge
@@ -86,6 +87,7 @@ class DataTimeRange(AnswerWithNotes):
     undecodable: tuple[Undecodable, ...] = ()
     clock_faults: tuple[SetAside, ...] = ()
     silences: tuple[Silence, ...] = ()
+    clock_steps: tuple[ClockStep, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,6 +369,7 @@ class Status(AnswerWithNotes):
         never_heard: topics it subscribed to that brought no message.
         fell_silent: topics that brought some, and none lately.
         silences: when topics with a usual rate were silent although the robot was on.
+        clock_steps: when the clock was set by 2 s or more.
         damaged: files that cannot be read.
         incomplete: bags that a crash left open.
         unread: files of a kind that is not read here.
@@ -389,6 +392,7 @@ class Status(AnswerWithNotes):
     budget: Budget
     problems: tuple[str, ...]
     silences: tuple[Silence, ...] = ()
+    clock_steps: tuple[ClockStep, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

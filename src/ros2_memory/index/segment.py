@@ -15,6 +15,7 @@ import numpy as np
 from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.index.holes import between, stretched
 from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.index.holes import Rates, SuspectedHole
     from ros2_memory.index.split_order import Series, SplitRange
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -112,6 +114,7 @@ class Segment:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
+        self._suspected: tuple[Rates, tuple[SuspectedHole, ...]] | None = None
 
     @cached_property
     def latest(self) -> Ns:
@@ -276,6 +279,14 @@ class Segment:
     def together(self) -> frozenset[frozenset[str]]:
         """Which topics the bags hold together, each combination once."""
         return frozenset(frozenset(schema.positions) for schema in self._schemas)
+
+    def suspected_holes(self, rates: Rates) -> tuple[SuspectedHole, ...]:
+        """Returns where no topic may have a message, by the usual rates of some topics."""
+        known = self._suspected
+        if known is None or known[0] != rates:
+            known = rates, (*stretched(self.bags, rates), *between(self.bags))
+            self._suspected = known
+        return known[1]
 
     @cached_property
     def silent(self) -> frozenset[str]:

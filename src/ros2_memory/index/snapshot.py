@@ -11,6 +11,7 @@ from ros2_memory.analysis.silences import joined, silences
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
+from ros2_memory.index.holes import between, rates_of
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
+    from ros2_memory.index.holes import SuspectedHole
 
 _MAX_PLACED: Final = 500
 
@@ -99,29 +101,39 @@ class Snapshot:
         return check_dates(self.timeline, [*between, *steps], self.scanned_at)
 
     @cached_property
-    def silences(self) -> tuple[Silence, ...]:
-        """Where topics with a usual rate were silent, in order of time; see `analysis.silences`.
+    def _dated(self) -> Sequence[Segment]:
+        """The bags that a correct clock dated, without that of carried messages, in order."""
+        parts = self.timeline.recorded_segments
+        misdated = self.dating.misdated
+        if not misdated:
+            return parts
+        dated = ([bag for bag in each.bags if bag.file not in misdated] for each in parts)
+        return [Segment(bags) for bags in dated if bags]
 
-        Logs have no usual rate. Bags that a wrong clock dated do not count.
-        """
-        parts = [*self.timeline.recorded_segments]
-        if misdated := self.dating.misdated:
-            dated = ([bag for bag in each.bags if bag.file not in misdated] for each in parts)
-            parts = [Segment(bags) for bags in dated if bags]
-        presences: dict[str, list[Presence]] = {}
-        for part in parts:
+    @cached_property
+    def _presences(self) -> dict[str, Presence]:
+        """When bags hold each topic; not of logs, whose lines come when something happens."""
+        found: dict[str, list[Presence]] = {}
+        for part in self._dated:
             for topic, presence in part.presences.items():
-                presences.setdefault(topic, []).append(presence)
-        return tuple(
-            silences(
-                {
-                    topic: joined(each)
-                    for topic, each in presences.items()
-                    if not self.timeline.is_log(topic)
-                },
-                frozenset(chain.from_iterable(part.together for part in parts)),
-            )
-        )
+                found.setdefault(topic, []).append(presence)
+        is_log = self.timeline.is_log
+        return {topic: joined(each) for topic, each in found.items() if not is_log(topic)}
+
+    @cached_property
+    def silences(self) -> tuple[Silence, ...]:
+        """Where topics with a usual rate were silent, in order of time; see `analysis.silences`."""
+        together = frozenset(chain.from_iterable(part.together for part in self._dated))
+        return tuple(silences(self._presences, together))
+
+    @cached_property
+    def suspected_holes(self) -> tuple[SuspectedHole, ...]:
+        """Where no topic may have a message although a recorder ran, in order of time."""
+        rates = rates_of(self._presences)
+        found = [each for part in self._dated for each in part.suspected_holes(rates)]
+        ends = [bag for part in self._dated for bag in (part.bags[0], part.bags[-1])]
+        found += between(ends)
+        return tuple(sorted(set(found), key=lambda each: (each.first, each.last)))
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:

@@ -45,10 +45,11 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_groups import DigestKind, Fold
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.silences import grouped, silences_in
 from ros2_memory.history.view import open_span
@@ -77,6 +78,7 @@ _STANDSTILLS_UNKNOWN: Final = (
 )
 _PLURALS: Final = {
     "gap": "gaps",
+    "clock step": "clock steps",
     "silence": "silences",
     "error": "errors",
     "stop": "stops",
@@ -141,7 +143,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         Event("gap", begin, until, "nothing was recorded")
         for begin, until in recording_gaps(view, window)
     ]
-    events += _silences(view, window)
+    events += [*_clock_steps(view, window), *_silences(view, window)]
     note_unread(view, window)
     note_edges(view, window)
     counts = Counter(each.kind for each in events)
@@ -256,6 +258,13 @@ def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:
         end = until.get(toggle.path)
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
         until[toggle.path] = toggle.time
+
+
+def _clock_steps(view: View, window: TimeWindow) -> Iterator[Event]:
+    """Yields when the clock was set."""
+    for at, by in clock_steps(view, window):
+        how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
+        yield Event("clock step", at, None, f"the clock was set {how}")
 
 
 def _silences(view: View, window: TimeWindow) -> Iterator[Event]:

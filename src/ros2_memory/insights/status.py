@@ -8,6 +8,7 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.silences import silences_of
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
@@ -52,6 +53,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         never_heard=() if heartbeat is None else heartbeat.silent,
         fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
         silences=tuple(silences_of(snapshot, memory.limits.latching)),
+        clock_steps=clock_steps(view),
         damaged=len(snapshot.damaged),
         incomplete=snapshot.timeline.disk_use[1],
         unread=len(snapshot.unread),

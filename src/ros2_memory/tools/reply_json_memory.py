@@ -13,6 +13,7 @@ from ros2_memory.tools.reply_json import LocalTimes, moment, render, seconds, wi
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.silences import Silence
     from ros2_memory.bag_dir.moment_file import SaveRequest, StoredMoment
     from ros2_memory.core.model import JsonValue, SetAside
@@ -39,6 +40,7 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
     lists: dict[str, list[JsonValue]] = {
         "gaps": gaps,
         "silences": [_silence(each, local) for each in answer.silences],
+        "clock_steps": [_clock_step(each, local) for each in answer.clock_steps],
         "active": _files(answer.active, bag_dir),
         "damaged": _files(answer.damaged, bag_dir),
         "incomplete": _files(answer.incomplete, bag_dir),
@@ -78,6 +80,11 @@ def _silence(silence: Silence, local: LocalTimes) -> JsonObject:
     }
 
 
+def _clock_step(step: ClockStep, local: LocalTimes) -> JsonObject:
+    """Returns a step of the clock; `step_s` is negative where it was set back."""
+    return {"at": unix_rounded_up(step.at), "step_s": seconds(step.by), **local.of(step.at)}
+
+
 def _local(at: Ns | None) -> str | None:
     return None if at is None else iso_local(at)
 
@@ -107,6 +114,7 @@ def _status(answer: results.Status) -> JsonObject:
             for each in answer.fell_silent
         ],
         "silences": [_silence(each, local) for each in reversed(answer.silences)],
+        "clock_steps": [_clock_step(each, local) for each in reversed(answer.clock_steps)],
         "never_heard": [*answer.never_heard],
         "missing": [*answer.missing],
     }

@@ -105,7 +105,7 @@ _DECLARATIONS = (
     ToolDeclaration(
         (ToolName("data_time_range", "Span of the memory"),),
         "What time span the memory covers, with its holes, and what time it is now. "
-        "Reply: {{earliest, latest, now, bags, gaps, silences, damaged, clock_faults, ...}}, times "
+        "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, times "
         "in Unix s and local ISO, null while the memory is empty.",
         NoArguments,
         queries.data_time_range,

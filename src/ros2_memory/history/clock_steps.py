@@ -1,0 +1,93 @@
+"""When the clock that dates messages was set, by what bags show."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.analysis.bulk_decode import motion_decoder
+from ros2_memory.analysis.clock_steps import (
+    BESIDE_NS,
+    SHORTEST_STEP_NS,
+    ClockStep,
+    holes,
+    step_over,
+)
+from ros2_memory.analysis.odometry import TimedPosition, is_place
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.driven_path import add_poses
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.index.clock_faults import FaultyClock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.core.model import Pose
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.view import View
+    from ros2_memory.index.holes import SuspectedHole
+
+_MOST_SUSPECTS: Final = 32
+"""The newest suspected holes are looked at; each costs some milliseconds."""
+_MOST_TOPICS: Final = 32
+
+
+def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep, ...]:
+    """Returns when the clock was set by 2 s or more (in a window), in order of time.
+
+    Back by the order of log times, forward where the robot drove through the step.
+    """
+    window = TimeWindow.everything() if window is None else window
+    steps = [
+        ClockStep(fault.bag.start, -fault.by)
+        for fault in view.snapshot.dating.faults
+        if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
+    ]
+    suspects = [
+        each for each in view.snapshot.suspected_holes if window.overlaps(each.first, each.last)
+    ]
+    if suspects:
+        try:
+            topic = resolve_pose_topic(view)
+        except NoDataError:
+            suspects = []
+        for suspect in suspects[-_MOST_SUSPECTS:]:
+            steps += _steps_in(view, topic, suspect)
+    return tuple(sorted(each for each in steps if window.contains(each.at)))
+
+
+def _steps_in(view: View, topic: str, suspect: SuspectedHole) -> Iterator[ClockStep]:
+    for hole in _holes_in(view, suspect):
+        step = step_over(
+            hole,
+            _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
+            _poses(view, topic, TimeWindow(hole[1], hole[1] + BESIDE_NS)),
+        )
+        if step is not None:
+            yield step
+
+
+def _holes_in(view: View, suspect: SuspectedHole) -> list[tuple[Ns, Ns]]:
+    bag = suspect.bag
+    if bag is None:
+        return [(suspect.first, suspect.last)]
+    busiest = sorted(bag.summary.topics, key=lambda each: (-each.count, each.topic))
+    names = dict.fromkeys(each.topic for each in busiest[:_MOST_TOPICS])
+    window = TimeWindow.everything()
+    return holes(at for name in names for at in view.bags.log_times(bag, name, window))
+
+
+def _poses(view: View, topic: str, window: TimeWindow) -> list[TimedPosition]:
+    poses: list[TimedPosition] = []
+    failures: list[UndecodableError] = []
+
+    def add(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
+        if is_place(pose.position):
+            poses.append(TimedPosition(time, pose.position))
+
+    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
+    try:
+        add_poses(view, add, decoder, view.stream.messages([topic], window), failures)
+    except InvalidArgumentsError:
+        return []
+    return poses
