@@ -8,7 +8,7 @@ only. `now` is what ages count from.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
@@ -279,11 +279,43 @@ class Sightings(AnswerWithNotes):
     now: Ns
 
 
+class PastChange(NamedTuple):
+    """Something that changed, and how long before another event."""
+
+    text: str
+    before: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class Before(AnswerWithNotes):
+    """What changed before a moment.
+
+    Attributes:
+        at: the moment.
+        length: how long before it changes count.
+        changes: nearest first.
+        more: how many others there are.
+        recorded: the topics on which a change would show, as far as they are recorded at the time.
+        robot: where the robot was; None where that is not known.
+        speed_mps: what its pose topic states.
+        state: booleans, statuses that are not ok and the goal of each action, as of the moment.
+    """
+
+    at: Ns
+    length: Ns
+    changes: tuple[PastChange, ...]
+    more: int
+    recorded: tuple[str, ...]
+    robot: Pose | None
+    speed_mps: float | None
+    state: tuple[tuple[str, bool | str], ...]
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
     """Something that happened at `start`, and went on until `end` where it took time.
 
-    With `goes_on`, `end` is only as far as is known.
+    With `goes_on`, `end` is only as far as is known. `before`: what changed before, nearest first.
     """
 
     kind: str
@@ -291,6 +323,7 @@ class Event:
     end: Ns | None
     text: str
     goes_on: bool = False
+    before: tuple[PastChange, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

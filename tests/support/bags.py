@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Mapping
     from pathlib import Path
 
     from rosbags.typesys.store import Typestore
@@ -301,6 +301,79 @@ def text(ns: int, data: str, topic: str = "/chatter") -> Msg:
 
 def boolean(ns: int, data: bool, topic: str = "/bumper") -> Msg:
     return Msg(topic, "std_msgs/msg/Bool", ns, make("std_msgs/msg/Bool", data=data))
+
+
+def log_entry(ns: int, level: int, name: str, message: str) -> Msg:
+    """An entry of /rosout: 20 INFO, 30 WARN, 40 ERROR."""
+    body = make(
+        "rcl_interfaces/msg/Log",
+        stamp=stamp(ns),
+        level=level,
+        name=name,
+        msg=message,
+        file="",
+        function="",
+        line=0,
+    )
+    return Msg("/rosout", "rcl_interfaces/msg/Log", ns, body)
+
+
+def diagnostics(ns: int, **levels: tuple[int, str]) -> Msg:
+    """A DiagnosticArray with a level and a message for each name."""
+    statuses = [
+        make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=level,
+            name=name,
+            message=message,
+            hardware_id="",
+            values=[],
+        )
+        for name, (level, message) in levels.items()
+    ]
+    body = make("diagnostic_msgs/msg/DiagnosticArray", header=header(ns, ""), status=statuses)
+    return Msg("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", ns, body)
+
+
+def goals(ns: int, statuses: Mapping[int, int], topic: str = "/drive/_action/status") -> Msg:
+    """A GoalStatusArray with the status of each goal: 2 executing, 4 succeeded, 6 aborted."""
+    listed = []
+    for number, status in statuses.items():
+        uuid = np.array([0] * 15 + [number], dtype=np.uint8)
+        goal_id = make("unique_identifier_msgs/msg/UUID", uuid=uuid)
+        info = make("action_msgs/msg/GoalInfo", goal_id=goal_id, stamp=stamp(ns))
+        listed.append(make("action_msgs/msg/GoalStatus", goal_info=info, status=status))
+    body = make("action_msgs/msg/GoalStatusArray", status_list=listed)
+    return Msg(topic, "action_msgs/msg/GoalStatusArray", ns, body)
+
+
+def battery(ns: int, percentage: float) -> Msg:
+    """A BatteryState that discharges; `percentage` is a fraction, as the message has it."""
+    body = make(
+        "sensor_msgs/msg/BatteryState",
+        header=header(ns, ""),
+        voltage=12.0,
+        temperature=math.nan,
+        current=-1.0,
+        charge=math.nan,
+        capacity=math.nan,
+        design_capacity=math.nan,
+        percentage=percentage,
+        power_supply_status=2,
+        power_supply_health=0,
+        power_supply_technology=0,
+        present=True,
+        cell_voltage=np.array([], dtype=np.float32),
+        cell_temperature=np.array([], dtype=np.float32),
+        location="",
+        serial_number="",
+    )
+    return Msg("/battery_state", "sensor_msgs/msg/BatteryState", ns, body)
+
+
+def command(ns: int, vx: float, wz: float = 0.0, topic: str = "/cmd_vel") -> Msg:
+    """A commanded velocity."""
+    return Msg(topic, "geometry_msgs/msg/Twist", ns, twist(vx, wz))
 
 
 def detections(

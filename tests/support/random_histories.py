@@ -16,8 +16,13 @@ from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from tests.support.bags import (
     McapLayout,
     Msg,
+    battery,
     boolean,
+    command,
     detections,
+    diagnostics,
+    goals,
+    log_entry,
     odom,
     text,
     tf,
@@ -62,7 +67,7 @@ class _Robot:
 
     def _message(self, at: int) -> Msg:  # noqa: PLR0911 - one for each kind
         draw = self.draw
-        kind = draw.randrange(12)
+        kind = draw.randrange(14)
         x = draw.choice([draw.uniform(-2, 2), draw.uniform(-2, 2), math.nan, 80.0])
         if kind < 4:
             return odom(at, x, draw.uniform(-1, 1), draw.uniform(-3, 3), vx=draw.choice([0.0, 0.4]))
@@ -89,10 +94,28 @@ class _Robot:
         if kind == 9:
             body = draw.choice([text(at, "cup"), boolean(at, True)])
             return replace(body, topic="/mixed")
+        if kind > 11:
+            return _state(at, draw)
         if kind == 10 and draw.random() < 0.3:
             broken = b"\x00\x01\x00\x00\xff\xff\xff\x7f"
             return Msg("/chatter", "std_msgs/msg/String", at, broken)
         return text(at, draw.choice(WORDS), "/chatter")
+
+
+def _state(at: int, draw: Random) -> Msg:
+    """What explains why a robot stopped."""
+    kind = draw.randrange(5)
+    if kind == 0:
+        return log_entry(at, draw.choice([20, 30, 40]), "planner", draw.choice(["no way", "9 s"]))
+    if kind == 1:
+        names = draw.sample(["motor", "camera"], draw.randint(1, 2))
+        return diagnostics(at, **{name: (draw.randrange(3), "hot") for name in names})
+    if kind == 2:
+        numbers = draw.sample([1, 2, 3], draw.randint(0, 2))
+        return goals(at, {number: draw.choice([1, 2, 4, 6]) for number in numbers})
+    if kind == 3:
+        return battery(at, draw.choice([math.nan, 0.9, 0.15, 0.04]))
+    return command(at, draw.choice([0.0, 0.3]), draw.choice([0.0, -0.0, 0.5]))
 
 
 def write_history(bag_dir: Path, draw: Random) -> Written:

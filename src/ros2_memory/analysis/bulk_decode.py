@@ -65,9 +65,11 @@ class PayloadTemplate:
     """What is common to all payloads of a template, and where the numbers are.
 
     Attributes:
+        type_name: of the messages.
         fixed: for each byte of the payload whether it is common to all.
         layout: where the numbers are.
         numbers: offsets of the numbers that are in the value unchanged.
+        names: the field of each of these.
         times: offsets of the times that are in it, in seconds.
         angles: whether angles in degrees are in it.
         points: the positions that `near_position` tests.
@@ -78,9 +80,11 @@ class PayloadTemplate:
         pairs: the frames of all transforms, valid or not.
     """
 
+    type_name: str
     fixed: np.ndarray[tuple[int], np.dtype[np.bool_]]
     layout: CdrLayout
     numbers: tuple[int, ...]
+    names: tuple[str, ...]
     times: tuple[int, ...]
     angles: bool
     points: tuple[PointOffsets, ...]
@@ -219,16 +223,16 @@ def template_for(
         _Marked(reader, extractor, record, layout, marks) for marks in (_FIRST_MARKS, _OTHER_MARKS)
     )
     try:
-        return _template(layout, one, other)
+        return _template(record.channel.type, layout, one, other)
     # Two values of different structure have leaves that do not pair, which zip reports.
     except (_NoTemplateError, ValueError):
         return None
 
 
-def _template(layout: CdrLayout, one: _Marked, other: _Marked) -> PayloadTemplate:
+def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -> PayloadTemplate:
     if depends_on_numbers(one.value):
         raise _NoTemplateError
-    numbers, times, angles = _numbers_in_value(one, other)
+    numbers, names, times, angles = _numbers_in_value(one, other)
     points, orientation = one.points(), one.orientation()
     if points != other.points() or orientation != other.orientation():
         raise _NoTemplateError
@@ -238,9 +242,11 @@ def _template(layout: CdrLayout, one: _Marked, other: _Marked) -> PayloadTemplat
     for offset in layout.singles:
         fixed[offset : offset + 4] = False
     return PayloadTemplate(
+        type_name=type_name,
         fixed=fixed,
         layout=layout,
         numbers=tuple(numbers),
+        names=tuple(names),
         times=tuple(times),
         angles=angles,
         points=points,
@@ -252,13 +258,14 @@ def _template(layout: CdrLayout, one: _Marked, other: _Marked) -> PayloadTemplat
     )
 
 
-def _numbers_in_value(one: _Marked, other: _Marked) -> tuple[list[int], list[int], bool]:
-    """Returns the offsets of the numbers and times in the value, and whether angles are in it.
+def _numbers_in_value(one: _Marked, other: _Marked) -> tuple[list[int], list[str], list[int], bool]:
+    """Returns offsets and fields of numbers, offsets of times, and whether there are angles.
 
     Raises:
         _NoTemplateError: something else differs.
     """
     numbers: list[int] = []
+    names: list[str] = []
     times: list[int] = []
     angles = False
     for (key, leaf), (_, again) in zip(_leaves(one.value), _leaves(other.value), strict=True):
@@ -267,13 +274,14 @@ def _numbers_in_value(one: _Marked, other: _Marked) -> tuple[list[int], list[int
                 raise _NoTemplateError
         elif leaf in one.offset_of and other.offset_of.get(again) == one.offset_of[leaf]:
             numbers.append(one.offset_of[leaf])
+            names.append(key)
         elif leaf in one.time_of and other.time_of.get(again) == one.time_of[leaf]:
             times.append(one.time_of[leaf])
         elif key in ANGLES:
             angles = True
         else:
             raise _NoTemplateError
-    return numbers, times, angles
+    return numbers, names, times, angles
 
 
 def _leaves(value: JsonValue, key: str = "") -> Iterator[tuple[str, JsonValue]]:

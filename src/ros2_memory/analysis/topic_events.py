@@ -1,5 +1,7 @@
 """Events on a topic: objects came into view and left, booleans toggled, errors were reported.
 
+What else changed, and only matters before another event, is in `state_changes`.
+
 Collected message by message or by whole bags; where a history is cut into bags changes nothing, as
 long as nothing is left out for being too much.
 """
@@ -10,6 +12,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.intervals import IntervalBuilder, IntervalPart, IntervalTable, joined
+from ros2_memory.analysis.state_changes import (
+    NO_CHANGES,
+    Level,
+    StateChanges,
+    StateChangesBuilder,
+    has_levels,
+    levels_of,
+    reports_of,
+)
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
@@ -45,18 +56,21 @@ _MEASUREMENT_PACKAGES: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "
 class State(NamedTuple):
     """What one message states: labels of objects, booleans by dot-path, errors as sentences.
 
-    `beyond` is how many more labels and booleans it has.
+    `beyond` is how many more labels and booleans it has; `levels` and `reports` are those of
+    `state_changes`.
     """
 
     labels: tuple[str, ...] = ()
     flags: tuple[tuple[str, bool], ...] = ()
     errors: tuple[str, ...] = ()
     beyond: int = 0
+    levels: tuple[Level, ...] = ()
+    reports: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether the message states nothing."""
-        return not (self.labels or self.flags or self.errors)
+        return not (self.labels or self.flags or self.errors or self.levels or self.reports)
 
 
 EMPTY_STATE: Final = State()
@@ -105,6 +119,7 @@ class TopicEvents:
         undecodable: messages that cannot be decoded; where there are no others, `first` is after
             `last`.
         beyond: labels and booleans of one message that are not tracked, at most.
+        changes: what else changed.
     """
 
     first: Ns
@@ -116,11 +131,13 @@ class TopicEvents:
     left_out: int = 0
     undecodable: int = 0
     beyond: int = 0
+    changes: StateChanges = NO_CHANGES
 
     @property
     def is_empty(self) -> bool:
         """Whether there were only messages without an event."""
-        return not (self.visible.rows or self.known or self.errors or self.undecodable)
+        has_events = self.visible.rows or self.known or self.errors or self.undecodable
+        return not has_events and self.changes.is_empty
 
 
 NO_EVENTS: Final = TopicEvents(0, 0)
@@ -134,17 +151,20 @@ def has_events(type_name: str) -> bool:
 
 def state_of(value: JsonValue, type_name: str) -> State:
     """Returns what an extracted message of a type states."""
+    levels = levels_of(value, type_name) if has_levels(type_name) else ()
     if not has_events(type_name):
-        return EMPTY_STATE
+        return State(levels=levels) if levels else EMPTY_STATE
     errors = tuple(_errors_in(value, _ERROR_LEVELS.get(type_name)))
     if type_name in _ERROR_LEVELS:
-        return State(errors=errors) if errors else EMPTY_STATE
+        reports = reports_of(value, type_name)
+        state = State(errors=errors, levels=levels, reports=reports)
+        return EMPTY_STATE if state.is_empty else state
     labels = tuple(dict.fromkeys(detection.label for detection in detections_of(value)))
     flags = tuple(_flags_in(value, ""))
-    if not (labels or flags):
+    if not (labels or flags or levels):
         return EMPTY_STATE
     beyond = len(labels[MAX_LABELS:]) + len(flags[MAX_FLAGS:])
-    return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond)
+    return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond, levels)
 
 
 class TopicEventsBuilder:
@@ -160,6 +180,7 @@ class TopicEventsBuilder:
         self._left_out = 0
         self._undecodable = 0
         self._beyond = 0
+        self._changes = StateChangesBuilder()
 
     def add_undecodable(self) -> None:
         """Takes the next message, which cannot be decoded."""
@@ -175,6 +196,8 @@ class TopicEventsBuilder:
             self._add_flag(KnownFlag(path, time, value, value))
         for text in state.errors:
             self._add_error(ReportedError(text, time, time, 1))
+        if state.levels or state.reports:
+            self._changes.add(time, state.levels, state.reports)
 
     def join(self, events: TopicEvents) -> None:
         """Takes all messages of a bag that come next, as if they were added one by one."""
@@ -197,6 +220,8 @@ class TopicEventsBuilder:
             self._add_error(error)
         self._left_out += events.left_out
         self._beyond = max(self._beyond, events.beyond)
+        if events.changes is not NO_CHANGES:
+            self._changes.join(events.changes)
 
     def events(self, at_most: int | None = None) -> TopicEvents | None:
         """Returns the events so far, `at_most` of each kind; None without a message."""
@@ -217,6 +242,7 @@ class TopicEventsBuilder:
             self._left_out + left_out,
             self._undecodable,
             self._beyond,
+            self._changes.changes(at_most),
         )
 
     def _close_part(self) -> None:

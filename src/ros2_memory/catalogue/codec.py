@@ -18,6 +18,13 @@ from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.odometry import Leg, MotionTotals, NearbyMotion, PoseDigest, TimedPosition
 from ros2_memory.analysis.path_length import Creep, End
 from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
+from ros2_memory.analysis.state_changes import (
+    NO_CHANGES,
+    KnownLevel,
+    LevelChange,
+    Report,
+    StateChanges,
+)
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
@@ -111,8 +118,15 @@ def encode_topic_events(events: TopicEvents | None) -> bytes:
         [each.at - events.first for each in events.known],
         "".join(str(each.first + 2 * each.last) for each in events.known),
     ]
+    changes = events.changes
     rest = json.dumps(
-        [events.visible.labels, known, events.toggles, events.errors],
+        [
+            events.visible.labels,
+            known,
+            events.toggles,
+            events.errors,
+            *([] if changes is NO_CHANGES else [_parts(_since(-events.first, changes))]),
+        ],
         ensure_ascii=False,
         separators=(",", ":"),
     )
@@ -134,28 +148,57 @@ def decode_topic_events(packed: bytes) -> TopicEvents | None:
     try:
         first, last, left_out, undecodable, beyond, size = _EVENTS.unpack_from(packed)
         end = _EVENTS.size + size
-        labels, (paths, after, values), flips, faults = _decode_text(packed[end:])
+        labels, (paths, after, values), flips, faults, relative = _decode_text(packed[end:])
         known = tuple(
             KnownFlag(path, first + at, value in "13", value in "23")
             for path, at, value in zip(paths, after, values, strict=True)
         )
+        changes = _since(first, relative)
     except (TypeError, struct.error, zlib.error) as error:
         raise ValueError(f"not the events of a topic: {error}") from error
     seen = IntervalTable(labels, packed[_EVENTS.size : end])
     if not seen.is_sound:
         raise ValueError("not the events of a topic: a label is missing")
-    return TopicEvents(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
+    return TopicEvents(
+        first, last, seen, known, flips, faults, left_out, undecodable, beyond, changes
+    )
+
+
+def _parts(changes: StateChanges) -> tuple[object, ...]:
+    return changes.known, changes.changes, changes.reports, changes.left_out
+
+
+def _since(since: int, relative: StateChanges) -> StateChanges:
+    """Returns changes whose times are later by `since`."""
+    if relative is NO_CHANGES:
+        return relative
+    return StateChanges(
+        tuple(each._replace(at=each.at + since) for each in relative.known),
+        tuple(each._replace(time=each.time + since) for each in relative.changes),
+        tuple(
+            each._replace(first=each.first + since, last=each.last + since)
+            for each in relative.reports
+        ),
+        relative.left_out,
+    )
 
 
 @lru_cache(2048)
 def _decode_text(
     text: bytes,
 ) -> tuple[
-    tuple[str, ...], tuple[list[str], list[int], str], tuple[Toggle, ...], tuple[ReportedError, ...]
+    tuple[str, ...],
+    tuple[list[str], list[int], str],
+    tuple[Toggle, ...],
+    tuple[ReportedError, ...],
+    StateChanges,
 ]:
-    """Decodes labels, flags, toggles and errors; cached, since those of many bags are equal."""
+    """Decodes labels, flags, toggles, errors and changes, whose times are relative.
+
+    Cached, since those of many bags are equal.
+    """
     plain = text if text.startswith(b"[") else zlib.decompress(text)
-    labels, (paths, after, values), flips, faults = json.loads(
+    labels, (paths, after, values), flips, faults, *changes = json.loads(
         plain.decode("utf-8", "surrogatepass")
     )
     return (
@@ -163,6 +206,21 @@ def _decode_text(
         (paths, after, values),
         tuple(Toggle(*each) for each in flips),
         tuple(ReportedError(*each) for each in faults),
+        _decode_changes(*changes[0]) if changes else NO_CHANGES,
+    )
+
+
+def _decode_changes(
+    known: list[tuple[str, int, int, int, str]],
+    changes: list[tuple[str, int, int, str]],
+    reports: list[tuple[str, int, int, int]],
+    left_out: int,
+) -> StateChanges:
+    return StateChanges(
+        tuple(KnownLevel(*each) for each in known),
+        tuple(LevelChange(*each) for each in changes),
+        tuple(Report(*each) for each in reports),
+        left_out,
     )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
 from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.standstills import StandstillCollector
+from ros2_memory.analysis.state_changes import follow_numbers, levels_by_number
 from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEventsBuilder, state_of
 from ros2_memory.analysis.trajectory import PoseCollector
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
@@ -208,4 +209,16 @@ class TopicCollector:
 
     def _apply(self, template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterable[_Sample]:
         self._zone_map.add_rows(template, rows)
-        return map(_Sample, template.poses(rows), template.speeds(rows), repeat(first.state))
+        return map(
+            _Sample, template.poses(rows), template.speeds(rows), _states(template, first, rows)
+        )
+
+
+def _states(template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterable[State]:
+    """Returns the state of each message: the first's, but for levels that follow numbers."""
+    if not follow_numbers(template.type_name):
+        return repeat(first.state)
+    columns = [template.column(rows, offset).tolist() for offset in template.numbers]
+    numbers = zip(*columns, strict=True) if columns else repeat((), len(rows))
+    levels = levels_by_number(template.type_name, template.names, numbers)
+    return (first.state._replace(levels=each) for each in levels)

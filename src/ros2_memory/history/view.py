@@ -165,11 +165,16 @@ class AtTime:
 
 @dataclass(frozen=True, slots=True)
 class TimeRange:
-    """An inclusive window: from `start_s` to `end_s`, or the last so many seconds."""
+    """An inclusive window: from `start_s` to `end_s`, or the last so many seconds.
+
+    For a recap alone also the `before_s` seconds before `around_s`.
+    """
 
     start_s: float | None = None
     end_s: float | None = None
     last_s: float | None = None
+    around_s: float | None = None
+    before_s: float = 10.0
 
 
 def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, Ns | None]:

@@ -8,7 +8,7 @@ are left out, and counted.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
@@ -22,20 +22,8 @@ from ros2_memory.analysis.standstills import (
     StandstillCollector,
     StandstillDigest,
 )
-from ros2_memory.analysis.topic_events import (
-    MAX_PER_BAG,
-    NO_EVENTS,
-    TopicEvents,
-    TopicEventsBuilder,
-    has_events,
-    state_of,
-)
-from ros2_memory.catalogue.codec import (
-    decode_standstills,
-    decode_topic_events,
-    encode_standstills,
-    encode_topic_events,
-)
+from ros2_memory.analysis.topic_events import has_events
+from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.text import Reason, counted, listed
 from ros2_memory.core.timebase import (
@@ -53,14 +41,16 @@ from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.silences import grouped, silences_in
 from ros2_memory.history.view import open_span
-from ros2_memory.results import Event, Recap
+from ros2_memory.insights.changes_before import SLACK_NS, ChangesBefore, before, changes_in
+from ros2_memory.insights.topic_events import events_in, toggled
+from ros2_memory.results import Before, Event, Recap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.intervals import IntervalTable
     from ros2_memory.analysis.standstills import Standstill
-    from ros2_memory.analysis.topic_events import ReportedError
+    from ros2_memory.analysis.topic_events import ReportedError, TopicEvents
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
@@ -69,8 +59,12 @@ if TYPE_CHECKING:
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import TimeRange, View
+    from ros2_memory.results import PastChange
 
 MOST_EVENTS: Final = 25
+
+_MOST_CHANGES: Final = 30
+"""Changes before events in one recap: with more, each event has fewer, and the nearest."""
 
 _UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
 _STANDSTILLS_UNKNOWN: Final = (
@@ -126,6 +120,13 @@ class _Drive:
         return stood
 
 
+def recap_or_before(memory: Memory, call: Call, span: TimeRange) -> Recap | Before:
+    """Returns what happened in a window, or what changed before a moment; see both."""
+    if span.around_s is None:
+        return recap(memory, call, span)
+    return before(memory, call, span.around_s, span.before_s)
+
+
 def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     """Returns what happened in a window.
 
@@ -137,7 +138,8 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     view, window = open_span(memory, call, span)
     start, end = window.asked()
     drive = _drive(view, window)
-    reported, things, throughout = _topic_events(view, window)
+    found = _found_events(view, window)
+    reported, things, throughout = _topic_events(view, window, found)
     events = [*_stops(drive), *reported]
     events += [
         Event("gap", begin, until, "nothing was recorded")
@@ -150,6 +152,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     if things:
         counts["thing"] = things
     shown = _most_important(view, events, counts)
+    shown = _with_changes(changes_in(view, window, found), shown)
     trajectory = drive.trajectory
     for note in () if trajectory is None else length_notes(trajectory):
         view.notes.add(note)
@@ -192,7 +195,19 @@ def _drive(view: View, window: TimeWindow) -> _Drive:
     return _Drive(path, standstills)
 
 
-def _topic_events(view: View, window: TimeWindow) -> tuple[list[Event], int, set[str]]:
+def _found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | None]:
+    """Returns the events of each topic that can have some; None where it has no message."""
+    timeline = view.snapshot.timeline
+    return {
+        topic: events_in(view, topic, window)
+        for topic in timeline.topics()
+        if any(map(has_events, timeline.types_of(topic)))
+    }
+
+
+def _topic_events(
+    view: View, window: TimeWindow, found_events: Mapping[str, TopicEvents | None]
+) -> tuple[list[Event], int, set[str]]:
     """Returns events that messages report, the number of things seen, and those seen throughout.
 
     Of things that came or went, only the `MOST_EVENTS` that were seen longest are among the events.
@@ -204,10 +219,7 @@ def _topic_events(view: View, window: TimeWindow) -> tuple[list[Event], int, set
     visible: list[IntervalTable] = []
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
-    for topic in view.snapshot.timeline.topics():
-        if not any(map(has_events, view.snapshot.timeline.types_of(topic))):
-            continue
-        found = _events_in(view, topic, window)
+    for topic, found in found_events.items():
         if found is None or found.is_empty:
             continue
         events += [*_flips(topic, found), *map(_error, found.errors)]
@@ -253,8 +265,7 @@ def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:
     """Yields each toggle with how long its value held: until the next, or beyond the window."""
     until: dict[str, Ns] = {}
     for toggle in reversed(events.toggles):
-        name = topic if toggle.path == "value" else f"{topic} {toggle.path}"
-        text = f"{name} became {'true' if toggle.value else 'false'}"
+        text = toggled(topic, toggle)
         end = until.get(toggle.path)
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
         until[toggle.path] = toggle.time
@@ -282,6 +293,20 @@ def _error(error: ReportedError) -> Event:
     again = f" ({error.reports} times)" if error.reports > 1 else ""
     end = error.last if error.reports > 1 else None
     return Event("error", error.first, end, f"error: {error.text}{again}")
+
+
+def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event]:
+    """Returns the events, and with each stop and toggle what changed before."""
+    found: dict[Event, tuple[PastChange, ...]] = {}
+    for each in events:
+        if each.kind == "stop":
+            found[each] = changes.before(each.start, slack=SLACK_NS)
+        elif each.kind == "flip":
+            found[each] = changes.before(each.start, without=each.text.rpartition(" ")[0])
+    most = 3
+    while most > 1 and sum(len(each[:most]) for each in found.values()) > _MOST_CHANGES:
+        most -= 1
+    return [replace(each, before=found.get(each, ())[:most]) for each in events]
 
 
 def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -> list[Event]:
@@ -313,12 +338,6 @@ _STANDSTILLS: Final = DigestKind(
     look_up=lambda digests, topic, among: digests.catalogue.standstills(topic, among),
     encode=encode_standstills,
     decode=decode_standstills,
-)
-_TOPIC_EVENTS: Final = DigestKind(
-    "story",
-    look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
-    encode=encode_topic_events,
-    decode=decode_topic_events,
 )
 
 
@@ -371,38 +390,3 @@ def _standstills_in(
         for each in builder.standstills()
         if each.start < end and each.end > start
     )
-
-
-def _events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
-    """Returns what the messages of a topic report in a window; None where there is no message."""
-    builder = TopicEventsBuilder()
-
-    def collect(messages: Iterable[StoredMessage]) -> tuple[TopicEvents | None, Span | None]:
-        collector = TopicEventsBuilder()
-        _add_events(view, collector, messages)
-        events = collector.events(MAX_PER_BAG)
-        return events, None if events is None else (events.first, events.last)
-
-    def join(events: TopicEvents | None, span: Span) -> None:
-        if events is not None:
-            builder.join(TopicEvents(*span) if events is NO_EVENTS else events)
-
-    Fold(
-        _TOPIC_EVENTS,
-        add=lambda messages: _add_events(view, builder, messages),
-        collect=collect,
-        join=join,
-    ).over(view, topic, window)
-    return builder.events()
-
-
-def _add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
-    for found in messages:
-        channel = found.record.channel
-        try:
-            message = view.memory.reader.decode(found.record)
-        except UndecodableError:
-            to.add_undecodable()
-            continue
-        value = view.memory.extractor.exact(message, channel.type)
-        to.add(found.time, state_of(value, channel.type))

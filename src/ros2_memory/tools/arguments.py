@@ -42,6 +42,8 @@ TIME_KINDS: Final = ("number", "string")
 LONGEST_BEFORE_S: Final = 3600.0
 LONGEST_AFTER_S: Final = 600.0
 """Of a moment that is to be saved."""
+LONGEST_REASON_S: Final = 60.0
+"""Before a moment of which is asked what changed before."""
 
 
 def _as_list(value: object) -> object:
@@ -247,6 +249,23 @@ class Between(TimeArgument):
     text = "between two times"
     start_s: Annotated[_Time, Field(examples=[1784023200], alias="start")]
     end_s: Annotated[_Time, Field(examples=[1784023260], alias="end")]
+
+
+class BetweenOrAround(TimeArgument):
+    """A window in Unix seconds, or a moment and how much before it is asked for."""
+
+    replaces = "span"
+    text = "between two Unix times, or before one"
+    start_s: _UnixBound | None = Field(default=None, alias="start", examples=[1784023200])
+    end_s: _UnixBound | None = Field(default=None, alias="end", examples=[1784023260])
+    around_s: (
+        Annotated[_Unix, Field(description="Instead: what changed before this moment.")] | None
+    ) = Field(default=None, alias="around")
+    before_s: Annotated[
+        _Positive,
+        AfterValidator(partial(_check_most, LONGEST_REASON_S)),
+        Field(description="How long before around."),
+    ] = Field(default=10, alias="seconds_before")
 
 
 class Last(TimeArgument):

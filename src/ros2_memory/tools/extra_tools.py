@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from ros2_memory.insights.recap import recap
+from ros2_memory.insights.recap import recap_or_before
 from ros2_memory.insights.saved_moments import list_moments, remember_moment
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status
 from ros2_memory.insights.type_fields import describe_type
 from ros2_memory.insights.visits import visits
 from ros2_memory.tools.arguments import (
-    Between,
+    BetweenOrAround,
     Last,
     MatchesArguments,
     NoArguments,
@@ -32,14 +32,15 @@ _SIGHTINGS = ToolDeclaration(
 )
 _RECAP = ToolDeclaration(
     (
-        ToolName("recap", "What happened", Between),
+        ToolName("recap", "What happened", BetweenOrAround),
         ToolName("recap_last", "What happened lately", Last),
     ),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps, silences. "
-    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], "
-    "counts}}.",
+    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text, before: "
+    "what changed in the 10 s before}}], counts}}. With around: {{before: [{{text, s_before}}], "
+    "nearest first, recorded, robot, state}}.",
     WindowArguments,
-    recap,
+    recap_or_before,
     blocking=True,
 )
 _STATUS = ToolDeclaration(

@@ -291,4 +291,29 @@ def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
     }
     if event.end is not None:
         reply["duration_s"] = seconds(event.end - event.start)
+    if event.before:
+        reply["before"] = _changes(event.before)
     return with_notes(reply, (), goes_on=event.goes_on)
+
+
+def _changes(changes: Sequence[results.PastChange]) -> list[JsonValue]:
+    return [{"text": each.text, "s_before": round(seconds(each.before), 1)} for each in changes]
+
+
+@render.register(results.Before)
+def _before(answer: results.Before) -> JsonObject:
+    reply: JsonObject = {
+        "around": moment(answer.at),
+        "seconds_before": seconds(answer.length),
+        "before": _changes(answer.changes),
+    }
+    if answer.more:
+        reply["more"] = answer.more
+    reply["recorded"] = [*answer.recorded]
+    if answer.robot is not None:
+        robot = {**planar_pose(answer.robot), "frame_id": answer.robot.frame_id or None}
+        if answer.speed_mps is not None:
+            robot["speed_mps"] = rounded(answer.speed_mps, 3)
+        reply["robot"] = robot
+    reply["state"] = dict(answer.state)
+    return with_notes(reply, answer.notes)

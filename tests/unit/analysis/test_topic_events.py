@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
 from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable
+from ros2_memory.analysis.state_changes import Level
 from ros2_memory.analysis.topic_events import (
     EMPTY_STATE,
     KnownFlag,
@@ -39,10 +40,18 @@ def each_second(*states: State) -> Messages:
 
 
 STATES = st.builds(
-    lambda labels, flags, faults: State(tuple(sorted(labels)), flags, faults),
+    lambda labels, flags, faults, levels, reports: State(
+        tuple(sorted(labels)), flags, faults, levels=levels, reports=reports
+    ),
     st.sets(st.sampled_from("abc")),
     st.sampled_from([(), (("x", True),), (("x", False),), (("x", True), ("y", False))]),
     st.sampled_from([(), ("hot",), ("cold",), ("hot", "cold")]),
+    st.lists(
+        st.builds(Level, st.sampled_from("mn"), st.integers(0, 2)),
+        max_size=2,
+        unique_by=lambda level: level.name,
+    ).map(tuple),
+    st.sampled_from([(), ("late by 3 s",), ("late by 14 s",), ("no way",)]),
 ).map(lambda state: EMPTY_STATE if state.is_empty else state)
 
 
@@ -69,7 +78,9 @@ def _comparable(events: TopicEvents | None) -> object:
     flips = sorted(events.toggles, key=lambda flip: (flip.time, flip.path))
     known = sorted(events.known)
     seen = events.visible.intervals()
-    return (events.first, events.last, seen, known, flips, events.errors, events.left_out)
+    state = events.changes
+    levels = sorted(state.known), sorted(state.changes), state.reports, state.left_out
+    return (events.first, events.last, seen, known, flips, events.errors, events.left_out, levels)
 
 
 def _glimpse(label: str, at: int) -> IntervalTable:
@@ -160,7 +171,8 @@ def test_labels_booleans_and_errors_are_found_in_values() -> None:
     assert state_of({"a": {"b": False, "list": [True]}}, "x/msg/Y").flags == (("a.b", False),)
     log: dict[str, JsonValue] = {"level": 40, "name": "planner", "msg": "no path"}
     assert state_of(log, "rcl_interfaces/msg/Log").errors == ("planner: no path",)
-    assert state_of({**log, "level": 30}, "rcl_interfaces/msg/Log") is EMPTY_STATE
+    assert not state_of({**log, "level": 30}, "rcl_interfaces/msg/Log").errors
+    assert state_of({**log, "level": 20}, "rcl_interfaces/msg/Log") is EMPTY_STATE
     status: list[JsonValue] = [
         {"level": 0, "name": "lidar", "message": "fine"},
         {"level": 2, "name": "motor", "message": "hot"},

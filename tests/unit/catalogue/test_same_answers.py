@@ -20,7 +20,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange, View
-from ros2_memory.insights.recap import recap
+from ros2_memory.insights.recap import recap, recap_or_before
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
@@ -94,6 +94,9 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
             yield f"{topic} in {span}", partial(_range, topic, span)
             yield f"way of {topic} in {span}", partial(_way, topic, span)
         yield f"recap of {span}", partial(_recap, span)
+        at = draw.choice([first, last])
+        around = TimeRange(around_s=at / 1e9, before_s=draw.choice([1.0, 10.0, 60.0]))
+        yield f"before {around}", partial(_before, around)
     for topic in TOPICS:
         for kind, wanted in draw.sample(CONDITIONS, 4):
             for field in (
@@ -136,6 +139,10 @@ def _range(topic: str, span: TimeRange, memory: Memory, call: Call) -> object:
 
 def _recap(span: TimeRange, memory: Memory, call: Call) -> object:
     return recap(memory, call, span)
+
+
+def _before(span: TimeRange, memory: Memory, call: Call) -> object:
+    return recap_or_before(memory, call, span)
 
 
 def _way(topic: str, span: TimeRange, memory: Memory, call: Call) -> object:

@@ -1,0 +1,385 @@
+"""What changed in the seconds before a moment: before it, never because of what.
+
+Log entries of WARN and above, levels of diagnostics, goals of actions, booleans, a battery that
+fell below a fraction, and a commanded velocity that became zero while a goal was active. That
+nothing changed is an answer where such topics are recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.analysis.intervals import IntervalTable
+from ros2_memory.analysis.state_changes import (
+    ACTIVE_GOAL,
+    BATTERY,
+    CHARGE,
+    COMMAND,
+    GOAL,
+    LOG,
+    LOW_CHARGES,
+    STATUS,
+    VELOCITIES,
+    charge_of,
+    has_levels,
+)
+from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.geometry import compose
+from ros2_memory.core.model import Pose, TimeWindow, Transform
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
+from ros2_memory.history.coverage import note_edges, note_unread
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.transforms import transform_at
+from ros2_memory.history.view import ns_argument, open_view
+from ros2_memory.insights.topic_events import add_events, events_in, toggled
+from ros2_memory.results import Before, PastChange
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from ros2_memory.analysis.state_changes import LevelChange, Report, StateChanges
+    from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.view import View
+
+LENGTH_NS: Final = 10 * NS_PER_S
+"""How long before an event a change counts."""
+_LEAD_NS: Final = 30 * NS_PER_S
+"""How long before a window messages are read: a change shows by the message before it."""
+_KNOWN_NS: Final = 3600 * NS_PER_S
+"""How old a state may be that no later message repeats: of a goal, or of a latched boolean."""
+_AROUND_NS: Final = 600 * NS_PER_S
+"""A topic with a bag so near is recorded, though it may have nothing to report."""
+_POSE_NS: Final = 2 * NS_PER_S
+"""The robot may have moved since an older pose."""
+SLACK_NS: Final = NS_PER_S // 2
+"""When a standstill began is known to half a second: what changed by then counts as before."""
+_MOST_CHANGES: Final = 20
+_MAX_LOG_CHARS: Final = 100
+
+_LEVELS: Final = ("ok", "warning", "error", "stale")
+_GOAL_WORDS: Final = {3: "canceling", 4: "succeeded", 5: "canceled", 6: "aborted"}
+_STATUS_TOPIC: Final = "/_action/status"
+_NO_INTERVALS: Final = IntervalTable()
+
+
+class _Change(NamedTuple):
+    """Something that changed on a topic; a log entry that is repeated goes on until `last`."""
+
+    first: Ns
+    last: Ns
+    text: str
+
+
+class ChangesBefore:
+    """What changed in a window and shortly before it, on all topics.
+
+    Attributes:
+        recorded: the topics on which a change would show.
+        state: booleans, statuses that are not ok, and the goal of each action, at the end.
+        left_out: by topic, how many changes were too many to be stored.
+    """
+
+    def __init__(
+        self,
+        changes: Iterable[_Change],
+        recorded: tuple[str, ...] = (),
+        state: tuple[tuple[str, bool | str], ...] = (),
+        left_out: Mapping[str, int] | None = None,
+    ) -> None:
+        self._changes = sorted(changes)
+        self._longest = max((each.last - each.first for each in self._changes), default=0)
+        self.recorded = recorded
+        self.state = state
+        self.left_out = left_out or {}
+
+    def before(
+        self, at: Ns, length: Ns = LENGTH_NS, *, without: str = "", slack: Ns = 0
+    ) -> tuple[PastChange, ...]:
+        """Returns what changed in the time before a moment, nearest first.
+
+        What changed up to `slack` after it counts as at the moment. `without` is how sentences
+        begin that are left out: those of the boolean that toggled.
+        """
+        found = {}
+        begin = bisect_left(self._changes, (at - length - self._longest,))
+        end = bisect_left(self._changes, (at + slack + 1,))
+        for first, last, text in self._changes[begin:end]:
+            # A report that goes on is repeated within seconds, if not at the moment itself.
+            since = max(0, at - last)
+            if since <= length and not (without and text.startswith(without)):
+                found[first, text] = PastChange(text, since)
+        return tuple(sorted(found.values(), key=lambda each: each.before))
+
+
+def changes_in(
+    view: View, window: TimeWindow, known: Mapping[str, TopicEvents | None]
+) -> ChangesBefore:
+    """Returns what changed in a window, and in the seconds before it.
+
+    Args:
+        view: of the call.
+        window: of the changes.
+        known: the events in the window of topics that were asked before.
+    """
+    timeline = view.snapshot.timeline
+    joined: dict[str, TopicEvents] = {}
+    recorded: list[str] = []
+    commands = _commands(view)
+    for topic in timeline.topics():
+        types = timeline.types_of(topic)
+        if not (any(map(has_events, types)) or topic in commands):
+            continue
+        found = known[topic] if topic in known else events_in(view, topic, window)
+        events = _with_lead(view, topic, window, found, types)
+        if events is not None:
+            joined[topic] = events
+        is_telling = any(each == LOG or has_levels(each) for each in types)
+        if (is_telling or (events is not None and events.known)) and view.stream.overlapping_bags(
+            [topic], window.widened(_AROUND_NS)
+        ):
+            recorded.append(topic)
+    changes: list[_Change] = []
+    for topic, events in joined.items():
+        if topic not in commands:
+            changes += _changes(topic, events)
+    goals = _ActiveGoals(joined.values())
+    for topic in commands:
+        if topic in joined:
+            changes += _stopped_commands(topic, joined[topic], goals)
+    return ChangesBefore(
+        changes,
+        tuple(recorded),
+        tuple(_state(joined)),
+        {
+            topic: events.changes.left_out
+            for topic, events in joined.items()
+            if events.changes.left_out
+        },
+    )
+
+
+def _commands(view: View) -> set[str]:
+    """Returns the topic of velocities that the robot's base is given; none where there is none.
+
+    Of `/cmd_vel_nav`, `/cmd_vel_smoothed` and `/cmd_vel`, which follow each other, the last.
+    """
+    timeline = view.snapshot.timeline
+    found = [
+        topic
+        for topic in timeline.topics()
+        if topic.rsplit("/", 1)[-1].startswith("cmd_vel")
+        and not VELOCITIES.isdisjoint(timeline.types_of(topic))
+    ]
+    return {min(found, key=lambda topic: (len(topic), topic))} if found else set()
+
+
+def _with_lead(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    found: TopicEvents | None,
+    types: Sequence[str],
+) -> TopicEvents | None:
+    """Returns the events in a window, joined with the state before it.
+
+    None where neither can have a change: a detector's topic is not read for it.
+    """
+    can_change = LOG in types or found is None or found.known or not found.changes.is_empty
+    if not can_change:
+        return None
+    start = max(window.start - _LEAD_NS, MIN_NS)
+    builder = TopicEventsBuilder()
+    newest = view.stream.newest(topic, TimeWindow(max(start - _KNOWN_NS, MIN_NS), start))
+    if newest is not None:
+        add_events(view, builder, [newest])
+    for events in (events_in(view, topic, TimeWindow(start, window.start)), found):
+        if events is not None:
+            builder.join(replace(events, visible=_NO_INTERVALS, errors=()))
+    return builder.events()
+
+
+def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
+    for toggle in events.toggles:
+        yield _Change(toggle.time, toggle.time, toggled(topic, toggle))
+    for report in events.changes.reports:
+        yield _Change(report.first, report.last, _reported(report))
+    charge = next((each.first for each in events.changes.known if each.name == CHARGE), 0)
+    for change in events.changes.changes:
+        text = _changed(topic, change, charge)
+        if change.name == CHARGE:
+            charge = change.value
+        if text:
+            yield _Change(change.time, change.time, text)
+    for known in events.changes.known:
+        # A goal is new, and a status that is not ok, where earlier messages are without it.
+        if known.at == events.first:
+            continue
+        if known.name.startswith(GOAL):
+            word = _GOAL_WORDS.get(known.first, "accepted")
+            yield _Change(known.at, known.at, f"{_action(topic)} goal {word}")
+        elif known.name.startswith(STATUS) and known.first:
+            yield _Change(known.at, known.at, _status(known.name, known.first, known.text))
+
+
+def _changed(topic: str, change: LevelChange, charge: int) -> str:
+    """Returns a sentence for a change of level; empty for one that is not reported."""
+    if change.name.startswith(STATUS):
+        return _status(change.name, change.value, change.text)
+    if change.name.startswith(GOAL) and change.value in _GOAL_WORDS:
+        return f"{_action(topic)} goal {_GOAL_WORDS[change.value]}"
+    if change.name == CHARGE and change.value > charge:
+        return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
+    return ""
+
+
+def _status(name: str, level: int, text: str) -> str:
+    word = _LEVELS[level] if 0 <= level < len(_LEVELS) else f"level {level}"
+    more = f": {text}" if text else ""
+    return f"status of {name.removeprefix(STATUS)} became {word}{more}"[:_MAX_LOG_CHARS]
+
+
+def _action(topic: str) -> str:
+    return topic.removesuffix(_STATUS_TOPIC)
+
+
+def _reported(report: Report) -> str:
+    if report.reports == 1:
+        return report.text
+    span = unix_from_ns(report.last - report.first)
+    return f"{report.text} ({report.reports} times in {span:.0f} s)"
+
+
+class _ActiveGoals:
+    """Whether the newest goal of some action was active at a time."""
+
+    def __init__(self, events: Iterable[TopicEvents]) -> None:
+        self._actions = [action for each in events if (action := [*_activity(each.changes)])]
+
+    def at(self, time: Ns) -> bool:
+        """Returns whether one was."""
+        for action in self._actions:
+            nth = bisect_right(action, (time, True)) - 1
+            if nth >= 0 and action[nth][1]:
+                return True
+        return False
+
+
+def _activity(changes: StateChanges) -> Iterator[tuple[Ns, bool]]:
+    """Yields, whenever the status of a goal changes, whether the newest one is active from then on.
+
+    An older goal does not count: that it ended may not be recorded.
+    """
+    begun = {known.name: known.at for known in changes.known if known.name.startswith(GOAL)}
+    states = [(known.at, known.name, known.first) for known in changes.known]
+    states += [(change.time, change.name, change.value) for change in changes.changes]
+    newest, active = MIN_NS, set[str]()
+    for time, name, value in sorted(each for each in states if each[1] in begun):
+        if begun[name] > newest:
+            newest = begun[name]
+            active.clear()
+        if begun[name] == newest:
+            (active.add if value in ACTIVE_GOAL else active.discard)(name)
+        yield time, bool(active)
+
+
+def _stopped_commands(topic: str, events: TopicEvents, goals: _ActiveGoals) -> Iterator[_Change]:
+    for change in events.changes.changes:
+        if change.name == COMMAND and not change.value and goals.at(change.time):
+            text = f"{topic} went to zero while a goal was active"
+            yield _Change(change.time, change.time, text)
+
+
+def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]]:
+    """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end."""
+    for topic, events in joined.items():
+        is_battery = any(each.name == CHARGE for each in events.changes.known)
+        for flag in () if is_battery else events.known:
+            yield topic if flag.path == "value" else f"{topic} {flag.path}", flag.last
+        goals = [each for each in events.changes.known if each.name.startswith(GOAL)]
+        if goals:
+            newest = max(goals, key=lambda each: each.at)
+            yield f"{_action(topic)} goal", _GOAL_WORDS.get(newest.last, "active")
+        for level in events.changes.known:
+            if level.name.startswith(STATUS) and level.last:
+                word = _LEVELS[level.last] if 0 < level.last < len(_LEVELS) else str(level.last)
+                yield f"status of {level.name.removeprefix(STATUS)}", word
+
+
+def before(memory: Memory, call: Call, at_s: float, length_s: float) -> Before:
+    """Returns what changed in the seconds before a moment, and the state of the robot then.
+
+    Raises:
+        InvalidArgumentsError: the moment is not finite.
+        NoDataError: the memory holds nothing.
+        QueryTimeoutError: the call's time is over.
+    """
+    at, length = ns_argument("around", at_s), ns_argument("seconds_before", length_s)
+    view = open_view(memory, call, at)
+    window = TimeWindow(max(at - length, MIN_NS), min(at + SLACK_NS + 1, MAX_NS))
+    changes = changes_in(view, window, {})
+    found = changes.before(at, length, slack=SLACK_NS)
+    robot, speed_mps = _robot(view, at)
+    if not changes.recorded:
+        view.notes.add("no topic that would show a change is recorded at this time")
+    elif not found:
+        view.notes.add(f"nothing changed on the recorded topics in the {length_s:g} s before")
+    for topic, more in changes.left_out.items():
+        view.notes.add(f"{topic} changes too often to store each change: {more} more")
+    note_unread(view, window)
+    note_edges(view, window)
+    return Before(
+        at,
+        length,
+        found[:_MOST_CHANGES],
+        len(found[_MOST_CHANGES:]),
+        changes.recorded,
+        robot,
+        speed_mps,
+        (*changes.state, *_charges(view, at)),
+        notes=view.notes.sentences(),
+    )
+
+
+def _robot(view: View, at: Ns) -> tuple[Pose | None, float | None]:
+    """Returns the robot's newest pose, in the map where that is known, and its speed."""
+    window = TimeWindow(max(at - _POSE_NS, MIN_NS), at + 1)
+    try:
+        found = view.stream.newest(resolve_pose_topic(view), window)
+    except (InvalidArgumentsError, NoDataError):
+        return None, None
+    message = None if found is None else view.bags.decode(found)
+    if found is None or message is None:
+        return None, None
+    type_name = found.record.channel.type
+    pose = view.memory.extractor.pose(message, type_name)
+    twist = view.memory.extractor.twist(message, type_name)
+    speed_mps = None if twist is None else math.hypot(*twist.linear)
+    target = view.memory.limits.map_frame
+    if pose is None or pose.orientation is None or not target or pose.frame_id == target:
+        return pose, speed_mps
+    try:
+        placed = transform_at(view, target, pose.frame_id, found.time, found.bag.recording)
+    except NoDataError:
+        return pose, speed_mps
+    whole = compose(placed.transform, Transform(pose.position, pose.orientation))
+    return Pose(whole.translation, whole.rotation, target), speed_mps
+
+
+def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
+    """Yields how full each battery was at a time."""
+    timeline = view.snapshot.timeline
+    for topic in timeline.topics():
+        if BATTERY not in timeline.types_of(topic):
+            continue
+        found = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
+        message = None if found is None else view.bags.decode(found)
+        if message is not None:
+            part = charge_of(view.memory.extractor.exact(message, BATTERY))
+            if part is not None:
+                yield topic, f"{part:.0%}"

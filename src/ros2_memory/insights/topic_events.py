@@ -1,0 +1,74 @@
+"""The events of one topic in a window, from digests of whole bags and the messages of others."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.analysis.topic_events import (
+    MAX_PER_BAG,
+    NO_EVENTS,
+    TopicEvents,
+    TopicEventsBuilder,
+    state_of,
+)
+from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.history.bag_groups import DigestKind, Fold
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from ros2_memory.analysis.topic_events import Toggle
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.history.bag_groups import Span
+    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.view import View
+
+_TOPIC_EVENTS: Final = DigestKind(
+    "story",
+    look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
+    encode=encode_topic_events,
+    decode=decode_topic_events,
+)
+
+
+def toggled(topic: str, toggle: Toggle) -> str:
+    """Returns a sentence for a boolean of a topic that toggled."""
+    name = topic if toggle.path == "value" else f"{topic} {toggle.path}"
+    return f"{name} became {'true' if toggle.value else 'false'}"
+
+
+def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
+    """Returns what the messages of a topic report in a window; None where there is no message."""
+    builder = TopicEventsBuilder()
+
+    def collect(messages: Iterable[StoredMessage]) -> tuple[TopicEvents | None, Span | None]:
+        collector = TopicEventsBuilder()
+        add_events(view, collector, messages)
+        events = collector.events(MAX_PER_BAG)
+        return events, None if events is None else (events.first, events.last)
+
+    def join(events: TopicEvents | None, span: Span) -> None:
+        if events is not None:
+            builder.join(TopicEvents(*span) if events is NO_EVENTS else events)
+
+    Fold(
+        _TOPIC_EVENTS,
+        add=lambda messages: add_events(view, builder, messages),
+        collect=collect,
+        join=join,
+    ).over(view, topic, window)
+    return builder.events()
+
+
+def add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
+    """Adds what messages of one topic report, in log-time order."""
+    for found in messages:
+        channel = found.record.channel
+        try:
+            message = view.memory.reader.decode(found.record)
+        except UndecodableError:
+            to.add_undecodable()
+            continue
+        value = view.memory.extractor.exact(message, channel.type)
+        to.add(found.time, state_of(value, channel.type))

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    command,
+    detections,
+    diagnostics,
+    goals,
+    log_entry,
+    odom,
+    tf,
+    transform,
+    write_mcap,
+)
+from tests.support.memories import asked, memory_of, recalling, replied
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+RUNNING, SUCCEEDED, ABORTED = 2, 4, 6
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def at(seconds: float) -> int:
+    return BEGIN + round(seconds * S)
+
+
+def driving(until: float, stops: float, hz: int = 10) -> list[Msg]:
+    """Drives 0.4 m/s up to a time, and then stands."""
+    times = [nth / hz for nth in range(round(until * hz))]
+    return [odom(at(t), 0.4 * min(t, stops), 0.0, 0.0) for t in times]
+
+
+def commanded(until: float, stops: float, hz: int = 10) -> list[Msg]:
+    times = [nth / hz for nth in range(round(until * hz))]
+    return [command(at(t), 0.4 if t < stops else 0.0) for t in times]
+
+
+def write(folder: Path, messages: list[Msg], split_s: float = 20.0) -> None:
+    """In bags of some seconds."""
+    ordered = sorted(messages, key=lambda each: each.log_time)
+    splits: dict[int, list[Msg]] = {}
+    for each in ordered:
+        splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
+    for nth, split in splits.items():
+        write_mcap(folder / "rec" / f"rec_{nth}.mcap", split)
+
+
+def before(folder: Path, around: float, *, recalls: bool = False, **given: float) -> dict[str, Any]:
+    memory = memory_of(folder)
+    if recalls:
+        memory = recalling(replace(memory), folder)
+    reply: dict[str, Any] = asked(memory, folder, "recap", around=BEGIN / S + around, **given)
+    return reply
+
+
+def told(reply: dict[str, Any]) -> list[tuple[str, float]]:
+    return [(each["text"], each["s_before"]) for each in reply["before"]]
+
+
+ALL = [
+    *driving(60, 43),
+    *commanded(60, 43),
+    *(boolean(at(t), 42.6 <= t < 43.4) for t in range(60)),
+    boolean(at(42.6), True),
+    *(diagnostics(at(t), motor=(1, "hot") if t > 38 else (0, "ok")) for t in range(0, 60, 3)),
+    goals(at(5), {1: RUNNING}),
+    *(battery(at(t), 0.25 - t * 0.00125) for t in range(60)),
+    log_entry(at(41.5), 30, "motor", "81 C"),
+    log_entry(at(42.0), 20, "motor", "nothing of interest"),
+]
+
+
+@each_way
+def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool) -> None:
+    write(tmp_path, ALL)
+    reply = before(tmp_path, 43.0, recalls=recalls)
+    assert told(reply) == [
+        ("/cmd_vel went to zero while a goal was active", 0.0),
+        ("/bumper became true", 0.4),
+        ("warning of motor: 81 C", 1.5),
+        ("/battery_state fell below 20%", 2.0),
+        ("status of motor became warning: hot", 4.0),
+    ]
+    assert reply["state"] == {
+        "/bumper": True,
+        "/drive goal": "active",
+        "status of motor": "warning",
+        "/battery_state": "20%",
+    }
+    assert reply["robot"]["frame_id"] == "odom"
+    assert "notes" not in reply
+
+
+@each_way
+def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path, recalls: bool) -> None:
+    write(tmp_path, ALL)
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    reply = asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 60)
+    [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
+    assert [each["text"] for each in stop["before"]] == [
+        "/cmd_vel went to zero while a goal was active",
+        "/bumper became true",
+        "warning of motor: 81 C",
+    ]
+    [bump] = [each for each in reply["events"] if each["text"] == "/bumper became true"]
+    assert bump["before"][0]["text"] == "warning of motor: 81 C"
+    assert all("before" not in each or each["before"] for each in reply["events"])
+
+
+def test_a_window_that_begins_with_the_stop_knows_what_changed_before(tmp_path: Path) -> None:
+    write(tmp_path, ALL)
+    reply = asked(memory_of(tmp_path), tmp_path, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
+    [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
+    assert "/bumper became true" in [each["text"] for each in stop["before"]]
+
+
+@each_way
+def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
+    tmp_path: Path, recalls: bool
+) -> None:
+    calm = [
+        *driving(40, 20),
+        *(boolean(at(t), False) for t in range(40)),
+        *(diagnostics(at(t), motor=(0, "ok")) for t in range(40)),
+        log_entry(at(3), 20, "motor", "on"),
+    ]
+    write(tmp_path, calm)
+    reply = before(tmp_path, 20.0, recalls=recalls)
+    assert reply["before"] == []
+    assert reply["recorded"] == ["/bumper", "/diagnostics", "/rosout"]
+    assert reply["notes"] == ["nothing changed on the recorded topics in the 10 s before"]
+
+
+def test_that_no_such_topic_is_recorded_is_another_answer(tmp_path: Path) -> None:
+    write(tmp_path, [*driving(40, 20), *(detections(at(t), ["cup"]) for t in range(40))])
+    reply = before(tmp_path, 20.0)
+    assert (reply["before"], reply["recorded"]) == ([], [])
+    assert reply["notes"] == ["no topic that would show a change is recorded at this time"]
+
+
+def test_a_command_that_ends_without_a_goal_is_no_change(tmp_path: Path) -> None:
+    done = [goals(at(5), {1: RUNNING}), goals(at(18), {1: SUCCEEDED})]
+    write(tmp_path, [*driving(40, 20), *commanded(40, 20), *done])
+    assert told(before(tmp_path, 20.0)) == [("/drive goal succeeded", 2.0)]
+
+
+def test_goals_are_accepted_and_end(tmp_path: Path) -> None:
+    statuses = [(5, {1: RUNNING}), (10, {1: ABORTED, 2: 1}), (11, {1: ABORTED, 2: RUNNING})]
+    write(tmp_path, [*driving(20, 20), *(goals(at(t), each) for t, each in statuses)])
+    assert told(before(tmp_path, 12.0)) == [
+        ("/drive goal aborted", 2.0),
+        ("/drive goal accepted", 2.0),
+    ]
+
+
+@each_way
+def test_a_state_is_known_by_the_message_long_before(tmp_path: Path, recalls: bool) -> None:
+    """A latched topic has a message whenever it changes, and no other."""
+    docked = [boolean(at(0), True, "/docked"), boolean(at(300), False, "/docked")]
+    write(tmp_path, [*driving(320, 310, hz=2), *docked])
+    reply = before(tmp_path, 304.0, recalls=recalls)
+    assert told(reply) == [("/docked became false", 4.0)]
+    assert reply["state"] == {"/docked": False}
+
+
+def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
+    write(tmp_path, ALL)
+    assert told(before(tmp_path, 43.0, seconds_before=1)) == [
+        ("/cmd_vel went to zero while a goal was active", 0.0),
+        ("/bumper became true", 0.4),
+    ]
+    assert ("/drive goal accepted", 38.0) not in told(before(tmp_path, 43.0))
+    refused = before(tmp_path, 43.0, seconds_before=61)
+    assert refused["error"] == "invalid_arguments"
+
+
+def test_a_warning_that_is_repeated_is_listed_once(tmp_path: Path) -> None:
+    late = [log_entry(at(20 + nth / 2), 30, "control", f"late by {nth} ms") for nth in range(30)]
+    write(tmp_path, [*driving(60, 50), *late])
+    assert told(before(tmp_path, 30.0)) == [
+        ("warning of control: late by 0 ms (22 times in 10 s)", 0.0)
+    ]
+
+
+def test_places_of_the_robot_are_in_the_map(tmp_path: Path) -> None:
+    placed = [
+        tf(at(t / 2), transform(at(t / 2), "map", "odom", (10.0, 0.0, 0.0))) for t in range(80)
+    ]
+    write(tmp_path, [*driving(40, 20), *placed])
+    robot = before(tmp_path, 30.0)["robot"]
+    assert (robot["x"], robot["frame_id"]) == (pytest.approx(18.0, abs=0.01), "map")
+
+
+def test_a_recap_of_many_stops_is_short(tmp_path: Path) -> None:
+    messages: list[Msg] = []
+    x = 0.0
+    for nth in range(40 * 12):
+        stands = nth % 12 > 6
+        x += 0.0 if stands else 0.5
+        messages.append(odom(at(nth), x, 0.0, 0.0))
+        if nth % 12 == 6:
+            texts = ("far", "the planner failed to find a way around " * 4)
+            messages += [log_entry(at(nth) + n, 40, "x" * 40, text) for n, text in enumerate(texts)]
+            messages.append(boolean(at(nth), nth % 24 > 12))
+    write(tmp_path, messages)
+    memory = memory_of(tmp_path)
+    span = {"start": BEGIN / S, "end": BEGIN / S + 480}
+    reply = replied(memory, tmp_path, "recap", span)
+    assert len(reply.text) < 6_000
+    stops = [each for each in json.loads(reply.text)["events"] if "stood" in each["text"]]
+    assert all(each["before"] for each in stops)
