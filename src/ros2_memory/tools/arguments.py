@@ -252,19 +252,23 @@ class Between(TimeArgument):
 
 
 class BetweenOrAround(TimeArgument):
-    """A window in Unix seconds, or a moment and how much before it is asked for."""
+    """A window between two times, or a moment and how much before it is asked for."""
 
     replaces = "span"
-    text = "between two Unix times, or before one"
-    start_s: _UnixBound | None = Field(default=None, alias="start", examples=[1784023200])
-    end_s: _UnixBound | None = Field(default=None, alias="end", examples=[1784023260])
-    around_s: (
-        Annotated[_Unix, Field(description="Instead: what changed before this moment.")] | None
-    ) = Field(default=None, alias="around")
+    text = "between two times, or before one"
+    either = ("around", "start")
+    start_s: _Time | None = Field(default=None, alias="start", examples=[1784023200])
+    end_s: _Time | None = Field(default=None, alias="end", examples=[1784023260])
+    around_s: _Time | None = Field(
+        default=None,
+        alias="around",
+        description="Instead of start and end: what changed before it.",
+        examples=[1784023230],
+    )
     before_s: Annotated[
         _Positive,
         AfterValidator(partial(_check_most, LONGEST_REASON_S)),
-        Field(description="How long before around."),
+        Field(description="Before around."),
     ] = Field(default=10, alias="seconds_before")
 
 

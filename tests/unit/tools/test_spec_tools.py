@@ -74,6 +74,7 @@ OPTIONAL = {
         "oldest_first",
         "limit",
     },
+    "recap": {"start", "end", "seconds_before"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
@@ -98,7 +99,16 @@ PAIRS = [
     ("trajectory_summary", "recent_trajectory_summary"),
     ("recap", "recap_last"),
 ]
-UNFOLDED = {"timestamp", "timestamps", "seconds_ago", "start", "end", "seconds"}
+UNFOLDED = {
+    "timestamp",
+    "timestamps",
+    "seconds_ago",
+    "start",
+    "end",
+    "seconds",
+    "around",
+    "seconds_before",
+}
 
 
 def seen(tool: Tool) -> dict[str, Any]:
@@ -167,7 +177,7 @@ def test_everything_the_planner_reads_fits_into_18_000_characters() -> None:
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_every_tool_shows_an_example_that_it_accepts(tool: Tool) -> None:
     needed: set[str] = set(tool.schema.get("required") or [])  # type: ignore[arg-type]
-    assert set(example(tool)) == needed | {"timestamp"} & set(tool.schema["properties"])  # type: ignore[arg-type]
+    assert set(example(tool)) == needed | {"timestamp", "around"} & set(tool.schema["properties"])  # type: ignore[arg-type]
     assert callable(tool.question(example(tool)))
 
 
