@@ -36,9 +36,9 @@ _RECAP = ToolDeclaration(
         ToolName("recap_last", "What happened lately", Last),
     ),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps, silences. "
-    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text, before: "
-    "what changed in the 10 s before}}], counts}}. With around: {{before: [{{text, s_before}}], "
-    "nearest first, recorded, robot, state}}.",
+    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text, "
+    "before: what changed in the 10 s before}}], counts}}. With around: {{before: [{{text, "
+    "s_before}}], nearest first, recorded, robot, state}}.",
     WindowArguments,
     recap_or_before,
     blocking=True,

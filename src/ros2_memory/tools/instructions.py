@@ -29,8 +29,9 @@ get_position_at with the timestamp it gives.
 _HAPPENED: Final = """\
 - "When did you last see X, and where?": find_matches; "when first, how often?": with \
 oldest_first. "What happened, where did you stop?": recap_last. "Why?": recap \
-with around. "Have you been here?": visits, with the frame_id that x and y are of. "How low was it?": get_topic_in_last \
-with fields and max_samples 1. "How far can I trust this?": memory_status. Each takes one call.
+with around. "Have you been here?": visits, with the frame_id that x and y are of. "How low \
+was it?": get_topic_in_last with fields and max_samples 1. "How far can I trust this?": \
+memory_status. Each takes one call.
 """
 _REST: Final = """\
 - Positions are metres, yaw_deg is counter-clockwise from x, both in frame_id (for {pose_topic} \
@@ -67,7 +68,8 @@ get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
 on the vision topics. When first, how often: with oldest_first and limit 1. When was a number \
 beyond a limit: above or below, with field.
 - What happened in the last minutes, how far did I drive, where did I stop, was there an error: \
-recap_last, or recap between two times. Why then: recap with around. The shape of the way: recent_trajectory_summary.
+recap_last, or recap between two times. Why then: recap with around. The shape of the way: \
+recent_trajectory_summary.
 - Have I been here, when was I at a place, for how long, how near: visits, with the frame_id \
 that x and y are of.
 - What did a topic say: get_topic_seconds_ago, get_topic_in_last. How low or high was a \
