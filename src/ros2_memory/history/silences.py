@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import MAX_NAMED, listed
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
 from ros2_memory.history.coverage import unix_text
 
 if TYPE_CHECKING:
@@ -51,11 +51,14 @@ def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -
     if not found:
         return ()
     longest = sorted(found, key=lambda each: each.start - each.end)[:MAX_NAMED]
-    names = [
-        f"{each.topic} {unix_text(each.start)} to {unix_text(each.end)}"
-        for each in sorted(longest, key=lambda each: each.start)
-    ]
+    names = [_described(each) for each in sorted(longest, key=lambda each: each.start)]
     return (f"silent while the robot was on, so not searched: {listed(names, len(found))}",)
+
+
+def _described(silence: Silence) -> str:
+    times = f"{unix_text(silence.start)} to {unix_text(silence.end)}"
+    first, last = local_text(silence.start), local_text(silence.end)
+    return f"{silence.topic} {times} ({first} to {last})"
 
 
 def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:

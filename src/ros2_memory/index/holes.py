@@ -91,13 +91,27 @@ def _positions(schema: SummarySchema, rates: Rates) -> Iterator[tuple[int, Ns]]:
             yield found[0], period
 
 
-def between(bags: Sequence[BagFile]) -> Iterator[SuspectedHole]:
-    """Yields the holes from one split to the next of the same recording, of bags in order."""
+def _is_cut(before: BagFile, after: BagFile, rates: Rates) -> bool:
+    """Returns whether messages of a topic are regular to the end of a bag, and on in the next."""
+    return any(
+        before.end - last.last <= 2 * period and first.first - after.start <= 2 * period
+        for topic, period in rates
+        for last in before.summary.of(topic)
+        for first in after.summary.of(topic)
+    )
+
+
+def between(bags: Sequence[BagFile], rates: Rates) -> Iterator[SuspectedHole]:
+    """Yields the holes from one split to the next of the same recording, of bags in order.
+
+    One of these topics must be heard up to the hole, and from it on: a robot on which little is
+    published has holes all along.
+    """
     for before, after in pairwise(bags):
         if after.start - before.end < SHORTEST_STEP_NS:
             continue
         one, other = split_of(before.file), split_of(after.file)
         if one is None or other is None or one[0] != other[0]:
             continue
-        if other[1] == one[1] + 1:
+        if other[1] == one[1] + 1 and _is_cut(before, after, rates):
             yield SuspectedHole(before.end, after.start)

@@ -34,7 +34,8 @@ _Times: TypeAlias = "NDArray[np.int64]"
 
 def presences_of(bags: Sequence[BagFile]) -> dict[str, Presence]:
     """Returns by topic when the bags hold it, and how often; a topic's types count together."""
-    topics = sorted({topic for bag in bags for topic in bag.summary.schema.positions})
+    schemas = {id(bag.summary.schema): bag.summary.schema for bag in bags}.values()
+    topics = sorted({topic for schema in schemas for topic in schema.positions})
     counts, firsts, lasts = _tables(bags, {topic: at for at, topic in enumerate(topics)})
     held = np.array([bag.end - bag.start for bag in bags], np.int64)
     messages = counts.sum(axis=0).tolist()
@@ -58,12 +59,16 @@ def _tables(bags: Sequence[BagFile], column: dict[str, int]) -> tuple[_Times, _T
         schema = bags[rows[0]].summary.schema
         data = b"".join([bags[row].summary.numbers for row in rows])
         numbers = np.frombuffer(data, "<i8").reshape(len(rows), len(schema.topics), 3)
-        for position, header in enumerate(schema.topics):
-            here = rows, column[header.topic]
+        columns = [column[header.topic] for header in schema.topics]
+        if len(schema.positions) == len(columns):
+            here = np.ix_(rows, columns)
+            counts[here], firsts[here], lasts[here] = np.moveaxis(numbers, 2, 0)
+            continue
+        for position, at in enumerate(columns):  # a topic of two types has two
             count, first, last = numbers[:, position].T
-            counts[here] += count
-            firsts[here] = np.minimum(firsts[here], first)
-            lasts[here] = np.maximum(lasts[here], last)
+            counts[rows, at] += count
+            firsts[rows, at] = np.minimum(firsts[rows, at], first)
+            lasts[rows, at] = np.maximum(lasts[rows, at], last)
     return counts, firsts, lasts
 
 

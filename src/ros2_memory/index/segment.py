@@ -284,7 +284,7 @@ class Segment:
         """Returns where no topic may have a message, by the usual rates of some topics."""
         known = self._suspected
         if known is None or known[0] != rates:
-            known = rates, (*stretched(self.bags, rates), *between(self.bags))
+            known = rates, (*stretched(self.bags, rates), *between(self.bags, rates))
             self._suspected = known
         return known[1]
 

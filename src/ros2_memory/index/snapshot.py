@@ -132,7 +132,7 @@ class Snapshot:
         rates = rates_of(self._presences)
         found = [each for part in self._dated for each in part.suspected_holes(rates)]
         ends = [bag for part in self._dated for bag in (part.bags[0], part.bags[-1])]
-        found += between(ends)
+        found += between(ends, rates)
         return tuple(sorted(set(found), key=lambda each: (each.first, each.last)))
 
     @cached_property

@@ -110,3 +110,11 @@ def test_one_topic_that_pauses_is_no_hole(tmp_path: Path) -> None:
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
     assert memory.index.snapshot().suspected_holes == ()
+
+
+def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -> None:
+    for number in range(SPLITS):
+        begin = (BEGIN + number * SPLIT) * S
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(begin, 0.0, 0.0, 0.0)])
+    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
+    assert memory.index.snapshot().suspected_holes == ()

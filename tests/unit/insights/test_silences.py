@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ros2_memory.core.timebase import local_text
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, recalling
@@ -83,7 +84,8 @@ NEVER = {"topic": SEEN, "condition_type": "contains", "value": "unicorn"}
 def test_never_seen_names_when_the_detector_was_silent(memory: Memory, tmp_path: Path) -> None:
     note = (
         f"silent while the robot was on, so not searched: {SEEN} "
-        f"{BEGIN + 99}.000001 to {BEGIN + 190}.000001"
+        f"{BEGIN + 99}.000001 to {BEGIN + 190}.000001 "
+        f"({local_text((BEGIN + 99) * S)} to {local_text((BEGIN + 190) * S)})"
     )
     assert asked(memory, tmp_path, "find_last_match", **NEVER)["notes"] == [note]
     assert asked(memory, tmp_path, "find_matches", **NEVER)["notes"] == [note]
