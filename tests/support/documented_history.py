@@ -85,11 +85,9 @@ CALLS: Final[dict[str, dict[str, object]]] = {
         "value": "scissors",
         "seconds": 64,
     },
-    "recap": {"start": START_S, "end": START_S + 60},
-    "recap_last": {"seconds": 30},
+    "recap": {"last_s": 30},
     "visits": {"x": 11, "y": 2, "radius_m": 1},
     "memory_status": {},
-    "list_moments": {},
     "remember_moment": {"label": "scissors found", "seconds_before": 30},
 }
 """A call of every tool."""
@@ -144,14 +142,14 @@ def recorder_beside(bag_dir: Path, clock: SettableClock) -> Iterator[None]:
 
 
 def replies(bag_dir: Path) -> dict[str, str]:
-    """The replies to `CALLS` and `MISTAKES`, asked `NOW`; the moment is kept before the list."""
+    """The replies to `CALLS` and `MISTAKES`, asked `NOW`; the moment is kept before the status."""
     clock = SettableClock(NOW)
     settings = load_settings([f"recording.bag_dir={bag_dir}"], env={"MEMORY_DEPLOYMENT": "robot"})
     memory = memory_of(bag_dir, clock=clock, limits=query_settings_of(settings))
     server = build_server(settings, memory)
     told = {}
     with recorder_beside(bag_dir, clock):
-        for name in sorted(CALLS, key=lambda name: name == "list_moments"):
+        for name in sorted(CALLS, key=lambda name: name == "memory_status"):
             told[name] = anyio.run(server.dispatcher.answer, name, CALLS[name]).text
         for name, (tool, given) in MISTAKES.items():
             told[name] = anyio.run(server.dispatcher.answer, tool, given).text

@@ -113,7 +113,7 @@ def replied(
     max_chars: int = 24_000,
 ) -> Reply:
     """The reply itself."""
-    [tool] = [each for each in build_tools(memory.limits, 25.0) if each.name == name]
+    [tool] = [each for each in build_tools(memory.limits) if each.name == name]
     replies, call = Replies(bag_dir, max_chars), Call()
     try:
         answer = tool.question(given)(memory, call)

@@ -160,26 +160,24 @@ QUESTIONS: Final = (
     ),
     _asked(
         "How fast were you at most in the last half minute, and how long did you stand?",
-        "recap_last",
-        {"seconds": 30},
+        "recap",
+        {"last_s": 30},
         way_of_recap(30),
     ),
     _asked(
         "How far have you driven since you remember anything?",
-        "recap_last",
-        {"seconds": 86_400},
+        "recap",
+        {"last_s": 86_400},
         way_of_recap(86_400),
     ),
     _asked(
         "Where did you stop in the last minute, when, and for how long?",
-        "recap_last",
-        {"seconds": 60},
+        "recap",
+        {"last_s": 60},
         stopped(60),
     ),
-    _asked("How long have you been standing here?", "recap_last", {"seconds": 30}, standing_since),
-    _asked(
-        "What came into view in the last 40 s?", "recap_last", {"seconds": 40}, came_into_view(40)
-    ),
+    _asked("How long have you been standing here?", "recap", {"last_s": 30}, standing_since),
+    _asked("What came into view in the last 40 s?", "recap", {"last_s": 40}, came_into_view(40)),
     _asked(
         "Did anything go wrong between these two times?",
         "recap",
@@ -188,13 +186,13 @@ QUESTIONS: Final = (
     ),
     _asked(
         "When did the path become clear or blocked in the last minute?",
-        "recap_last",
-        {"seconds": 60},
+        "recap",
+        {"last_s": 60},
         flips_of_path,
     ),
     Planned(
         "How far did you drive between your last two stops?",
-        (Step("recap_last", {"seconds": 60}), Step("recap", between_stops)),
+        (Step("recap", {"last_s": 60}), Step("recap", between_stops)),
         driven_between_stops,
     ),
     _asked(
@@ -364,7 +362,7 @@ QUESTIONS: Final = (
         commanded(20),
     ),
     _asked("Can I trust what you remember just now?", "memory_status", {}, trusted),
-    _asked("Which moments were you told to keep?", "list_moments", {}, none_kept),
+    _asked("Which moments were you told to keep?", "memory_status", {}, none_kept),
     _asked(
         "What did the camera's pictures show?",
         "get_topic_seconds_ago",

@@ -66,10 +66,9 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
         "sightings",
     ),
     ("recap", {"start": T0_S, "end": T0_S + LENGTH_S}, "events"),
-    ("recap_last", {"seconds": 5}, "stood_s"),
+    ("recap", {"last_s": 5}, "stood_s"),
     ("visits", {"x": 0.0, "y": 0.0}, "there_now"),
     ("memory_status", {}, "trust"),
-    ("list_moments", {}, "moments"),
 ]
 REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [
     ("get_position_at", {"timestamp": 5}, "no_data", False),

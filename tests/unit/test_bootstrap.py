@@ -69,7 +69,7 @@ def test_a_memory_is_built_before_its_directory_exists(tmp_path: Path) -> None:
     ("override", "key", "expected"),
     [
         ("server.name=memory_two", "name", "memory_two"),
-        ("server.call_timeout_s=7", "timeout", "up to 7 s"),
+        ("data.time_tolerance_s=0.7", "tolerance", "default 0.7"),
     ],
 )
 async def test_the_server_is_built_as_configured(
@@ -81,7 +81,7 @@ async def test_the_server_is_built_as_configured(
         assert info is not None
         texts = {
             "name": info.name,
-            "timeout": str([tool.description for tool in (await client.list_tools()).tools]),
+            "tolerance": str([tool.description for tool in (await client.list_tools()).tools]),
         }
         assert info.version == version("ros2-memory") == package_version()
     assert expected in texts[key]
@@ -102,7 +102,7 @@ async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:
             assert not is_error
             if name == "list_recorded_topics":
                 assert reply == []
-            elif name not in {"data_time_range", "memory_status", "list_moments"}:
+            elif name not in {"data_time_range", "memory_status"}:
                 assert reply["reason"] == "empty_memory", (name, reply)
 
 

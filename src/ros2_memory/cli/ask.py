@@ -36,7 +36,7 @@ NEVER: Final = "never: no recorded message meets the condition"
 
 def complete(incomplete: str) -> list[str]:
     """Returns the tools whose names begin so, for the shell's completion."""
-    names = (tool.name for tool in build_tools(QuerySettings(), 1.0, writing=True))
+    names = (tool.name for tool in build_tools(QuerySettings(), writing=True))
     return [name for name in names if name.startswith(incomplete)]
 
 

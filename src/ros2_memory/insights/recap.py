@@ -121,7 +121,14 @@ class _Drive:
 
 
 def recap_or_before(memory: Memory, call: Call, span: TimeRange) -> Recap | Before:
-    """Returns what happened in a window, or what changed before a moment; see both."""
+    """Returns what happened in a window, or what changed before a moment; see both.
+
+    Raises:
+        InvalidArgumentsError: the window and the moment are given in more than one form.
+    """
+    is_bounded = span.start_s is not None or span.end_s is not None
+    if is_bounded + (span.last_s is not None) + (span.around_s is not None) > 1:
+        raise InvalidArgumentsError("last_s, around, or start and end: give one of the three")
     if span.around_s is None:
         return recap(memory, call, span)
     return before(memory, call, span.around_s, span.before_s)

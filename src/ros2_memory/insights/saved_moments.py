@@ -56,7 +56,7 @@ def remember_moment(
         slot.close()
     if outcome is None:
         raise RefusedError(
-            f"the recorder did not answer within {ANSWER_TIMEOUT_S:g} s; list_moments tells "
+            f"the recorder did not answer within {ANSWER_TIMEOUT_S:g} s; memory_status tells "
             "whether it keeps the moment all the same, else ask again"
         )
     if outcome.moment is None:
@@ -71,14 +71,28 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
         RefusedError: they cannot be listed.
     """
     try:
-        stored = [*stored_moments_in(memory.index.bag_dir)]
+        return newest_moments(memory, _now(memory, call), MAX_LISTED)
     except OSError as error:
-        raise RefusedError(
-            f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
-            "to read moments/ of the bag directory"
-        ) from error
+        raise RefusedError(unlisted(error)) from error
+
+
+def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
+    """Returns the newest saved moments, the newest first; `now` is what "ago" counts from.
+
+    Raises:
+        OSError: they cannot be listed; see `unlisted`.
+    """
+    stored = [*stored_moments_in(memory.index.bag_dir)]
     stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
-    return MomentList(tuple(stored[:MAX_LISTED]), len(stored[MAX_LISTED:]), _now(memory, call))
+    return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now)
+
+
+def unlisted(error: OSError) -> str:
+    """Returns the sentence on moments that cannot be listed."""
+    return (
+        f"the moments cannot be listed: {error.strerror or error}; this server must be allowed to "
+        "read moments/ of the bag directory"
+    )
 
 
 def _now(memory: Memory, call: Call) -> Ns:

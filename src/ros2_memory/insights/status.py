@@ -12,6 +12,7 @@ from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.silences import silences_of
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.insights.saved_moments import newest_moments, unlisted
 from ros2_memory.results import Budget, SilentTopic, Status, Undecodable
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
+MAX_MOMENTS: Final = 5
+"""Saved moments in a status; the resource has more."""
 _SILENT_PERIODS: Final = 10
 """A topic is silent after so many of its usual periods without a message."""
 _MIN_MESSAGES: Final = 5
@@ -42,6 +45,11 @@ def memory_status(memory: Memory, call: Call) -> Status:
     live = heartbeat is not None and heartbeat.is_live(wall)
     # What a live recorder keeps too long while its clock may be wrong.
     held = heartbeat.age_held if heartbeat is not None and live else None
+    moments = None
+    try:
+        moments = newest_moments(memory, now, MAX_MOMENTS)
+    except OSError as error:
+        view.notes.add(unlisted(error))
     return Status(
         now=now,
         earliest=snapshot.dating.earliest,
@@ -58,6 +66,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         incomplete=snapshot.timeline.disk_use[1],
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
+        moments=moments,
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
         notes=(*view.notes.sentences(), *filter(None, [held])),
     )

@@ -55,7 +55,17 @@ STATUS: Final = Resource(
     description="How far the memory can be trusted just now.",
     mime_type=_JSON,
 )
-TOOLS_OF_RESOURCES: Final = {TOPICS.uri: "list_recorded_topics", STATUS.uri: "memory_status"}
+MOMENTS: Final = Resource(
+    uri="episodic://moments",
+    name="moments",
+    description="What remember_moment kept, newest first.",
+    mime_type=_JSON,
+)
+TOOLS_OF_RESOURCES: Final = {
+    TOPICS.uri: "list_recorded_topics",
+    STATUS.uri: "memory_status",
+    MOMENTS.uri: "list_moments",
+}
 """The tools whose replies are the text of the resources."""
 _SCHEMA_PREFIX: Final = "episodic://schema/"
 SCHEMA: Final = ResourceTemplate(
@@ -81,7 +91,7 @@ class EpisodicServer(MCPServer[object]):
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
-        self._resources = [TOPICS, STATUS] if has_status else [TOPICS]
+        self._resources = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
         self._templates = [SCHEMA] if has_status else []
         self._prompt = f"{instructions}\n{PROMPT}"
 

@@ -155,9 +155,7 @@ _Time: TypeAlias = Annotated[
     WithJsonSchema({"type": [*TIME_KINDS]}),
 ]
 _Times: TypeAlias = Annotated[tuple[_Time, ...], BeforeValidator(_as_times)]
-_Tolerance: TypeAlias = Annotated[
-    _Duration, Field(description="How old the message may be then, in s.")
-]
+_Tolerance: TypeAlias = _Duration
 _Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Not the default.")]
 _SearchTopic: TypeAlias = Annotated[
@@ -237,9 +235,7 @@ class Ago(TimeArgument):
     replaces = "moment"
     text = "some seconds ago"
     extra_reply = "age_s (before now)"
-    ago_s: Annotated[
-        _Duration, Field(description="Seconds before now.", examples=[10], alias="seconds_ago")
-    ]
+    ago_s: Annotated[_Duration, Field(examples=[10], alias="seconds_ago")]
 
 
 class Between(TimeArgument):
@@ -251,18 +247,19 @@ class Between(TimeArgument):
     end_s: Annotated[_Time, Field(examples=[1784023260], alias="end")]
 
 
-class BetweenOrAround(TimeArgument):
-    """A window between two times, or a moment and how much before it is asked for."""
+class RecapTime(TimeArgument):
+    """A window that ends now, or between two times, or a moment and how much before it."""
 
     replaces = "span"
-    text = "between two times, or before one"
-    either = ("around", "start")
+    text = "in the last_s seconds, between two times, or before one"
+    either = ("last_s", "start", "around")
+    last_s: Annotated[_Positive, Field(examples=[60])] | None = None
     start_s: _Time | None = Field(default=None, alias="start", examples=[1784023200])
     end_s: _Time | None = Field(default=None, alias="end", examples=[1784023260])
     around_s: _Time | None = Field(
         default=None,
         alias="around",
-        description="Instead of start and end: what changed before it.",
+        description="What changed before it.",
         examples=[1784023230],
     )
     before_s: Annotated[
@@ -277,7 +274,7 @@ class Last(TimeArgument):
 
     replaces = "span"
     text = "in the last seconds"
-    last_s: Annotated[_Positive, Field(description="Before now.", examples=[60], alias="seconds")]
+    last_s: Annotated[_Positive, Field(examples=[60], alias="seconds")]
 
 
 class NoArguments(Arguments):

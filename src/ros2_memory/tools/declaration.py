@@ -65,7 +65,10 @@ class ToolName:
 
 @dataclass(frozen=True, slots=True)
 class ToolDeclaration:
-    """A query and all its names."""
+    """A query and all its names.
+
+    `shows_example`: its schema alone does not show how it is called.
+    """
 
     names: tuple[ToolName, ...]
     description: str
@@ -73,6 +76,7 @@ class ToolDeclaration:
     query: Query
     blocking: bool = False
     writes: bool = False
+    shows_example: bool = False
 
     def tools(self, defaults: Mapping[str, object], *, plain_times: bool = False) -> Iterator[Tool]:
         """Yields a tool for each name; `defaults` fill the description's placeholders.
@@ -101,8 +105,10 @@ class ToolDeclaration:
             extra = f" Reply: the same, {when.extra_reply}." if when.extra_reply else ""
             text = f"As {first.name}, {when.text}.{extra}"
         if self.blocking:
-            text = f"Blocking, up to {defaults['timeout']} s. {text}"
-        return f"{text} Example: {to_json_text(signature.example)}", signature.json_schema()
+            text = f"Blocking. {text}"
+        if self.shows_example and name is first:
+            text = f"{text} Example: {to_json_text(signature.example)}"
+        return text, signature.json_schema()
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))

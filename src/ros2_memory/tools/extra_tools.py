@@ -9,10 +9,9 @@ from ros2_memory.insights.status import memory_status
 from ros2_memory.insights.type_fields import describe_type
 from ros2_memory.insights.visits import visits
 from ros2_memory.tools.arguments import (
-    BetweenOrAround,
-    Last,
     MatchesArguments,
     NoArguments,
+    RecapTime,
     SaveMomentArguments,
     TypeArguments,
     VisitsArguments,
@@ -22,19 +21,17 @@ from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
-    "When, where, how often and how long a condition (as in find_last_match) held, newest first; "
+    "When, where, how often and how long a condition held, newest first; "
     "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: where it "
     "was then, place: of the thing, score}}], total}}.",
     MatchesArguments,
     find_matches,
     blocking=True,
+    shows_example=True,
 )
 _RECAP = ToolDeclaration(
-    (
-        ToolName("recap", "What happened", BetweenOrAround),
-        ToolName("recap_last", "What happened lately", Last),
-    ),
+    (ToolName("recap", "What happened", RecapTime),),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps, silences. "
     "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text, "
     "before: what changed in the 10 s before}}], counts}}. With around: {{before: [{{text, "
@@ -46,7 +43,7 @@ _RECAP = ToolDeclaration(
 _STATUS = ToolDeclaration(
     (ToolName("memory_status", "How far to trust the memory"),),
     "Whether the recorder is alive, how old the newest data is, which topics fell silent and when, "
-    "what is damaged, and for how long the disk lasts.",
+    "what is damaged, for how long the disk lasts, and the newest kept moments.",
     NoArguments,
     memory_status,
 )
@@ -65,7 +62,7 @@ TYPE = ToolDeclaration(
     TypeArguments,
     describe_type,
 )
-_MOMENTS = ToolDeclaration(
+MOMENTS = ToolDeclaration(
     (ToolName("list_moments", "Kept moments"),),
     "Moments kept by remember_moment, newest first.",
     NoArguments,
@@ -80,4 +77,7 @@ _SAVE_MOMENT = ToolDeclaration(
     blocking=True,
     writes=True,
 )
-DECLARATIONS = (_SIGHTINGS, _RECAP, _VISITS, _STATUS, _MOMENTS, _SAVE_MOMENT)
+DECLARATIONS = (_SIGHTINGS, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
+"""The tools, in the order in which clients see them."""
+READABLE = (TYPE, MOMENTS)
+"""What is read as a resource, and is no tool."""

@@ -10,35 +10,34 @@ if TYPE_CHECKING:
 _RULES: Final = """\
 What a robot saw and did in the past, from its recordings. For what it sees right now, ask \
 elsewhere: {newest} answer not_closed_yet.
-Three rules prevent most wrong calls:
-1. Times are Unix seconds{or_text}. For "10 s ago" or "in the last minute" take the tools named \
-_seconds_ago, _last or recent_: they need no clock. A time from a reply can be passed to any \
-other tool as it is, and timestamps in place of timestamp asks about several at once: \
-{{results: [...]}} in their order.
+1. Times are Unix seconds{or_text}. For "10 s ago" or "in the last minute" {relative} need no \
+clock. Times of replies can be passed on as they are; timestamps asks about several at once: \
+{{results: [...]}}.
 2. Use topic names as list_recorded_topics spells them; only find_* and get_value_when take globs \
 (/vision/*/scene_objects). "At" a time means the newest message at or before it, at most \
-tolerance_s old ({tolerance} s by default: give 2 for a topic that speaks once a second); the \
-detail of no_data says which tolerance_s finds it.
+tolerance_s old ({tolerance} s by default: give 2 for a topic that speaks once a second).
 3. Having nothing is an answer, no failure: {{"error": "no_data", "reason", "detail"}}. The detail \
 says what there is and what to ask instead; do not repeat the same call.
+4. Conditions: contains (part of a text anywhere in the message, or an element of the list that \
+field names), equals (boolean, number, whole text; 1 is true), above, below (number; field says \
+which), near_position ({{"x": m, "y": m}}, within {near} m in the frame of the topic). Case is of \
+no matter; detections that score below min_score do not count.
 """
 _SEEN: Final = """\
 - "When did you last see X, and where?": find_last_match with contains on the vision topics, then \
 get_position_at with the timestamp it gives.
 """
 _HAPPENED: Final = """\
-- "When did you last see X, and where?": find_matches; "when first, how often?": with \
-oldest_first. "What happened, where did you stop?": recap_last. "Why?": recap \
-with around. "Have you been here?": visits, with the frame_id that x and y are of. "How low \
-was it?": get_topic_in_last with fields and max_samples 1. "How far can I trust this?": \
-memory_status. Each takes one call.
+- "When did you last see X, and where?": find_matches, with oldest_first for the first time. "What \
+happened, where did you stop?": recap; "why then?": with around. "Have you been here?": visits. \
+"How low was it?": get_topic_in_last with fields and max_samples 1. "Can I trust this?": \
+memory_status.
 """
 _REST: Final = """\
-- Positions are metres, yaw_deg is counter-clockwise from x, both in frame_id (for {pose_topic} \
-usually where the robot was switched on, not a map). get_transform_* relates any two frames.
-- notes in a reply say what was thinned, skipped or estimated: pass on what matters. Narrow large \
-values with fields, or ask for a shorter window.
-- Tools marked Blocking search long stretches of history: ask one at a time.
+- Positions are metres, yaw_deg is counter-clockwise from x, in frame_id ({pose_topic}: usually \
+where the robot was switched on, not a map). get_transform_* relates frames.
+- notes say what was thinned, skipped or estimated: pass on what matters. Narrow large values with \
+fields. Ask tools marked Blocking one at a time.
 """
 
 
@@ -49,12 +48,14 @@ def instructions(settings: QuerySettings, *, additions: bool = True) -> str:
     tools beyond the specification are offered.
     """
     return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
-        or_text=" or ISO 8601 (2026-11-20T14:05, local unless it has an offset)"
-        if additions
-        else "",
+        or_text=" or ISO 8601 (2026-11-20T14:05; local without offset)" if additions else "",
         newest="the newest 3 s or so are not on disk yet and"
         if settings.include_active
         else f"the newest {settings.split_duration_s:g} s or so are still being written and",
+        relative="*_seconds_ago, *_last, recent_* and last_s"
+        if additions
+        else "*_seconds_ago, *_last and recent_*",
+        near=f"{settings.position_tolerance_m:g}",
         pose_topic=settings.pose_topic,
         tolerance=f"{settings.time_tolerance_s:g}",
     )
@@ -68,7 +69,7 @@ get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
 on the vision topics. When first, how often: with oldest_first and limit 1. When was a number \
 beyond a limit: above or below, with field.
 - What happened in the last minutes, how far did I drive, where did I stop, was there an error: \
-recap_last, or recap between two times. Why then: recap with around. The shape of the way: \
+recap with last_s, or between start and end. Why then: recap with around. The shape of the way: \
 recent_trajectory_summary.
 - Have I been here, when was I at a place, for how long, how near: visits, with the frame_id \
 that x and y are of.

@@ -133,6 +133,7 @@ def _status(answer: results.Status) -> JsonObject:
         "incomplete": answer.incomplete,
         "unread": answer.unread,
         "budget": _budget(answer.budget),
+        **_newest_moments(answer.moments),
         **{
             f"{name}_count": len(topics)
             for name, topics in lists.items()
@@ -140,6 +141,16 @@ def _status(answer: results.Status) -> JsonObject:
         },
     }
     return with_notes(reply, answer.notes)
+
+
+def _newest_moments(newest: results.MomentList | None) -> JsonObject:
+    """Returns the moments of a status, and how many there are where not all are listed."""
+    if newest is None:
+        return {}
+    reply: JsonObject = {"moments": _stored_moments(newest)["moments"]}
+    if newest.more:
+        reply["moments_count"] = len(newest.moments) + newest.more
+    return reply
 
 
 def _budget(budget: results.Budget) -> JsonObject:

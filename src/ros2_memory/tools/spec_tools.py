@@ -37,21 +37,23 @@ if TYPE_CHECKING:
 
 def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
     """Returns what is read as a resource, and is not a tool."""
-    return tuple(extra_tools.TYPE.tools({"pose_topic": settings.pose_topic}))
+    return tuple(
+        tool
+        for each in extra_tools.READABLE
+        for tool in each.tools({"pose_topic": settings.pose_topic})
+    )
 
 
 def build_tools(
-    settings: QuerySettings, call_timeout_s: float, *, additions: bool = True, writing: bool = False
+    settings: QuerySettings, *, additions: bool = True, writing: bool = False
 ) -> tuple[Tool, ...]:
     """Returns the tools, in order. Their descriptions name this deployment's defaults.
 
     `additions`: also those beyond the specification; `writing`: also those of them that write.
     """
     defaults = {
-        "timeout": f"{call_timeout_s:g}",
         "pose_topic": settings.pose_topic,
         "tolerance": f"{settings.time_tolerance_s:g}",
-        "near": f"{settings.position_tolerance_m:g}",
         "map_frame": settings.map_frame or "no map",
     }
     declarations = (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
@@ -87,12 +89,6 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
     )
 
 
-_CONDITIONS = (
-    "contains (part of a text anywhere in the message, or an element of the list that field "
-    "names), equals (boolean, number or text; 1 and 0 are true and false), "
-    "above and below (number; field says which), near_position "
-    '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
-)
 _DECLARATIONS = (
     ToolDeclaration(
         (ToolName("list_recorded_topics", "Recorded topics"),),
@@ -164,17 +160,17 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("find_last_match", "Last time something held"),),
-        "When a condition last held, in all history. "
-        f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
+        "When a condition last held, in all history. Reply: {{timestamp, value, topic, type, "
         "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
         "read).",
         LastMatchArguments,
         queries.find_last_match,
         blocking=True,
+        shows_example=True,
     ),
     ToolDeclaration(
         (ToolName("get_value_when", "A topic when another matched"),),
-        "What value_topic held when condition_topic last met a condition (as in find_last_match), "
+        "What value_topic held when condition_topic last met a condition, "
         "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
         "value_timestamp, condition_topic, value_topic}}, or null as there.",
         ValueWhenArguments,

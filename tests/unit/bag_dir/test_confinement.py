@@ -436,7 +436,7 @@ def _write_through(link: Path, target: Path) -> None:
 
 
 class TestArguments:
-    TOOLS = build_tools(QuerySettings(), 25.0)
+    TOOLS = build_tools(QuerySettings())
 
     @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
     def test_no_tool_takes_a_path(self, tool: Any) -> None:

@@ -83,7 +83,7 @@ def replied(tmp_path_factory: pytest.TempPathFactory) -> Replied:
     for path in folder.rglob("*.mcap"):
         os.utime(path, ns=(now, now))  # however long it took to write them
     memory = memory_of(folder, clock=FixedClock(now))
-    tools = {tool.name: tool for tool in build_tools(memory.limits, 25.0)}
+    tools = {tool.name: tool for tool in build_tools(memory.limits)}
     replies = Replies(folder, 24_000)
     texts = {}
     for question in QUESTIONS:

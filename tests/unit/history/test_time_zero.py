@@ -49,7 +49,7 @@ def questions(topic: str) -> Iterator[tuple[str, dict[str, Any]]]:
             yield "find_matches", {"topic": "/*", **condition, **window}
     for seconds in (1e-6, 5.0, 1e12, 1e300):
         yield "get_topic_in_last", {"topic": topic, "seconds": seconds}
-        yield "recap_last", {"seconds": seconds}
+        yield "recap", {"last_s": seconds}
         yield "find_matches", {"topic": "/*", **SEARCH, "seconds": seconds}
     for condition in (SEARCH, NEVER, PLACE):
         yield "find_matches", {"topic": "/*", **condition}

@@ -140,7 +140,7 @@ class Tail:
 @cache
 def tools() -> Mapping[str, Tool]:
     """Those of this deployment, by name."""
-    return {tool.name: tool for tool in build_tools(LIVE, 25.0)}
+    return {tool.name: tool for tool in build_tools(LIVE)}
 
 
 def reply_of(memory: Memory, name: str, **arguments: object) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -28,16 +29,19 @@ from ros2_memory.insights.saved_moments import (
     list_moments,
     remember_moment,
 )
+from ros2_memory.insights.status import MAX_MOMENTS
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import keeper_of, recorder_at_work
-from tests.support.memories import memory_of
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from ros2_memory.bag_dir.moment_file import StoredMoment
 
 S = 10**9
 T0 = 1_790_000_000 * S
@@ -209,6 +213,27 @@ class TestTheList:
         assert len(told["moments"]) == MAX_LISTED
         assert told["more"] == 3
 
+    def test_a_status_has_the_newest_and_counts_all(self, tmp_path: Path) -> None:
+        memory = memory_of(tmp_path, clock=SettableClock(NOW))
+        for number in range(MAX_MOMENTS + 2):
+            self.keep(tmp_path, number, pending=False)
+            status = asked(memory, tmp_path, "memory_status")
+            assert status["moments"] == shown(memory, tmp_path)["moments"][:MAX_MOMENTS]
+            assert status.get("moments_count") == (number + 1 if number >= MAX_MOMENTS else None)
+
+    def test_a_status_says_that_they_cannot_be_listed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def refused(_bag_dir: Path) -> list[StoredMoment]:
+            raise PermissionError(errno.EACCES, "Permission denied")
+
+        monkeypatch.setattr(saved_moments, "stored_moments_in", refused)
+        status = asked(memory_of(tmp_path), tmp_path, "memory_status")
+        assert "moments" not in status
+        assert any("the moments cannot be listed: Permission denied" in n for n in status["notes"])
+        with pytest.raises(RefusedError, match="Permission denied"):
+            list_moments(memory_of(tmp_path), Call())
+
     def test_a_moment_says_what_of_it_is_not_kept(self, tmp_path: Path) -> None:
         self.keep(tmp_path, 1, pending=False, missing=("the share was used up",))
         [told] = shown(memory_of(tmp_path, clock=SettableClock(NOW)), tmp_path)["moments"]
@@ -240,11 +265,11 @@ class TestTheTool:
         assert load_settings((), {"MEMORY_DEPLOYMENT": preset}).server.write_tools is offered
 
     def test_it_is_offered_only_where_writing_is_allowed(self) -> None:
-        reading = {tool.name for tool in build_tools(QuerySettings(), 25.0)}
-        writing = {tool.name: tool for tool in build_tools(QuerySettings(), 25.0, writing=True)}
+        reading = {tool.name for tool in build_tools(QuerySettings())}
+        writing = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
         assert writing.keys() - reading == {"remember_moment"}
         assert [name for name, tool in writing.items() if tool.writes] == ["remember_moment"]
-        spec = build_tools(QuerySettings(), 25.0, additions=False, writing=True)
+        spec = build_tools(QuerySettings(), additions=False, writing=True)
         assert not [tool for tool in spec if tool.writes]
 
     @pytest.mark.parametrize(
@@ -260,6 +285,6 @@ class TestTheTool:
         ],
     )
     def test_its_arguments_are_bounded(self, given: dict[str, Any], said: str) -> None:
-        [tool] = [tool for tool in build_tools(QuerySettings(), 25.0, writing=True) if tool.writes]
+        [tool] = [tool for tool in build_tools(QuerySettings(), writing=True) if tool.writes]
         with pytest.raises(Exception, match=said):
             tool.question(given)

@@ -30,7 +30,7 @@ MESSAGES: Final = 1500
 AT_MOST: Final = 2 * MESSAGES
 """Messages that may still be read: those of a bag that is gone through at once."""
 TOOLS: Final = {
-    tool.name: tool for tool in build_tools(QuerySettings(), 25.0, additions=True, writing=False)
+    tool.name: tool for tool in build_tools(QuerySettings(), additions=True, writing=False)
 }
 SPAN: Final = {"start": BEGIN_S, "end": BEGIN_S + 4000}
 LONG: Final[tuple[tuple[str, dict[str, Any]], ...]] = (

@@ -47,9 +47,14 @@ async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
     write_run(tmp_path)
     async with Client(server(tmp_path)) as client:
         listed = (await client.list_resources()).resources
-        assert [str(each.uri) for each in listed] == ["episodic://topics", "episodic://status"]
+        assert [str(each.uri) for each in listed] == [
+            "episodic://topics",
+            "episodic://status",
+            "episodic://moments",
+        ]
         assert "/odom" in {row["topic"] for row in await read(client, "episodic://topics")}
         assert "trust" in await read(client, "episodic://status")
+        assert await read(client, "episodic://moments") == {"moments": []}
 
 
 async def test_the_fields_of_a_type_are_a_resource(tmp_path: Path) -> None:
@@ -103,7 +108,7 @@ async def test_the_prompt_teaches_with_tools_that_there_are(tmp_path: Path) -> N
         [message] = got.messages
         assert isinstance(message.content, TextContent)
         tools = {tool.name for tool in (await client.list_tools()).tools}
-        for name in ("find_matches", "recap_last", "visits", "memory_status", "data_time_range"):
+        for name in ("find_matches", "recap", "visits", "memory_status", "data_time_range"):
             assert name in tools
             assert name in message.content.text
         with pytest.raises(MCPError, match=prompt.name) as refused:
@@ -112,14 +117,19 @@ async def test_the_prompt_teaches_with_tools_that_there_are(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("which", ["spec", "all"])
-async def test_what_is_only_read_is_no_tool_and_named_by_none(tmp_path: Path, which: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "given"), [("describe_type", {"type": "nav_msgs/msg/Odometry"}), ("list_moments", {})]
+)
+async def test_what_is_only_read_is_no_tool_and_named_by_none(
+    tmp_path: Path, which: str, name: str, given: dict[str, Any]
+) -> None:
     async with Client(server(tmp_path, f"server.tools={which}")) as client:
-        result = await client.call_tool("describe_type", {"type": "nav_msgs/msg/Odometry"})
+        result = await client.call_tool(name, given)
     [block] = result.content
     assert isinstance(block, TextContent)
     detail = json.loads(block.text)["detail"]
-    assert 'there is no tool "describe_type"' in detail
-    assert "describe_type" not in detail.partition(";")[2]
+    assert f'there is no tool "{name}"' in detail
+    assert name not in detail.partition(";")[2]
 
 
 async def test_with_the_specifications_tools_alone_nothing_speaks_of_the_others(

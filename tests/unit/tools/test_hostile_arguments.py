@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 LONGEST_REPLY = 24_000
 LONGEST_DETAIL = 2_000
 TOOLS: dict[str, Any] = {
-    tool.name: tool.schema for tool in build_tools(memory_of(Path("bags")).limits, 25, writing=True)
+    tool.name: tool.schema for tool in build_tools(memory_of(Path("bags")).limits, writing=True)
 }
 CODES = {"invalid_arguments", "no_data", "timeout", "refused"}
 
@@ -35,7 +35,7 @@ def dispatcher(tmp_path_factory: pytest.TempPathFactory) -> Dispatcher:
     bag_dir = tmp_path_factory.mktemp("hostile")
     write_run(bag_dir)
     memory = memory_of(bag_dir)
-    tools = build_tools(memory.limits, 25, writing=True)
+    tools = build_tools(memory.limits, writing=True)
     return Dispatcher(memory, tools, Replies(bag_dir, LONGEST_REPLY), call_timeout_s=25)
 
 

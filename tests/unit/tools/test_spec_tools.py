@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcp.types import ListToolsResult
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.serving.mcp_server import _listed
 from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.arguments import (
     At,
@@ -24,9 +26,17 @@ from ros2_memory.tools.declaration import Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
 from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import memory_of, replied
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
-TOOLS = {tool.name: tool for tool in build_tools(QuerySettings(), 25.0, writing=True)}
+TOOLS = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
+DECLARATIONS = (*spec_tools._DECLARATIONS, *extra_tools.DECLARATIONS, *extra_tools.READABLE)
+SIGNATURES = {
+    each.name: Signature(declaration.arguments, each.when)
+    for declaration in DECLARATIONS
+    for each in declaration.names
+}
 SPECIFIED = [
     "list_recorded_topics",
     "data_time_range",
@@ -46,7 +56,7 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "recap", "recap_last", "visits", "memory_status", "list_moments"]
+ADDED = ["find_matches", "recap", "visits", "memory_status"]
 WRITING = ["remember_moment"]
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
@@ -54,7 +64,6 @@ BLOCKING = {
     "visits",
     "find_matches",
     "recap",
-    "recap_last",
     "list_frames",
     "find_last_match",
     "get_value_when",
@@ -74,7 +83,7 @@ OPTIONAL = {
         "oldest_first",
         "limit",
     },
-    "recap": {"start", "end", "seconds_before"},
+    "recap": {"start", "end", "around", "seconds_before"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
@@ -97,7 +106,6 @@ PAIRS = [
     ("get_velocity_at", "get_velocity_seconds_ago"),
     ("get_transform_at", "get_transform_seconds_ago"),
     ("trajectory_summary", "recent_trajectory_summary"),
-    ("recap", "recap_last"),
 ]
 UNFOLDED = {
     "timestamp",
@@ -106,8 +114,6 @@ UNFOLDED = {
     "start",
     "end",
     "seconds",
-    "around",
-    "seconds_before",
 }
 
 
@@ -122,8 +128,7 @@ def seen(tool: Tool) -> dict[str, Any]:
 
 
 def example(tool: Tool) -> dict[str, Any]:
-    arguments: dict[str, Any] = json.loads(tool.description.partition("Example: ")[2])
-    return arguments
+    return SIGNATURES[tool.name].example
 
 
 def refusal(name: str, **given: Any) -> str:
@@ -150,8 +155,8 @@ def test_a_description_names_the_age_that_the_reply_tells(name: str) -> None:
 
 
 def test_additions_and_what_writes_can_be_left_out() -> None:
-    assert [tool.name for tool in build_tools(QuerySettings(), 25.0)] == [*SPECIFIED, *ADDED]
-    alone = build_tools(QuerySettings(), 25.0, additions=False, writing=True)
+    assert [tool.name for tool in build_tools(QuerySettings())] == [*SPECIFIED, *ADDED]
+    alone = build_tools(QuerySettings(), additions=False, writing=True)
     assert [tool.name for tool in alone] == SPECIFIED
 
 
@@ -169,15 +174,34 @@ def test_there_is_a_snapshot_for_each_tool_and_no_other() -> None:
     assert {path.stem for path in SNAPSHOTS.glob("*.json")} == set(NAMES)
 
 
-def test_everything_the_planner_reads_fits_into_18_000_characters() -> None:
-    text = json.dumps([seen(tool) for tool in TOOLS.values()], separators=(",", ":"))
-    assert len(text) < 18_000
+@pytest.mark.parametrize(("additions", "most"), [(False, 11_000), (True, 18_000)])
+def test_the_listing_stays_within_its_size(additions: bool, most: int) -> None:
+    tools = build_tools(QuerySettings(), additions=additions, writing=True)
+    listing = ListToolsResult(tools=[_listed(tool) for tool in tools])
+    assert len(listing.model_dump_json(by_alias=True, exclude_none=True).encode()) <= most
+
+
+def test_examples_of_descriptions_are_calls_without_what_is_optional() -> None:
+    shown = {name: tool.description.partition(" Example: ")[2] for name, tool in TOOLS.items()}
+    assert {name: json.loads(text) for name, text in shown.items() if text} == {
+        name: example(TOOLS[name]) for name in ("find_last_match", "find_matches")
+    }
+
+
+def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [odom(10**18, 0.0, 0.0)])
+    both = replied(memory_of(tmp_path), tmp_path, "recap", {"last_s": 5, "end": 1e9})
+    assert "give one of the three" in both.text
+    half = replied(memory_of(tmp_path), tmp_path, "recap", {"start": 1e9})
+    assert "start and end must both be given" in half.text
+    assert "last_s is missing" in refusal("recap")
+    assert "last_s and start were both given" in refusal("recap", last_s=5, start=0, end=1)
 
 
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
-def test_every_tool_shows_an_example_that_it_accepts(tool: Tool) -> None:
+def test_every_tool_has_an_example_that_it_accepts(tool: Tool) -> None:
     needed: set[str] = set(tool.schema.get("required") or [])  # type: ignore[arg-type]
-    assert set(example(tool)) == needed | {"timestamp", "around"} & set(tool.schema["properties"])  # type: ignore[arg-type]
+    assert set(example(tool)) == needed | {"timestamp", "last_s"} & set(tool.schema["properties"])  # type: ignore[arg-type]
     assert callable(tool.question(example(tool)))
 
 
@@ -192,7 +216,7 @@ def test_every_tool_names_its_arguments_and_refuses_others(tool: Tool) -> None:
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_tools_that_may_take_long_say_so(tool: Tool) -> None:
     assert tool.blocking == (tool.name in BLOCKING)
-    assert tool.description.startswith("Blocking, up to 25 s.") == tool.blocking
+    assert tool.description.startswith("Blocking. ") == tool.blocking
 
 
 @pytest.mark.parametrize(("absolute", "relative"), PAIRS)
@@ -206,11 +230,10 @@ def test_a_pair_differs_in_its_times_alone(absolute: str, relative: str) -> None
 
 def test_descriptions_tell_the_defaults_of_this_deployment() -> None:
     limits = QuerySettings(pose_topic="/amcl_pose", time_tolerance_s=0.25, position_tolerance_m=2.0)
-    tools = {tool.name: tool.description for tool in build_tools(limits, 8.0)}
+    tools = {tool.name: tool.description for tool in build_tools(limits)}
     assert "/amcl_pose" in tools["get_position_at"]
     assert "default 0.25" in tools["get_topic_at_time"]
-    assert "within 2 m" in tools["find_last_match"]
-    assert "up to 8 s" in tools["find_last_match"]
+    assert "within 2 m" in instructions(limits)
     assert "/amcl_pose" in instructions(limits)
 
 
@@ -220,7 +243,7 @@ def test_the_instructions_are_short_enough_for_clients_that_cut_them() -> None:
 
 def test_a_missing_argument_is_named_with_what_is_expected() -> None:
     assert refusal("get_position_seconds_ago") == (
-        "seconds_ago is missing: a number of at least 0 (Seconds before now), e.g. 10"
+        "seconds_ago is missing: a number of at least 0, e.g. 10"
     )
 
 
@@ -268,7 +291,7 @@ TWO_KINDS = {"type": ["number", "string"]}
 
 
 def test_every_time_is_a_number_or_a_text_and_for_the_specification_alone_a_number() -> None:
-    plain = {tool.name: tool for tool in build_tools(QuerySettings(), 25.0, additions=False)}
+    plain = {tool.name: tool for tool in build_tools(QuerySettings(), additions=False)}
     for name, tool in TOOLS.items():
         properties: Any = tool.schema["properties"]
         for each in TIMES & set(properties):
@@ -379,9 +402,6 @@ def test_a_time_argument_replaces_the_moment() -> None:
 def test_a_time_argument_replaces_the_span() -> None:
     arguments = Signature(WindowArguments, Last).parse({"seconds": 60})
     assert dict(arguments)["span"] == TimeRange(last_s=60.0)
-
-
-DECLARATIONS = (*spec_tools._DECLARATIONS, *extra_tools.DECLARATIONS, extra_tools.TYPE)
 
 
 @pytest.mark.parametrize("declaration", DECLARATIONS, ids=lambda each: each.names[0].name)
