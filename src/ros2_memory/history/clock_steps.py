@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
@@ -20,9 +21,9 @@ from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.index.clock_faults import FaultyClock
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import Pose
+    from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import SuspectedHole
@@ -56,7 +57,24 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     return tuple(sorted(each for each in steps if window.contains(each.at)))
 
 
-def _steps_in(view: View, topic: str, suspect: SuspectedHole) -> Iterator[ClockStep]:
+def _steps_in(view: View, topic: str, suspect: SuspectedHole) -> Sequence[ClockStep]:
+    """Returns the steps in a suspected hole, by its bags or by what the catalogue has of them."""
+    around = TimeWindow(suspect.first, suspect.last + 1).widened(BESIDE_NS)
+    topics = [topic] if suspect.bag is None else [topic, *_busiest(suspect.bag)]
+    bags = view.stream.overlapping_bags(topics, around)
+    question = json.dumps(["clock steps", topic, suspect.first, suspect.last])
+    steps = view.bags.cached_answer(question, bags, _decode)
+    if steps is None:
+        steps = tuple(_read_steps(view, topic, suspect))
+        view.bags.cache_answer(question, bags, json.dumps(steps))
+    return steps
+
+
+def _decode(answer: str) -> tuple[ClockStep, ...]:
+    return tuple(ClockStep(at, by) for at, by in json.loads(answer))
+
+
+def _read_steps(view: View, topic: str, suspect: SuspectedHole) -> Iterator[ClockStep]:
     for hole in _holes_in(view, suspect):
         step = step_over(
             hole,
@@ -71,10 +89,13 @@ def _holes_in(view: View, suspect: SuspectedHole) -> list[tuple[Ns, Ns]]:
     bag = suspect.bag
     if bag is None:
         return [(suspect.first, suspect.last)]
-    busiest = sorted(bag.summary.topics, key=lambda each: (-each.count, each.topic))
-    names = dict.fromkeys(each.topic for each in busiest[:_MOST_TOPICS])
     window = TimeWindow.everything()
-    return holes(at for name in names for at in view.bags.log_times(bag, name, window))
+    return holes(at for name in _busiest(bag) for at in view.bags.log_times(bag, name, window))
+
+
+def _busiest(bag: BagFile) -> list[str]:
+    rows = sorted(bag.summary.topics, key=lambda each: (-each.count, each.topic))
+    return [*dict.fromkeys(each.topic for each in rows[:_MOST_TOPICS])]
 
 
 def _poses(view: View, topic: str, window: TimeWindow) -> list[TimedPosition]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.history.context import Memory
 
 S = 10**9
@@ -64,6 +67,18 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
     assert reply["counts"]["clock steps"] == 1
     later = asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
     assert "clock steps" not in later["counts"]
+
+
+def test_a_suspected_hole_is_read_once(tmp_path: Path) -> None:
+    memory = recalling(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > 55)), tmp_path)
+    first = steps(memory, tmp_path)
+    stored = replace(memory, reader=Unreadable())
+    assert steps(stored, tmp_path) == first != []
+
+
+class Unreadable(McapReader):
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[int]:
+        raise AssertionError(path)
 
 
 def steps(memory: Memory, folder: Path) -> list[Any]:

@@ -1,0 +1,36 @@
+"""What the home robot did not perceive, by the world's truth: one blind time, one step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from benchmarks.home.__main__ import made
+from benchmarks.home.days import CLOCK_STEP_S, Scale
+from benchmarks.home.truth import truth_of
+
+from tests.support.clocks import SettableClock
+from tests.support.memories import asked, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+SCALE = Scale()
+
+
+def test_the_blind_time_and_the_step_of_the_clock_are_all_that_is_reported(
+    tmp_path: Path,
+) -> None:
+    bags, truth = made(SCALE, tmp_path) / "bags", truth_of(SCALE)
+    memory = memory_of(bags, clock=SettableClock(round(truth.recorded[-1][1] + 60) * S))
+    reply = asked(memory, bags, "data_time_range")
+    [silence], [step] = reply["silences"], reply["clock_steps"]
+    start, stop = truth.blind
+    blind = [(max(a, start), min(b, stop)) for a, b in truth.recorded if a < stop and b > start]
+    assert silence["topic"] == "/vision/scene/scene_objects"
+    assert silence["start"] == pytest.approx(blind[0][0], abs=2.0)
+    assert silence["end"] == pytest.approx(blind[-1][1], abs=2.0)
+    assert silence["silent_s"] == pytest.approx(sum(b - a for a, b in blind), abs=2.0)
+    assert step["step_s"] == pytest.approx(CLOCK_STEP_S, abs=0.2)
+    assert step["at"] == pytest.approx(truth.clock_step, abs=1.0)
