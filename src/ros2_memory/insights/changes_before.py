@@ -64,6 +64,7 @@ _MAX_LOG_CHARS: Final = 100
 
 _LEVELS: Final = ("ok", "warning", "error", "stale")
 _GOAL_WORDS: Final = {3: "canceling", 4: "succeeded", 5: "canceled", 6: "aborted"}
+_ROUTINE: Final = ("goal accepted", "goal succeeded")
 _STATUS_TOPIC: Final = "/_action/status"
 _NO_INTERVALS: Final = IntervalTable()
 
@@ -115,6 +116,11 @@ class ChangesBefore:
             if since <= length and not (without and text.startswith(without)):
                 found[first, text] = PastChange(text, since)
         return tuple(sorted(found.values(), key=lambda each: each.before))
+
+
+def is_routine(change: PastChange) -> bool:
+    """Returns whether a change is the begin of a goal, or its end as it was meant."""
+    return change.text.endswith(_ROUTINE)
 
 
 def changes_in(

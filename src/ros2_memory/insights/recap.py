@@ -41,7 +41,13 @@ from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.silences import grouped, silences_in
 from ros2_memory.history.view import open_span
-from ros2_memory.insights.changes_before import SLACK_NS, ChangesBefore, before, changes_in
+from ros2_memory.insights.changes_before import (
+    SLACK_NS,
+    ChangesBefore,
+    before,
+    changes_in,
+    is_routine,
+)
 from ros2_memory.insights.topic_events import events_in, toggled
 from ros2_memory.results import Before, Event, Recap
 
@@ -63,8 +69,12 @@ if TYPE_CHECKING:
 
 MOST_EVENTS: Final = 25
 
-_MOST_CHANGES: Final = 30
-"""Changes before events in one recap: with more, each event has fewer, and the nearest."""
+_MOST_CHANGES: Final = 3
+"""Changes that are listed before an event, the nearest."""
+_MOST_CHARS: Final = 1_200
+"""Characters of changes before all events of a recap: a recap with `around` has them all."""
+_CHANGE_CHARS: Final = 30
+"""What the reply adds to a change's text."""
 
 _UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
 _STANDSTILLS_UNKNOWN: Final = (
@@ -310,10 +320,22 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
             found[each] = changes.before(each.start, slack=SLACK_NS)
         elif each.kind == "flip":
             found[each] = changes.before(each.start, without=each.text.rpartition(" ")[0])
-    most = 3
-    while most > 1 and sum(len(each[:most]) for each in found.values()) > _MOST_CHANGES:
-        most -= 1
-    return [replace(each, before=found.get(each, ())[:most]) for each in events]
+    shown = dict.fromkeys(found, 0)
+    left = _MOST_CHARS
+    # What a goal that was meant begins or ends with matters least.
+    routine = {each: all(map(is_routine, found[each])) for each in found}
+    ranks = [(is_last, nth) for is_last in (False, True) for nth in range(_MOST_CHANGES)]
+    for is_last, nth in ranks:
+        for each, changes in found.items():
+            if routine[each] is is_last and len(changes) > nth == shown[each]:
+                size = len(changes[nth].text) + _CHANGE_CHARS
+                if size <= left:
+                    left -= size
+                    shown[each] += 1
+    return [
+        replace(each, before=found[each][: shown[each]]) if each in found else each
+        for each in events
+    ]
 
 
 def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -> list[Event]:

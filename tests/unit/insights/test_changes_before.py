@@ -205,21 +205,44 @@ def test_places_of_the_robot_are_in_the_map(tmp_path: Path) -> None:
     assert (robot["x"], robot["frame_id"]) == (pytest.approx(18.0, abs=0.01), "map")
 
 
-def test_a_recap_of_many_stops_is_short(tmp_path: Path) -> None:
+def stopping(times: int) -> list[Msg]:
+    """Stops so often, for 5 s each, 7 s after the stop before."""
     messages: list[Msg] = []
     x = 0.0
-    for nth in range(40 * 12):
-        stands = nth % 12 > 6
-        x += 0.0 if stands else 0.5
-        messages.append(odom(at(nth), x, 0.0, 0.0))
-        if nth % 12 == 6:
-            texts = ("far", "the planner failed to find a way around " * 4)
-            messages += [log_entry(at(nth) + n, 40, "x" * 40, text) for n, text in enumerate(texts)]
-            messages.append(boolean(at(nth), nth % 24 > 12))
+    for nth in range(times * 12 * 4):
+        x += 0.0 if nth / 4 % 12 > 6 else 0.1
+        messages.append(odom(at(nth / 4), x, 0.0, 0.0))
+    return messages
+
+
+def recap_of(folder: Path, seconds: float) -> tuple[list[dict[str, Any]], int]:
+    """Its stops, and how long the reply is."""
+    span = {"start": BEGIN / S, "end": BEGIN / S + seconds}
+    reply = replied(memory_of(folder), folder, "recap", span).text
+    stops = [each for each in json.loads(reply)["events"] if each["text"].startswith("stood")]
+    return stops, len(reply)
+
+
+def test_a_recap_of_many_stops_is_short(tmp_path: Path) -> None:
+    messages = stopping(40)
+    for nth in range(40):
+        for text in ("far", "the planner failed to find a way around " * 4):
+            messages.append(log_entry(at(12 * nth + 6) + len(text), 40, "x" * 40, text))
     write(tmp_path, messages)
-    memory = memory_of(tmp_path)
-    span = {"start": BEGIN / S, "end": BEGIN / S + 480}
-    reply = replied(memory, tmp_path, "recap", span)
-    assert len(reply.text) < 6_000
-    stops = [each for each in json.loads(reply.text)["events"] if "stood" in each["text"]]
-    assert all(each["before"] for each in stops)
+    stops, size = recap_of(tmp_path, 480)
+    assert size < 6_000
+    listed = [change for each in stops for change in each.get("before", ())]
+    assert 1_000 < sum(len(change["text"]) + 30 for change in listed) <= 1_200
+    assert any("before" not in each for each in stops)
+
+
+def test_what_went_wrong_has_room_before_goals_that_merely_succeeded(tmp_path: Path) -> None:
+    messages, topic = stopping(24), f"/{'d' * 60}/_action/status"
+    for nth in range(24):
+        messages.append(goals(at(12 * nth + 1), {nth + 1: RUNNING}, topic))
+        messages.append(goals(at(12 * nth + 6), {nth + 1: SUCCEEDED}, topic))
+    messages.append(log_entry(at(12 * 22 + 5), 40, "motor", "81 C"))
+    write(tmp_path, messages)
+    stops, _ = recap_of(tmp_path, 24 * 12)
+    assert len([each for each in stops if "81 C" in str(each.get("before"))]) == 1
+    assert any("before" not in each for each in stops)
