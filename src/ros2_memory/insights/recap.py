@@ -326,9 +326,9 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
     routine = {each: all(map(is_routine, found[each])) for each in found}
     ranks = [(is_last, nth) for is_last in (False, True) for nth in range(_MOST_CHANGES)]
     for is_last, nth in ranks:
-        for each, changes in found.items():
-            if routine[each] is is_last and len(changes) > nth == shown[each]:
-                size = len(changes[nth].text) + _CHANGE_CHARS
+        for each, past in found.items():
+            if routine[each] is is_last and len(past) > nth == shown[each]:
+                size = len(past[nth].text) + _CHANGE_CHARS
                 if size <= left:
                     left -= size
                     shown[each] += 1
