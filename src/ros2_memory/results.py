@@ -8,7 +8,7 @@ only. `now` is what ages count from.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
@@ -500,6 +500,49 @@ class MomentList:
     moments: tuple[StoredMoment, ...]
     more: int
     now: Ns
+
+
+BinColumn: TypeAlias = Literal["count", "duration", "metres", "number", "time"]
+"""What the values of a column are: whole numbers, nanoseconds, metres, plain numbers, log times."""
+
+
+@dataclass(frozen=True, slots=True)
+class Usual:
+    """The usual first time of a day, in seconds of local time since midnight; over `days` days.
+
+    `of_days` is how many days there are of which something was recorded.
+    """
+
+    median_s: int
+    earliest_s: int
+    latest_s: int
+    days: int
+    of_days: int
+
+
+@dataclass(frozen=True, slots=True)
+class Bins(AnswerWithNotes):
+    """What was counted in each bin of a window.
+
+    Attributes:
+        by: the kind of the bins.
+        about: the topics or the place that was counted.
+        start: of the window, as far as the memory reaches; inclusive.
+        end: of the window, likewise.
+        columns: the name of each column after that of the bin, and what its values are.
+        rows: for each bin its name and its values; None where there is none.
+        all: the values of all bins together.
+        usual: the usual time of the first beginning in a day, where beginnings are counted.
+    """
+
+    by: str
+    about: tuple[str, ...]
+    start: Ns
+    end: Ns
+    columns: tuple[tuple[str, BinColumn], ...]
+    rows: tuple[tuple[str, tuple[float | None, ...]], ...]
+    all: tuple[float | None, ...]
+    usual: Usual | None = None
 
 
 Answer: TypeAlias = AnswerWithNotes | tuple[TopicRow, ...] | RememberedMoment | MomentList

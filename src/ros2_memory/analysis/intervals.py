@@ -123,6 +123,12 @@ class IntervalTable(NamedTuple):
         rows = _rows(self.rows)
         return IntervalTable(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
 
+    def as_one(self, label: str) -> IntervalTable:
+        """Returns the intervals of all labels under one label; these may overlap."""
+        rows = _rows(self.rows).copy()
+        rows["label"] = 0
+        return IntervalTable((label,) if rows.size else (), rows.tobytes())
+
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
         rows = _rows(self.rows)

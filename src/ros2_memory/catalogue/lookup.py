@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.zone_map import UNBOUNDED, Boxes, united
@@ -70,6 +70,7 @@ class SegmentDigests:
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
+        self._derived: dict[str, object] = {}
 
     @property
     def is_complete(self) -> bool:
@@ -116,6 +117,14 @@ class SegmentDigests:
         return self._cached(
             self._messages, topic, lambda: self.catalogue.messages(topic, self._entries_with(topic))
         )
+
+    def derived(self, name: str, compute: Callable[[], T]) -> T:
+        """Returns what is computed from the entries of this segment once, by name.
+
+        It lives as long as the segment is in use. A name always stands for one type of value.
+        """
+        # The type is the caller's: each name is used in one place.
+        return self._cached(cast("dict[str, T]", self._derived), name, compute)
 
     def undecodable(self, topic: str, number: int) -> Mapping[str, str] | None:
         """Returns, by message type, why messages of an entry cannot be decoded.

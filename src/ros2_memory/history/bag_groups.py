@@ -88,6 +88,12 @@ class Group:
             return sum(each.count for each in self.bags[0].bag.summary.of(self._topic))
         return len(self._positions())
 
+    def times(self) -> list[Ns]:
+        """Returns the log times of the messages of the window, in order."""
+        if self._has_duplicates:
+            return [each.time for each in self.messages()]
+        return [each.time for each in self._positions()]
+
     def fetch(self, indices: Sequence[int]) -> Iterator[StoredMessage]:
         """Yields the messages at these indices of the group, which must ascend."""
         if not indices:

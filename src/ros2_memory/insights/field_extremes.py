@@ -50,7 +50,7 @@ def extremes_of(
             continue
         for field in fields:
             value = view.memory.extractor.exact_at(message, channel.type, field)
-            numbers = [*_numbers(value)]
+            numbers = [*numbers_in(value)]
             count += len(numbers)
             if numbers:
                 _update(found, field, each.time, numbers)
@@ -60,7 +60,8 @@ def extremes_of(
     return tuple(found[field] for field in dict.fromkeys(fields) if field in found)
 
 
-def _numbers(value: JsonValue) -> Iterator[float]:
+def numbers_in(value: JsonValue) -> Iterator[float]:
+    """Yields the numbers of a field; not those of a summary in place of an array."""
     if isinstance(value, dict) and value.keys() <= _SUMMARY:
         return  # its numbers are counts, not the field's values
     for leaf in leaves(value):

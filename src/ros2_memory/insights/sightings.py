@@ -51,6 +51,8 @@ if TYPE_CHECKING:
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 """The robot may have moved since an older pose."""
+MAX_COUNTED: Final = 20_000
+"""Sightings that are counted over time."""
 
 
 @dataclass(slots=True)
@@ -103,10 +105,10 @@ def find_matches(
     condition = condition_of(memory.limits, condition_type, value, field, min_score)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
-    view = open_view(memory, call, min(_window(span, wall).stop, wall))
+    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
-    window = clamped(view, _window(span, now))
+    window = clamped(view, search_window(span, now))
     collected = _Sightings(limit, oldest_first=oldest_first)
     _collect(view, topic, condition, window, collected)
     searched = window
@@ -136,7 +138,7 @@ def find_matches(
     )
 
 
-def _window(span: TimeRange, now: Ns) -> TimeWindow:
+def search_window(span: TimeRange, now: Ns) -> TimeWindow:
     """Returns the window to search, with the slack of floats of seconds.
 
     Raises:
@@ -153,6 +155,26 @@ def _window(span: TimeRange, now: Ns) -> TimeWindow:
     if end < start:
         raise InvalidArgumentsError(f"end ({end_s}) lies before start ({start_s})")
     return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
+
+
+def read_sightings(
+    view: View, pattern: str, condition: Condition, window: TimeWindow
+) -> tuple[list[tuple[Ns, Ns]], Ns | None]:
+    """Returns the times (inclusive) of all sightings in a window, oldest first.
+
+    With them since when they are known, where the call's time is over before all is searched.
+
+    Raises:
+        InvalidArgumentsError: no value of the topics can meet the condition.
+        NoDataError: there is no such topic, or none of its messages can be decoded.
+        QueryTimeoutError: the call's time is over before the first match was found.
+    """
+    found = _Sightings(MAX_COUNTED, oldest_first=True)
+    _collect(view, pattern, condition, window, found)
+    if found.count > MAX_COUNTED:
+        view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
+    spans = [(each.first, each.newest.time) for each in found.selected]
+    return spans, spans[0][0] if found.cut and spans else None
 
 
 def _collect(

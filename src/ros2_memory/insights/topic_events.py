@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.topic_events import (
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
-_TOPIC_EVENTS: Final = DigestKind(
+TOPIC_EVENTS: Final = DigestKind(
     "story",
     look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
     encode=encode_topic_events,
@@ -42,23 +43,30 @@ def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
     """Returns what the messages of a topic report in a window; None where there is no message."""
     builder = TopicEventsBuilder()
 
-    def collect(messages: Iterable[StoredMessage]) -> tuple[TopicEvents | None, Span | None]:
-        collector = TopicEventsBuilder()
-        add_events(view, collector, messages)
-        events = collector.events(MAX_PER_BAG)
-        return events, None if events is None else (events.first, events.last)
-
     def join(events: TopicEvents | None, span: Span) -> None:
         if events is not None:
             builder.join(TopicEvents(*span) if events is NO_EVENTS else events)
 
     Fold(
-        _TOPIC_EVENTS,
+        TOPIC_EVENTS,
         add=lambda messages: add_events(view, builder, messages),
-        collect=collect,
+        collect=partial(collect_events, view),
         join=join,
     ).over(view, topic, window)
     return builder.events()
+
+
+def collect_events(
+    view: View, messages: Iterable[StoredMessage], at_most: int | None = MAX_PER_BAG
+) -> tuple[TopicEvents | None, Span | None]:
+    """Returns the digest of some messages, and the times of the first and the last, if any.
+
+    It has at most so many events of each kind, as that of a bag, unless all are wanted.
+    """
+    collector = TopicEventsBuilder()
+    add_events(view, collector, messages)
+    events = collector.events(at_most)
+    return events, None if events is None else (events.first, events.last)
 
 
 def add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:

@@ -191,6 +191,12 @@ _SearchField: TypeAlias = Annotated[
 ]
 
 
+_By: TypeAlias = Annotated[
+    Literal["day", "hour", "weekday"],
+    Field(description="Counts for each in local time: {columns, rows, all}."),
+]
+
+
 class Arguments(BaseModel):
     """The arguments of one query, whose parameters have the names of the fields.
 
@@ -308,6 +314,7 @@ class TopicRangeArguments(Arguments):
         Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_as_integer)
     ] = 100
     fields: _Fields = ()
+    by: _By | None = None
 
 
 class MotionArguments(Arguments):
@@ -366,6 +373,7 @@ class TrajectoryArguments(Arguments):
     max_waypoints: Annotated[
         Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)], BeforeValidator(_as_integer)
     ] = MAX_WAYPOINTS
+    by: _By | None = None
 
 
 class WindowArguments(Arguments):
@@ -418,3 +426,4 @@ class MatchesArguments(ConditionArguments):
         bool, Field(strict=True, description="Counts all; the first are told.")
     ] = False
     limit: _Limit = 5
+    by: _By | None = None

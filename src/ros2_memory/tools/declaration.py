@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, TypeAlias
@@ -68,6 +69,8 @@ class ToolDeclaration:
     """A query and all its names.
 
     `shows_example`: its schema alone does not show how it is called.
+    `count` answers in place of `query` where `by` is given, and takes those of the arguments that
+    bear on it.
     """
 
     names: tuple[ToolName, ...]
@@ -77,6 +80,7 @@ class ToolDeclaration:
     blocking: bool = False
     writes: bool = False
     shows_example: bool = False
+    count: Query | None = None
 
     def tools(self, defaults: Mapping[str, object], *, plain_times: bool = False) -> Iterator[Tool]:
         """Yields a tool for each name; `defaults` fill the description's placeholders.
@@ -112,4 +116,11 @@ class ToolDeclaration:
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))
-        return lambda memory, call: self.query(memory, call, **arguments)
+        if self.count is None:
+            return lambda memory, call: self.query(memory, call, **arguments)
+        by = arguments.pop("by")
+        if by is None:
+            return lambda memory, call: self.query(memory, call, **arguments)
+        count, taken = self.count, inspect.signature(self.count).parameters
+        chosen = {name: value for name, value in arguments.items() if name in taken}
+        return lambda memory, call: count(memory, call, by=by, **chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ros2_memory.insights.binned_matches import count_matches
 from ros2_memory.insights.recap import recap_or_before
 from ros2_memory.insights.saved_moments import list_moments, remember_moment
 from ros2_memory.insights.sightings import find_matches
@@ -29,6 +30,7 @@ _SIGHTINGS = ToolDeclaration(
     find_matches,
     blocking=True,
     shows_example=True,
+    count=count_matches,
 )
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),

@@ -30,8 +30,8 @@ get_position_at with the timestamp it gives.
 _HAPPENED: Final = """\
 - "When did you last see X, and where?": find_matches, with oldest_first for the first time. "What \
 happened, where did you stop?": recap; "why then?": with around. "Have you been here?": visits. \
-"How low was it?": get_topic_in_last with fields and max_samples 1. "Can I trust this?": \
-memory_status.
+"How low was it?": get_topic_in_last with fields and max_samples 1. "Usually, on each day?": by. \
+"Can I trust this?": memory_status.
 """
 _REST: Final = """\
 - Positions are metres, yaw_deg is counter-clockwise from x, in frame_id ({pose_topic}: usually \
@@ -76,6 +76,8 @@ that x and y are of.
 - What did a topic say: get_topic_seconds_ago, get_topic_in_last. How low or high was a \
 number: the extremes there, with fields and max_samples 1. What did it say when something \
 else held: get_value_when.
+- When do you usually, how often, how far, how low on each day, weekday or hour: by, of \
+find_matches, trajectory_summary and get_topic_in_range.
 - What do you remember at all, and how well: data_time_range, memory_status, list_recorded_topics.
 Answer with the figures of the reply as they stand: ages, durations and distances are in it.
 """

@@ -12,6 +12,8 @@ from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
 from ros2_memory.insights.at_each import at_each
+from ros2_memory.insights.binned_numbers import count_range
+from ros2_memory.insights.binned_path import count_path
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
@@ -125,6 +127,7 @@ _DECLARATIONS = (
         "max, max_at}}}} of all messages}}.",
         TopicRangeArguments,
         queries.topic_range,
+        count=count_range,
     ),
     ToolDeclaration(
         _at_and_ago("position", "Robot position"),
@@ -188,5 +191,6 @@ _DECLARATIONS = (
         TrajectoryArguments,
         queries.trajectory_summary,
         blocking=True,
+        count=count_path,
     ),
 )

@@ -94,14 +94,14 @@ def test_a_window_that_holds_too_much_says_so(
 
 @pytest.mark.parametrize("summary", [{"bytes": 921_600}, {"numbers": 2_000_000}])
 def test_a_summary_of_many_numbers_has_no_extremes(summary: JsonValue) -> None:
-    assert [*field_extremes._numbers(summary)] == []
-    assert [*field_extremes._numbers({"bytes": 1, "rate": 2})] == [2.0, 1.0]
+    assert [*field_extremes.numbers_in(summary)] == []
+    assert [*field_extremes.numbers_in({"bytes": 1, "rate": 2})] == [2.0, 1.0]
 
 
 @given(st.lists(st.lists(st.one_of(st.floats(), st.integers(-(10**400), 10**400)), max_size=4)))
 def test_extremes_are_the_least_and_the_greatest_finite_numbers(rows: list[list[float]]) -> None:
     found: dict[str, Extremes] = {}
-    finite = [[*field_extremes._numbers([*row, True, None, "9"])] for row in rows]
+    finite = [[*field_extremes.numbers_in([*row, True, None, "9"])] for row in rows]
     for time, numbers in enumerate(finite):
         if numbers:
             field_extremes._update(found, "a", time, numbers)

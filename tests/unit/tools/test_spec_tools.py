@@ -81,14 +81,15 @@ OPTIONAL = {
         "start",
         "end",
         "oldest_first",
+        "by",
         "limit",
     },
     "recap": {"start", "end", "around", "seconds_before"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
-    "get_topic_in_range": {"max_samples", "fields"},
-    "get_topic_in_last": {"max_samples", "fields"},
+    "get_topic_in_range": {"max_samples", "fields", "by"},
+    "get_topic_in_last": {"max_samples", "fields", "by"},
     "get_position_at": {"timestamps", "topic", "tolerance_s"},
     "get_position_seconds_ago": {"topic", "tolerance_s"},
     "get_velocity_at": {"timestamps", "topic", "tolerance_s"},
@@ -96,8 +97,8 @@ OPTIONAL = {
     "get_velocity_seconds_ago": {"topic", "tolerance_s"},
     "find_last_match": {"field", "min_score", "fields", "before"},
     "get_value_when": {"field", "min_score", "fields", "before"},
-    "trajectory_summary": {"topic", "max_waypoints"},
-    "recent_trajectory_summary": {"topic", "max_waypoints"},
+    "trajectory_summary": {"topic", "max_waypoints", "by"},
+    "recent_trajectory_summary": {"topic", "max_waypoints", "by"},
 }
 PAIRS = [
     ("get_topic_at_time", "get_topic_seconds_ago"),
@@ -408,4 +409,8 @@ def test_a_time_argument_replaces_the_span() -> None:
 def test_a_query_has_a_parameter_for_each_argument(declaration: ToolDeclaration) -> None:
     memory, call, *parameters = inspect.signature(declaration.query).parameters
     assert (memory, call) == ("memory", "call")
-    assert set(parameters) == set(declaration.arguments.model_fields)
+    arguments = set(declaration.arguments.model_fields)
+    assert set(parameters) == arguments - ({"by"} if declaration.count else set())
+    if declaration.count is not None:
+        memory, call, *counting = inspect.signature(declaration.count).parameters
+        assert {"by"} <= set(counting) <= arguments

@@ -1,0 +1,226 @@
+"""Bins of local time: days, hours of the day and weekdays, and what of a span falls into each.
+
+A window is cut where local days (or hours) begin; each piece belongs to one bin. Where clocks are
+changed, a day has 23 or 25 hours, the hour that is skipped has no piece, and the one that occurs
+twice is one piece of two hours: the pieces always cover the window exactly, so sums over bins are
+those of the window.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from datetime import date
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+import numpy as np
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from ros2_memory.core.model import TimeWindow
+
+ClockBin: TypeAlias = Literal["day", "hour", "weekday"]
+Offset: TypeAlias = "Callable[[int], int]"
+"""Returns how many seconds local time is ahead of UTC at a Unix second."""
+
+MOST_BINS: Final = 62
+"""Days that one answer lists: two months."""
+MOST_DAYS: Final = 1_000
+"""Days that are counted by hour or by weekday."""
+
+_HOUR_S: Final = 3_600
+_DAY_S: Final = 86_400
+_EPOCH: Final = date(1970, 1, 1).toordinal()
+_WEEKDAYS: Final = (
+    "Monday",
+    "Tuesday",
+    "Wednesday",
+    "Thursday",
+    "Friday",
+    "Saturday",
+    "Sunday",
+)
+
+
+def local_offset(at_s: int) -> int:
+    """Returns the offset of this machine's zone (or of TZ); 0 for years without a calendar."""
+    try:
+        return time.localtime(at_s).tm_gmtoff
+    except (OverflowError, ValueError, OSError):
+        return 0
+
+
+@dataclass(frozen=True, slots=True)
+class TimeBins:
+    """A window cut into pieces, each of which belongs to a bin.
+
+    Attributes:
+        names: of the bins, in order.
+        edges: where pieces begin, and where the last one ends; they ascend.
+        bin_of: for each piece, the index of its bin.
+        day_of: for each piece, the number of its local day since the epoch.
+    """
+
+    names: tuple[str, ...]
+    edges: NDArray[np.int64]
+    bin_of: NDArray[np.intp]
+    day_of: NDArray[np.int64]
+
+    def pieces(self, times: ArrayLike) -> NDArray[np.intp]:
+        """Returns the piece of each time; times outside of the window count to its ends."""
+        found = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
+        return np.clip(found, 0, len(self.bin_of) - 1)
+
+    def bins(self, times: ArrayLike) -> NDArray[np.intp]:
+        """Returns the bin of each time; times outside of the window count to its ends."""
+        return self.bin_of[self.pieces(times)]
+
+    def lengths(self, starts: ArrayLike, stops: ArrayLike) -> NDArray[np.int64]:
+        """Returns how much (ns) of half-open spans falls into each bin, all spans together.
+
+        What lies outside of the window does not count.
+        """
+        begin, end = np.asarray(starts, np.int64), np.asarray(stops, np.int64)
+        piece_lengths = np.array(
+            [
+                np.maximum(np.minimum(end, stop) - np.maximum(begin, start), 0).sum()
+                for start, stop in zip(self.edges[:-1], self.edges[1:], strict=True)
+            ],
+            np.int64,
+        )
+        totals = np.zeros(len(self.names), np.int64)
+        np.add.at(totals, self.bin_of, piece_lengths)
+        return totals
+
+
+def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -> TimeBins:
+    """Returns the bins of a window, which must not be empty.
+
+    Raises:
+        InvalidArgumentsError: there would be too many.
+    """
+    _check_length(window, by)
+    unit = _HOUR_S if by == "hour" else _DAY_S
+    starts = [window.start]
+    at = window.start // NS_PER_S
+    last = (window.stop - 1) // NS_PER_S
+    while (at := _next_edge(at, unit, offset)) <= last:
+        if at * NS_PER_S > window.start:
+            starts.append(at * NS_PER_S)
+    locals_s = [start // NS_PER_S + offset(start // NS_PER_S) for start in starts]
+    days = [local // _DAY_S for local in locals_s]
+    if by == "day":
+        keys = days
+    elif by == "weekday":
+        keys = [_weekday(day) for day in days]
+    else:
+        keys = [local % _DAY_S // _HOUR_S for local in locals_s]
+    known = sorted(set(keys))
+    if len(known) > MOST_BINS + 1:  # a window of so many days touches one day more
+        raise _too_long(by, MOST_BINS)
+    return TimeBins(
+        tuple(_name(key, by) for key in known),
+        np.array([*starts, window.stop], np.int64),
+        np.searchsorted(np.array(known), np.array(keys)),
+        np.array(days, np.int64),
+    )
+
+
+def _check_length(window: TimeWindow, by: ClockBin) -> None:
+    days = (window.stop - window.start) // (_DAY_S * NS_PER_S)
+    most = MOST_BINS if by == "day" else MOST_DAYS
+    if days > most:
+        raise _too_long(by, most)
+
+
+def _too_long(by: ClockBin, most: int) -> InvalidArgumentsError:
+    other = ", or by weekday" if by == "day" else ""
+    return InvalidArgumentsError(
+        f"by {by} takes at most {most} days: ask about a shorter window{other}"
+    )
+
+
+def _next_edge(at: int, unit: int, offset: Offset) -> int:
+    """Returns the first Unix second after this one in which another local day (or hour) begins."""
+    while True:
+        ahead = offset(at)
+        following = at - (at + ahead) % unit + unit
+        if offset(following) == ahead:
+            return following
+        # Clocks are changed on the way: the first second of the new time.
+        low, high = at, following
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if offset(middle) == ahead else (low, middle)
+        if (high + offset(high)) // unit != (high - 1 + ahead) // unit:
+            return high
+        at = high
+
+
+def _weekday(day: int) -> int:
+    return date.fromordinal(_EPOCH + day).weekday()
+
+
+def day_name(day: int) -> str:
+    """Returns the date of a local day, numbered since the epoch."""
+    return date.fromordinal(_EPOCH + day).isoformat()
+
+
+def _name(key: int, by: ClockBin) -> str:
+    if by == "day":
+        return day_name(key)
+    return _WEEKDAYS[key] if by == "weekday" else f"{key:02d}:00"
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Times in which something held, in order.
+
+    Attributes:
+        starts: when each began.
+        stops: when it ended.
+        begun: whether it is known that each began then; else it held before, or that is not known.
+    """
+
+    starts: NDArray[np.int64]
+    stops: NDArray[np.int64]
+    begun: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> Held:
+        """Returns them of tuples."""
+        starts, stops, begun = zip(*spans, strict=True) if spans else ((), (), ())
+        return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class UsualTime:
+    """When something first happened in a day, in seconds since local midnight, over many days."""
+
+    median_s: int
+    earliest_s: int
+    latest_s: int
+    days: int
+
+
+def first_of_days(bins: TimeBins, times: ArrayLike) -> list[Ns]:
+    """Returns the first of these times in each local day that has one, in order."""
+    ordered = np.sort(np.asarray(times, np.int64))
+    days = bins.day_of[bins.pieces(ordered)]
+    _, first = np.unique(days, return_index=True)
+    return [int(each) for each in ordered[first]]
+
+
+def usual_time(times: Sequence[Ns], offset: Offset = local_offset) -> UsualTime | None:
+    """Returns the usual time of day of one time from each of several days; None without any."""
+    if not times:
+        return None
+    clock = sorted((at // NS_PER_S + offset(at // NS_PER_S)) % _DAY_S for at in times)
+    median = (clock[(len(clock) - 1) // 2] + clock[len(clock) // 2]) // 2
+    return UsualTime(median, clock[0], clock[-1], len(clock))

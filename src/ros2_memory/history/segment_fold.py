@@ -1,0 +1,279 @@
+"""Folds the digests of a topic segment by segment, so that a week need not be joined anew.
+
+What is joined from the bags of a whole segment is kept for as long as the segment is in use. Bags
+that have no digest are read, the newest first, for a few seconds: what is older is left out then,
+and reported.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
+
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Deadline, Ns
+from ros2_memory.history.bag_groups import DigestKind, Group, StoredDigests, groups_of
+from ros2_memory.history.duplicates import COPY_HORIZON_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from ros2_memory.core.errors import UndecodableError
+    from ros2_memory.history.bag_groups import Span
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.view import View
+    from ros2_memory.index.segment import Segment
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+READING_S: Final = 4.0
+"""How long bags without a digest are read before the answer is partial."""
+_SHORT_NS: Final[Ns] = 300 * NS_PER_S
+"""A longer group that lies in several pieces is read, since its digest does not show what is in
+which."""
+
+
+class Digested(NamedTuple, Generic[T]):
+    """The digest of some messages, and the times of the first and the last of them (inclusive)."""
+
+    digest: T
+    first: Ns
+    last: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class Folded(Generic[R]):
+    """What was folded of a window, in order; what is before `since` was not read in time."""
+
+    parts: tuple[R, ...]
+    since: Ns | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentFold(Generic[T, R]):
+    """How digests of a topic are folded.
+
+    Attributes:
+        kind: of the digests.
+        collect: makes a digest of messages, if they amount to one; with their times.
+        reduce: joins digests in order; called with one at least.
+        name: of what `reduce` returns; another one for everything that it depends on.
+        edges: times at which long groups are cut, since `reduce` needs to know what is where.
+        failures: where `collect` puts messages that cannot be decoded.
+        leaves_out: whether a digest lacks something, since there is too much of it.
+        collect_all: makes one that lacks nothing, which is not stored.
+    """
+
+    kind: DigestKind[T]
+    collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]]
+    reduce: Callable[[Sequence[Digested[T]]], R]
+    name: str
+    edges: Sequence[Ns] = ()
+    failures: Sequence[UndecodableError] = ()
+    leaves_out: Callable[[T], bool] | None = None
+    collect_all: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]] | None = None
+
+    def over(self, view: View, topic: str, window: TimeWindow) -> Folded[R]:
+        """Folds a window.
+
+        Raises:
+            QueryTimeoutError: the call's time is over before anything is known.
+        """
+        reading = _Reading(view)
+        parts: list[R] = []
+        since: Ns | None = None
+        for share in reversed(_shares_of(view, topic, window)):
+            view.bags.check_deadline()
+            part, since = self._share(view, topic, share, window, reading)
+            if part is not None:
+                parts.append(part)
+            if since is not None:
+                break
+        if since is not None and not parts:
+            view.bags.check_deadline()
+            raise QueryTimeoutError(
+                f"the question needs more time; {view.bags.backfill_progress()}"
+                "ask about a shorter window"
+            )
+        return Folded(tuple(reversed(parts)), since)
+
+    def _share(
+        self, view: View, topic: str, share: _Share, window: TimeWindow, reading: _Reading
+    ) -> tuple[R | None, Ns | None]:
+        """Returns what is folded of a share, and since when, if not all was read in time."""
+        digests = view.bags.digests_of(share.segment)
+        if digests is None or not (share.alone and window.covers(share.first, share.last)):
+            return self._fold(view, topic, share, window, reading)
+        inner = [edge for edge in self.edges if share.first < edge <= share.last]
+        # The type of a name is one: `name` is part of it.
+        name = f"{self.name} {topic} {inner} {share.begins_in} {share.ends_in}"
+        known: list[R | None] = digests.derived(name, list)
+        if known:
+            return known[0], None
+        with _Completeness(view) as completeness:
+            folded, since = self._fold(view, topic, share, window, reading)
+            if since is None and completeness.is_complete and not self.failures:
+                known.append(folded)
+        return folded, since
+
+    def _fold(
+        self, view: View, topic: str, share: _Share, window: TimeWindow, reading: _Reading
+    ) -> tuple[R | None, Ns | None]:
+        # Wide enough to see the bags before that a group may have begun with.
+        begin = max(share.first - COPY_HORIZON_NS, MIN_NS)
+        inside = window.intersect(TimeWindow(begin, share.last + 1))
+        stored = StoredDigests(view, topic, self.kind, inside)
+        found: list[Digested[T]] = []
+        since: Ns | None = None
+        for group in reversed(groups_of(view.stream, topic, inside)):
+            if view.snapshot.timeline.segment_of(group.bags[0].bag) is not share.segment:
+                continue
+            known = stored.of(group) if group.is_whole and not self._is_cut(group) else None
+            if known is not None and not self._lacks(known[0]):
+                found.append(Digested(known[0], *known[1]))
+                continue
+            if reading.is_over:
+                since = max(each.last for each in group.bags) + 1
+                break
+            found.extend(reversed([*self._made(view, group, stored)]))
+        return (self.reduce(found[::-1]) if found else None), since
+
+    def _made(self, view: View, group: Group, stored: StoredDigests[T]) -> Iterator[Digested[T]]:
+        """Yields the digest of a group that is read; several where it is cut."""
+        if self._is_cut(group):
+            for _, messages in groupby(group.messages(), key=lambda each: self._piece(each.time)):
+                made, span = self.collect(messages)
+                if made is not None and span is not None:
+                    yield Digested(made, *span)
+            return
+        failed = len(self.failures)
+        # What cannot be read of other groups does not matter to this one.
+        with _Completeness(view):
+            made, span = self.collect(group.messages())
+            if made is not None and span is not None:
+                if group.is_whole and failed == len(self.failures):
+                    stored.store(group, made, span)
+                if self._lacks(made) and self.collect_all is not None:
+                    made, _ = self.collect_all(group.messages())
+                if made is not None:
+                    yield Digested(made, *span)
+
+    def _lacks(self, digest: T) -> bool:
+        return self.leaves_out is not None and self.leaves_out(digest)
+
+    def _is_cut(self, group: Group) -> bool:
+        first = min(each.first for each in group.bags)
+        last = max(each.last for each in group.bags)
+        return last - first > _SHORT_NS and self._piece(first) != self._piece(last)
+
+    def _piece(self, at: Ns) -> int:
+        return sum(edge <= at for edge in self.edges)
+
+
+class _Reading:
+    """How long bags have been read; counted from the first one on."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._deadline: Deadline | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no more bags are to be read."""
+        if self._deadline is None:
+            self._deadline = Deadline.after(READING_S)
+        return self._deadline.expired() or self._view.call.deadline.expired()
+
+
+class _Completeness:
+    """Shows whether all could be read inside of a block, whatever could not be before."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._before = True
+
+    def __enter__(self) -> Self:
+        notes = self._view.notes
+        self._before, notes.complete = notes.complete, True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._view.notes.complete = self._view.notes.complete and self._before
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all could be read so far."""
+        return self._view.notes.complete
+
+
+@dataclass(frozen=True, slots=True)
+class _Share:
+    """The groups of bags whose first bag is of one segment.
+
+    Attributes:
+        segment: the segment.
+        first: log time of the first message of its bags.
+        last: of the last one of all groups.
+        begins_in: its bags that belong to a group of the segment before.
+        ends_in: bags of the next segment that belong to its last group.
+        alone: whether these bags alone decide what is in them.
+    """
+
+    segment: Segment
+    first: Ns
+    last: Ns
+    begins_in: tuple[str, ...] = ()
+    ends_in: tuple[str, ...] = ()
+    alone: bool = True
+
+
+def _shares_of(view: View, topic: str, window: TimeWindow) -> list[_Share]:
+    """Returns the shares of all segments with a topic in a window, in order."""
+    if view.stream.may_be_relatched([topic]):
+        # Any bag may hold the original of a duplicate in any other.
+        bags = view.stream.overlapping_bags([topic], window)
+        if not bags:
+            return []
+        segment = view.snapshot.timeline.segment_of(bags[0].bag)
+        return [_Share(segment, bags[0].first, max(each.last for each in bags), alone=False)]
+    shares: list[_Share] = []
+    for segment in view.snapshot.timeline.segments:
+        span = segment.spans.get(topic)
+        if span is None or not window.overlaps(*span):
+            continue
+        crossing = _crossing(view, topic, segment) if shares else ()
+        if crossing:
+            before = shares[-1]
+            last = max(before.last, *(each.last for each in crossing))
+            names = tuple(f"{each.bag.file} {each.bag.size}" for each in crossing)
+            shares[-1] = replace(before, last=last, ends_in=names)
+            shares.append(_Share(segment, *span, begins_in=names))
+        else:
+            shares.append(_Share(segment, *span))
+    return shares
+
+
+def _crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:
+    """Returns the bags from a segment on that belong to a group which begins before it."""
+    timeline = view.snapshot.timeline
+    begin = segment.spans[topic][0]
+    end = begin
+
+    def crosses(group: Group) -> bool:
+        inside = [timeline.segment_of(each.bag) is segment for each in group.bags]
+        return any(inside) and not all(inside)
+
+    while True:
+        near = TimeWindow(
+            max(begin - COPY_HORIZON_NS, MIN_NS), min(end + COPY_HORIZON_NS + 1, MAX_NS)
+        )
+        group = next(filter(crosses, groups_of(view.stream, topic, near)), None)
+        if group is None:
+            return ()
+        last = max(each.last for each in group.bags)
+        if last <= end:
+            return tuple(each for each in group.bags if each.first >= begin)
+        end = last

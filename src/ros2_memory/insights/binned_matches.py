@@ -1,0 +1,212 @@
+"""How often and how long a condition held in each bin of a window.
+
+What counts as once:
+
+- A boolean that is asked for holds from the message in which it toggles to it until it toggles
+  back, or until nothing is recorded. It counts where it is seen to toggle.
+- A text on a topic of detections is a label. A thing is in view as in a recap: it may be missed
+  for `FLICKER_NS`, since detectors miss things now and then, and it is gone after `SILENCE_NS`
+  without a message. These and booleans are counted by the digests of events.
+- Any other condition holds in sightings, as `find_matches` returns them; these are read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from ros2_memory.analysis.conditions import Contains, Equals, parse_condition
+from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
+from ros2_memory.analysis.time_bins import Held
+from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
+from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.segment_fold import SegmentFold
+from ros2_memory.history.view import TimeRange, clamped, open_view
+from ros2_memory.insights.bins import BinnedWindow
+from ros2_memory.insights.sightings import read_sightings, search_window
+from ros2_memory.insights.topic_events import TOPIC_EVENTS, collect_events
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.analysis.topic_events import KnownFlag
+    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.segment_fold import Digested, Folded
+    from ros2_memory.history.view import View
+    from ros2_memory.insights.bins import By
+    from ros2_memory.results import Bins
+
+_TRUTHS = {"true": True, "false": False}
+
+
+def count_matches(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    condition_type: str,
+    value: JsonValue,
+    *,
+    by: By,
+    field: str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    last_s: float | None = None,
+) -> Bins:
+    """Returns how often and how long a condition held in each bin, and how long was recorded.
+
+    Raises:
+        InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or there
+            are too many bins.
+        NoDataError: the memory holds nothing in the window, or no such topic.
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    span = TimeRange(start_s, end_s, last_s)
+    wall = memory.clock.now()
+    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
+    asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest)))
+    topics = matching_topics(view, topic)
+    binned = BinnedWindow(view, asked, by, topics)
+    binned.add_heard("topic_s", topics)
+    held = None
+    if len(topics) == 1 and isinstance(condition.test, Contains | Equals):
+        held, since = _by_events(binned, topics[0], condition, value)
+        binned.note_since(since if held is not None else None)
+    if held is None:
+        spans, since = read_sightings(view, topic, condition, asked)
+        held = Held.of([(first, last, True) for first, last in spans])
+        binned.note_since(since)
+    binned.add_held(held)
+    return binned.answer()
+
+
+def _by_events(
+    binned: BinnedWindow, topic: str, condition: Condition, value: JsonValue
+) -> tuple[Held | None, Ns | None]:
+    """Returns when a condition held, by the events of a topic, and since when these are known.
+
+    None where events do not show it.
+    """
+    view = binned.view
+    if not any(map(has_events, view.snapshot.timeline.types_of(topic))):
+        return None, None
+    wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
+    if wanted is None and (condition.field is not None or not isinstance(value, str)):
+        return None, None
+    folded = _events(view, topic, binned.asked)
+    _note_limits(view, topic, folded)
+    if wanted is not None:
+        return _flag_held(folded, condition, _gaps_of(binned, topic), wanted=wanted), folded.since
+    return _label_held(folded, condition), folded.since
+
+
+def _events(view: View, topic: str, window: TimeWindow) -> Folded[TopicEvents]:
+    fold = SegmentFold(
+        TOPIC_EVENTS,
+        partial(collect_events, view),
+        _joined_events,
+        name="events",
+        leaves_out=lambda events: events is not None and events.left_out > 0,
+        collect_all=partial(collect_events, view, at_most=None),
+    )
+    return fold.over(view, topic, window)
+
+
+def _joined_events(found: Sequence[Digested[TopicEvents | None]]) -> TopicEvents:
+    builder = TopicEventsBuilder()
+    for digest, first, last in found:
+        if digest is not None:
+            builder.join(TopicEvents(first, last) if digest is NO_EVENTS else digest)
+    return builder.events() or TopicEvents(1, 0)
+
+
+def _note_limits(view: View, topic: str, folded: Folded[TopicEvents]) -> None:
+    left_out = sum(each.left_out for each in folded.parts)
+    if left_out:
+        view.notes.add(f"{topic} changes too often to count all: {left_out} more")
+    undecodable = sum(each.undecodable for each in folded.parts)
+    if undecodable:
+        view.notes.complete = False
+        view.notes.add(f"messages of {topic} that could not be decoded: {undecodable}")
+
+
+def _label_held(folded: Folded[TopicEvents], condition: Condition) -> Held | None:
+    """Returns when a thing with a label was in view; None where there are no labels at all."""
+    if not any(each.visible.labels for each in folded.parts):
+        return None
+    parts = [
+        IntervalPart(each.first, each.last, _of_label(each.visible, condition))
+        for each in folded.parts
+        if each.first <= each.last
+    ]
+    seen = joined(parts).visible.intervals()
+    return Held.of([(each.first, each.last, True) for each in seen])
+
+
+def _of_label(visible: IntervalTable, condition: Condition) -> IntervalTable:
+    """Returns the intervals of all labels that meet a condition, as those of one label."""
+    others = [label for label in visible.labels if not condition.test.matches(label)]
+    return visible.without(others).as_one("")
+
+
+def _flag_held(
+    folded: Folded[TopicEvents],
+    condition: Condition,
+    gaps: Sequence[tuple[Ns, Ns]],
+    *,
+    wanted: bool,
+) -> Held | None:
+    """Returns when a boolean held; None where it is not clear which boolean is meant."""
+    builder = TopicEventsBuilder()
+    for part in folded.parts:
+        if part.first <= part.last:
+            builder.join(replace(part, visible=IntervalTable(), errors=()))
+    events = builder.events()
+    if events is None:
+        return Held.of([])
+    meant = [each for each in events.known if condition.field in {None, each.path}]
+    if len(meant) != 1:
+        return None
+    spans = _spans_of(events, meant[0], wanted=wanted)
+    return Held.of([part for each in spans for part in _without_gaps(*each, gaps)])
+
+
+def _spans_of(
+    events: TopicEvents, known: KnownFlag, *, wanted: bool
+) -> Iterator[tuple[Ns, Ns, bool]]:
+    """Yields when a boolean had a value, and whether it is known that it toggled to it then."""
+    since, begun, value = known.at, False, known.first
+    for toggle in events.toggles:
+        if toggle.path == known.path:
+            if value is wanted:
+                yield since, toggle.time, begun
+            since, begun, value = toggle.time, True, toggle.value
+    if value is wanted:
+        yield since, events.last, begun
+
+
+def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
+    """Returns the gaps in the recording, each until the first message of a topic after it."""
+    firsts = [each.first for each in binned.view.stream.overlapping_bags([topic], binned.asked)]
+    return [
+        (begin, min((each for each in firsts if each >= begin), default=end))
+        for begin, end in binned.gaps
+    ]
+
+
+def _without_gaps(
+    start: Ns, stop: Ns, begun: bool, gaps: Sequence[tuple[Ns, Ns]]
+) -> list[tuple[Ns, Ns, bool]]:
+    """Returns a time without the gaps in it; what comes after a gap is not known to begin there."""
+    parts: list[tuple[Ns, Ns, bool]] = []
+    for begin, end in gaps:
+        if end < start or begin >= stop:
+            continue
+        if begin > start:
+            parts.append((start, begin, begun))
+        start, begun = end, False
+    return [*parts, (start, stop, begun)] if start < stop or not parts else parts

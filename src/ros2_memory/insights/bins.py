@@ -1,0 +1,175 @@
+"""What all counts over time have in common: the window, its bins, and how much was recorded."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from ros2_memory.analysis.time_bins import first_of_days, time_bins, usual_time
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps, unix_text
+from ros2_memory.history.no_data import no_data_between
+from ros2_memory.results import Bins, Usual
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.analysis.time_bins import Held, TimeBins
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.view import View
+    from ros2_memory.results import BinColumn
+
+By: TypeAlias = Literal["day", "hour", "weekday"]
+Values: TypeAlias = "Sequence[float | None]"
+
+
+class BinnedWindow:
+    """A window of the memory, cut into bins, to which columns of values are added.
+
+    Raises:
+        InvalidArgumentsError: there are too many bins.
+        NoDataError: nothing of the window was recorded.
+    """
+
+    def __init__(self, view: View, asked: TimeWindow, by: By, topics: Sequence[str]) -> None:
+        snapshot = view.snapshot
+        self.view = view
+        self.asked = asked
+        self._by = by
+        self._topics = tuple(topics)
+        start, end = asked.asked()
+        if snapshot.earliest is not None and snapshot.latest is not None:
+            start, end = max(start, snapshot.earliest), min(end, snapshot.latest)
+        if end < start:
+            raise no_data_between(view, self._topics, asked)
+        # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
+        self.window = TimeWindow(start, max(end, start + 1))
+        self.bins: TimeBins = time_bins(self.window, by)
+        self._columns: list[tuple[str, BinColumn]] = []
+        self._values: list[Values] = []
+        self._all: list[float | None] = []
+        self._usual: Usual | None = None
+        self.gaps = list(recording_gaps(view, self.window))
+        self._recorded = self._lengths([(self.window.start, self.window.stop)]) - self._lengths(
+            self.gaps
+        )
+        self.add("recorded_s", "duration", self._recorded.tolist(), int(self._recorded.sum()))
+
+    def add(self, name: str, kind: BinColumn, values: Values, whole: float | None) -> None:
+        """Adds a column, and its value for all bins together."""
+        self._columns.append((name, kind))
+        self._values.append(values)
+        self._all.append(whole)
+
+    def add_heard(self, column: str, topics: Sequence[str]) -> None:
+        """Adds how long topics had messages, without pauses far longer than usual on them."""
+        spans = [
+            (each.first, each.last)
+            for each in self.view.stream.overlapping_bags(topics, self.window)
+        ]
+        pause = 2 * _split_ns(self.view)
+        heard: list[tuple[Ns, Ns]] = []
+        for first, last in spans:
+            if heard and first - heard[-1][1] <= pause:
+                heard[-1] = (heard[-1][0], max(heard[-1][1], last))
+            else:
+                heard.append((first, last))
+        lengths = self._lengths(heard)
+        self.add(column, "duration", lengths.tolist(), int(lengths.sum()))
+
+    def add_held(self, held: Held) -> None:
+        """Adds how often something began, how long it held, and its first and last time."""
+        starts, stops = (np.clip(each, *self._ends) for each in (held.starts, held.stops))
+        size = len(self.bins.names)
+        begins = starts[held.begun]
+        counts = np.bincount(self.bins.bins(begins), minlength=size) if len(begins) else [0] * size
+        self.add("count", "count", [int(each) for each in counts], len(begins))
+        lengths = self._lengths(list(zip(starts.tolist(), stops.tolist(), strict=True)))
+        self.add("seconds", "duration", lengths.tolist(), int(lengths.sum()))
+        first = _least(self.bins.bins(begins), begins, size)
+        self.add("first", "time", first, min(begins.tolist(), default=None))
+        last = self._last_held(starts, stops)
+        self.add("last", "time", last, max(stops.tolist(), default=None))
+        self._usual = self._usual_first(begins)
+
+    def _last_held(self, starts: NDArray[np.int64], stops: NDArray[np.int64]) -> Values:
+        """Returns for each bin when something held there for the last time."""
+        found: list[float | None] = [None] * len(self.bins.names)
+        begin, end = self.bins.pieces(starts), self.bins.pieces(stops)
+        for at, (first, last) in enumerate(zip(begin.tolist(), end.tolist(), strict=True)):
+            for piece in range(first, last + 1):
+                until = min(int(stops[at]), int(self.bins.edges[piece + 1]) - 1)
+                number = int(self.bins.bin_of[piece])
+                known = found[number]
+                found[number] = until if known is None else max(known, until)
+        return found
+
+    def _usual_first(self, begins: NDArray[np.int64]) -> Usual | None:
+        usual = usual_time(first_of_days(self.bins, begins)) if len(begins) else None
+        if usual is None:
+            return None
+        recorded = self._days_recorded()
+        return Usual(usual.median_s, usual.earliest_s, usual.latest_s, usual.days, recorded)
+
+    def _days_recorded(self) -> int:
+        """Returns how many local days have something recorded."""
+        edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
+        found = set()
+        for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
+            missing = sum(max(min(end, stop) - max(begin, start), 0) for begin, end in self.gaps)
+            if missing < stop - start:
+                found.add(day)
+        return len(found)
+
+    def _lengths(self, spans: Sequence[tuple[Ns, Ns]]) -> NDArray[np.int64]:
+        return self.bins.lengths([each[0] for each in spans], [each[1] for each in spans])
+
+    @property
+    def _ends(self) -> tuple[Ns, Ns]:
+        return self.window.start, self.window.stop
+
+    def note_since(self, since: Ns | None) -> None:
+        """Notes that what is before a moment was not counted, if there is one."""
+        if since is None:
+            return
+        self.view.notes.complete = False
+        self.view.notes.add(
+            f"only what is after {unix_text(since)} is counted: "
+            f"{self.view.bags.backfill_progress() or 'the time was over; '}"
+            "ask about a shorter window"
+        )
+
+    def answer(self) -> Bins:
+        """Returns the answer, with notes on what could not be read."""
+        note_unread(self.view, self.asked)
+        note_edges(self.view, self.asked)
+        rows = zip(*self._values, strict=True)
+        return Bins(
+            by=self._by,
+            about=self._topics,
+            start=self.window.start,
+            end=self.window.stop,
+            columns=tuple(self._columns),
+            rows=tuple(
+                (name, tuple(values)) for name, values in zip(self.bins.names, rows, strict=True)
+            ),
+            all=tuple(self._all),
+            usual=self._usual,
+            notes=self.view.notes.sentences(),
+        )
+
+
+def _split_ns(view: View) -> Ns:
+    return round(view.memory.limits.split_duration_s * 1e9)
+
+
+def _least(bins: NDArray[np.intp], times: NDArray[np.int64], size: int) -> list[float | None]:
+    """Returns the least time in each bin; None where there is none."""
+    found: list[float | None] = [None] * size
+    for number, at in zip(bins.tolist(), times.tolist(), strict=True):
+        known = found[number]
+        found[number] = at if known is None else min(known, at)
+    return found

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+import json
+import math
+from datetime import datetime
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.history import segment_fold
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.view import TimeRange
+from ros2_memory.insights.binned_matches import count_matches
+from ros2_memory.insights.binned_numbers import count_range
+from ros2_memory.insights.binned_path import count_path
+from ros2_memory.queries import trajectory_summary
+from tests.support.bags import boolean, detections, odom, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.memories import asked, memory_of, recalling
+from tests.support.random_histories import write_history
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.history.context import Memory
+    from ros2_memory.results import Bins
+    from tests.support.bags import Msg
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+EVERY = 30 * S
+HOURS = 30
+OBJECTS = "/vision/scene/scene_objects"
+LATEST = QuerySettings(now="latest", split_duration_s=3600.0)
+
+
+def way(number: int) -> float:
+    """How far along its way the robot is at a pose: away from the dock, and back again."""
+    out = number % 1500 - 1000
+    return 0.1 * min(out, 500 - out) if out > 0 else 0.0
+
+
+def driven() -> Iterator[Msg]:
+    """A day and a half: the robot leaves its dock twice, drives, and sees a cup on its way."""
+    for number in range(HOURS * 3600 * S // EVERY):
+        at = BEGIN + number * EVERY
+        yield odom(at, way(number), 0.0)
+        yield boolean(at + 1, number % 1500 < 1000, topic="/is_docked")
+        if number % 100 < 3:
+            for second in range(8):
+                yield detections(at + 2 + second * S, ["cup"] if second % 4 else ["fork", "Cup"])
+
+
+def cut(folder: Path, messages: Sequence[Msg], draw: Random) -> None:
+    """Writes messages as splits of several recordings, of any length."""
+    ordered = sorted(messages, key=lambda each: each.log_time)
+    number, recording = 0, 0
+    while ordered:
+        size = draw.randint(20, 1000)
+        some, ordered = ordered[:size], ordered[size:]
+        write_mcap(folder / f"rec_{recording}" / f"rec_{recording}_{number}.mcap", some)
+        number += 1
+        if draw.random() < 0.3:
+            recording, number = recording + 1, 0
+
+
+def local(at: float, by: str) -> str:
+    when = datetime.fromtimestamp(at // S).astimezone()
+    if by == "day":
+        return when.date().isoformat()
+    return when.strftime("%A") if by == "weekday" else f"{when.hour:02d}:00"
+
+
+def column(answer: Bins, name: str) -> dict[str, float | None]:
+    at = [each[0] for each in answer.columns].index(name)
+    return {row: values[at] for row, values in answer.rows}
+
+
+def whole(answer: Bins, name: str) -> float | None:
+    return answer.all[[each[0] for each in answer.columns].index(name)]
+
+
+def everything() -> TimeRange:
+    return TimeRange(BEGIN / S, BEGIN / S + HOURS * 3600)
+
+
+BYS = ("day", "hour", "weekday")
+
+
+@pytest.fixture(scope="module")
+def memories(tmp_path_factory: pytest.TempPathFactory) -> list[Memory]:
+    """The same day and a half in differently cut bags, with and without a catalogue."""
+    messages = list(driven())
+    found = []
+    for seed in range(2):
+        folder = tmp_path_factory.mktemp(f"cut{seed}")
+        cut(folder, messages, Random(seed))
+        memory = memory_of(folder, limits=LATEST)
+        found += [memory, recalling(memory, folder, part=0.6), recalling(memory, folder)]
+    return found
+
+
+@pytest.mark.parametrize("by", BYS)
+def test_a_boolean_is_counted_where_it_toggles_and_lasts_in_every_bin(
+    memories: list[Memory], by: str
+) -> None:
+    starts = [BEGIN + 1000 * EVERY + 1, BEGIN + 2500 * EVERY + 1]
+    stops = [BEGIN + 1500 * EVERY + 1, BEGIN + 3000 * EVERY + 1]
+    for memory in memories:
+        answer = count_matches(memory, Call(), "/is_docked", "equals", False, by=by)  # type: ignore[arg-type]
+        counts, held = column(answer, "count"), column(answer, "seconds")
+        for name in counts:
+            assert counts[name] == sum(local(each, by) == name for each in starts)
+        assert sum(each or 0 for each in held.values()) == whole(answer, "seconds")
+        assert whole(answer, "seconds") == sum(stops) - sum(starts)
+        first = {local(each, by): each for each in reversed(starts)}
+        assert {name: at for name, at in column(answer, "first").items() if at} == first
+        assert answer.usual is not None
+        assert whole(answer, "recorded_s") == (HOURS * 3600 - 30) * S + 1
+
+
+@pytest.mark.parametrize("by", BYS)
+def test_all_ways_to_store_a_history_give_the_same_counts(memories: list[Memory], by: str) -> None:
+    def answers(memory: Memory) -> list[Bins]:
+        return [
+            count_matches(memory, Call(), OBJECTS, "contains", "cup", by=by),  # type: ignore[arg-type]
+            count_matches(memory, Call(), "/odom", "above", 20, field="position.x", by=by),  # type: ignore[arg-type]
+            count_path(memory, Call(), everything(), by),  # type: ignore[arg-type]
+            count_range(memory, Call(), OBJECTS, everything(), by),  # type: ignore[arg-type]
+        ]
+
+    first, *others = map(answers, memories)
+    assert whole(first[0], "count") == 108
+    for other in others:
+        for one, again in zip(first, other, strict=True):
+            assert one.columns == again.columns
+            assert one.notes == again.notes
+            for (name, values), (same, others_) in zip(one.rows, again.rows, strict=True):
+                assert name == same
+                assert others_ == pytest.approx(values)
+        # Asked again, from what is remembered of whole segments.
+    for memory, known in zip(memories, [first, *others], strict=True):
+        assert answers(memory) == known
+
+
+@pytest.mark.parametrize("by", BYS)
+def test_the_metres_of_all_bins_are_those_of_the_way(memories: list[Memory], by: str) -> None:
+    for memory in memories:
+        answer = count_path(memory, Call(), everything(), by)  # type: ignore[arg-type]
+        path = trajectory_summary(memory, Call(), everything()).trajectory
+        metres = column(answer, "metres")
+        assert math.fsum(each or 0 for each in metres.values()) == pytest.approx(
+            whole(answer, "metres")
+        )
+        assert whole(answer, "metres") == pytest.approx(path.totals.distance_m, rel=1e-3)
+        for name, each in metres.items():
+            steps = [
+                abs(way(number) - way(number - 1))
+                for number in range(1, HOURS * 120)
+                if local(BEGIN + number * EVERY, by) == name
+            ]
+            # A bag in which a bin ends is shared out by its drawn path.
+            assert each == pytest.approx(math.fsum(steps), abs=0.5)
+
+
+def test_numbers_have_their_extremes_and_mean_in_each_bin(memories: list[Memory]) -> None:
+    span = TimeRange(BEGIN / S, BEGIN / S + 10 * 3600)
+    for memory in memories:
+        answer = count_range(memory, Call(), "/odom", span, "hour", fields=["position.x"])
+        values: dict[str, list[float]] = {}
+        for number in range(10 * 120 + 1):
+            at = BEGIN + min(number, 10 * 120 - 1) * EVERY
+            values.setdefault(local(at, "hour"), []).append(way(number))
+        # What comes at the very end of the window counts to the bin that ends there.
+        assert sum(each or 0 for each in column(answer, "count").values()) == 1201
+        for name, numbers in values.items():
+            assert column(answer, "position.x.max")[name] == max(numbers)
+            assert column(answer, "position.x.mean")[name] == pytest.approx(
+                math.fsum(numbers) / len(numbers)
+            )
+
+
+def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> None:
+    for name, begin in (("one", 0), ("two", 20_000)):
+        messages = [
+            boolean(BEGIN + (begin + at) * S, at >= 50, topic="/is_docked") for at in range(100)
+        ]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+    memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
+    for each in (memory, recalling(memory, tmp_path)):
+        docked = count_matches(each, Call(), "/is_docked", "equals", True, by="day")
+        assert (whole(docked, "count"), whole(docked, "seconds")) == (2, 2 * 49 * S)
+        off = count_matches(each, Call(), "/is_docked", "equals", "false", by="day")
+        # Twice it was off the dock from the beginning on: nobody saw it leave.
+        assert (whole(off, "count"), whole(off, "seconds")) == (0, 2 * 50 * S)
+        assert whole(off, "recorded_s") == 2 * 99 * S
+        assert off.usual is None
+
+
+def test_bags_without_a_digest_are_read_for_seconds_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(4):
+        messages = [odom(BEGIN + (number * 10 + at) * S, at, 0.0) for at in range(10)]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
+    span = TimeRange(BEGIN / S, BEGIN / S + 40)
+    over = iter([False, False, True])
+
+    class Reading(segment_fold._Reading):
+        @property
+        def is_over(self) -> bool:
+            return next(over)
+
+    monkeypatch.setattr(segment_fold, "_Reading", Reading)
+    answer = count_path(memory, Call(), span, "day")
+    assert whole(answer, "metres") == 18.0
+    assert f"only what is after {BEGIN // S + 19}.000001 is counted" in answer.notes[0]
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), by=st.sampled_from(BYS), part=st.sampled_from([0.5, 1.0]))
+def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> None:
+    with TemporaryDirectory() as folder:
+        bags = Path(folder)
+        written = write_history(bags, Random(seed))
+        memory = memory_of(bags, clock=FixedClock(max(written.moments) + S))
+        known = recalling(memory, bags, part=part)
+        start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
+        questions: list[tuple[str, dict[str, object]]] = [
+            ("find_matches", {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}),
+            ("find_matches", {"topic": "/bumper", "condition_type": "equals", "value": True}),
+            ("trajectory_summary", {}),
+            ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"]}),
+        ]
+        for name, question in questions:
+            given_ = {**question, "start": start, "end": end, "by": by}
+            plain = asked(memory, bags, name, **given_)
+            assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
+            assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
