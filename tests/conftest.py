@@ -42,11 +42,26 @@ for _number, _handler in (
         signal.signal(_number, _handler)
 
 UNMEASURED = (
+    "faults/test_catalogue_faults.py",
+    "faults/test_failing_reads.py",
+    "faults/test_kills.py",
+    "faults/test_running_server.py",
+    "faults/test_two_servers.py",
     "fuzz/*.py",
+    "oracle/*.py",
     "soak/*.py",
     "test_benchmarks.py",
+    "test_cancelled.py",
+    "test_catalogue_versions.py",
+    "test_demo.py::test_it_",
     "test_documents.py",
-    "test_hostile_arguments.py",
+    "test_export.py::test_other_programs_open_what_comes_of_public_robots_bags",
+    "test_home_questions.py",
+    "test_home_world.py",
+    "test_hostile_*.py",
+    "test_index_killed.py",
+    "test_live_*.py",
+    "test_looking_only.py",
     "test_*_real_bags.py",
     "test_path_length.py",
     "test_planner_questions.py",
@@ -54,13 +69,19 @@ UNMEASURED = (
     "test_recorded_sessions.py",
     "test_same_answers.py",
     "test_standstills.py",
+    "test_time_zero.py",
+    "test_trajectory.py::test_a_long_way_is_drawn_in_bounded_memory",
+    "test_trajectory.py::test_a_path_in_very_many_pieces_is_held_in_bounded_memory",
     "test_week.py",
 )
-"""Tests in which coverage is not measured, which takes up to five times as long as the test itself.
+"""Tests in which coverage is not measured, which takes up to five times as long as the test itself:
+files, or tests of a file by how their names begin.
 
-They ask much of everything at once, or of hours of poses; what they run is run by other tests of
-the same room, or of the tools above it, as well.
+They ask much of everything at once, of hours of poses, or of programs over and over; what they run
+is run by other tests of the same room, or of the tools above it, as well.
 """
+DRAWN = "hypothesis"
+"""The mark of tests that draw their examples: the same lines many times, so not measured either."""
 _IN_PROGRAMS = "COVERAGE_PROCESS_CONFIG"
 """By this, coverage.py measures in the programs that are started."""
 
@@ -75,11 +96,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place(item.nodeid))
 
 
+def is_measured(item: pytest.Item) -> bool:
+    """Whether what a test runs counts for coverage."""
+    if item.get_closest_marker(DRAWN) is not None:
+        return False
+    names = (each.partition("::") for each in UNMEASURED)
+    return not any(item.path.match(file) and item.name.startswith(test) for file, _, test in names)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Measures no coverage in some tests, their fixtures, and the programs that they start."""
     measuring = Coverage.current()
-    if measuring is None or not any(item.path.match(pattern) for pattern in UNMEASURED):
+    if measuring is None or is_measured(item):
         return (yield)
     in_programs = os.environ.pop(_IN_PROGRAMS, None)
     measuring.stop()
