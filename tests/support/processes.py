@@ -26,6 +26,8 @@ PATIENCE_S: Final = 180.0
 No promise of the product: where all is well nobody waits for so long, and a machine that has more
 to do than it has processors may need most of it to start one program.
 """
+LONGEST_PAUSE_S: Final = 0.05
+"""Between two looks at a condition that is waited for."""
 
 
 def until(what: Callable[[], T | None], *, timeout_s: float = PATIENCE_S) -> T:
@@ -34,13 +36,15 @@ def until(what: Callable[[], T | None], *, timeout_s: float = PATIENCE_S) -> T:
     Raises:
         AssertionError: there was none within the timeout.
     """
-    give_up = time.monotonic() + timeout_s
+    give_up, pause_s = time.monotonic() + timeout_s, 0.01
     while True:
         found = what()
         if found is not None and found is not False:
             return found
         assert time.monotonic() < give_up, f"{what} did not come about within {timeout_s:g} s"
-        time.sleep(0.01)
+        time.sleep(pause_s)
+        # Asking takes processor time, often of the very program that is waited for.
+        pause_s = min(1.2 * pause_s, LONGEST_PAUSE_S)
 
 
 BOUND_S: Final = PATIENCE_S
