@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.xdist_group("heavy")
 
 LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
-QUESTIONS: Final = 2000 if LONG else 80
+QUESTIONS: Final = 2000 if LONG else 50
 SEEDS: Final = range(5) if LONG else range(1)
 
 

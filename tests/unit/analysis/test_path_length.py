@@ -86,7 +86,7 @@ def plain_sum(points: Points) -> float:
 def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -> Trajectory:
     """Pose by pose, or as the digests of bags that are cut at these poses."""
     times = [BEGIN + round(index * S / hertz) for index in range(len(points))]
-    poses = [Pose((float(x), float(y), float(z)), None) for x, y, z in points]
+    poses = [Pose((x, y, z), None) for x, y, z in points.tolist()]
     builder = TrajectoryBuilder(10.0)
     if cuts is None:
         for time, pose in zip(times, poses, strict=True):
@@ -103,7 +103,7 @@ def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -
 # Standing
 
 
-@pytest.mark.parametrize(("hertz", "axes"), [(50, 3), (50, 2), (20, 3), (5, 3), (1, 3)])
+@pytest.mark.parametrize(("hertz", "axes"), [(50, 3), (20, 2), (20, 3), (5, 3), (1, 3)])
 def test_an_hour_of_standing_with_10_mm_of_noise_is_no_way(hertz: int, axes: int) -> None:
     poses = noisy(np.zeros((HOUR_S * hertz, 3)), 0.010, axes=axes)
     assert plain_sum(poses) > 50

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from dataclasses import replace
 from functools import partial
@@ -72,6 +73,9 @@ CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
     ("near_position", {"x": 500.0, "y": 0.0}),
     ("near_position", {"x": 80, "y": 0.5, "z": 1.0}),
 )
+
+EXAMPLES = 200 if os.environ.get("EPISODIC_LONG") == "1" else 20
+"""Histories for each clock, others in every run; some hundred questions are asked of each."""
 
 FIELDS = ("goal", "detections.label", "detections.bbox", "position", "value", "data", "nowhere")
 
@@ -197,7 +201,7 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
 
 
 @pytest.mark.parametrize("clock", ["auto", "stamp"])
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 1.0, 0.5]))
 @example(seed=572545084, part=1.0)
 @example(seed=246, part=1.0)
