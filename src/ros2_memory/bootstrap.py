@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.catalogue.digest import Digester
     from ros2_memory.config import AdapterNode, Settings
     from ros2_memory.core.telemetry import Observer
     from ros2_memory.history.context import Memory, QuerySettings
@@ -239,18 +240,29 @@ def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str,
         {name: dict(fields) for name, fields in schemas.items()},
         settings.data.max_array_length,
         settings.data.max_plausible_speed_mps,
+        settings.data.pose_topic,
+        settings.data.map_frame,
+        settings.data.tf_topics,
+        settings.data.tf_clock,
     )
     return hashlib.sha256(json.dumps(depends_on).encode()).hexdigest()[:16]
 
 
 def build_backfill(settings: Settings, memory: Memory) -> Backfill:
     """Returns what fills the catalogue of a memory."""
-    from ros2_memory.catalogue.digest import Digester
     from ros2_memory.serving.backfill import Backfill
 
-    limit = memory.limits.max_plausible_speed_mps
-    return Backfill(
-        memory, Digester(memory.reader, memory.extractor, limit), settings.recording.bag_dir
+    return Backfill(memory, build_digester(memory), settings.recording.bag_dir)
+
+
+def build_digester(memory: Memory) -> Digester:
+    """Returns what digests the bags of a memory."""
+    from ros2_memory.catalogue.digest import Digester
+    from ros2_memory.history.map_digests import map_settings
+
+    limits = memory.limits
+    return Digester(
+        memory.reader, memory.extractor, limits.max_plausible_speed_mps, map_settings(limits)
     )
 
 

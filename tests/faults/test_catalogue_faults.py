@@ -18,6 +18,7 @@ import structlog
 from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache
+from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.core.errors import BagError
 from ros2_memory.serving.backfill import (
@@ -247,7 +248,7 @@ class Busy(sqlite3.Connection):
 
 
 class Refusing(Digester):
-    def digest(self, path: Path) -> Digest:
+    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
         raise BagError(str(path), "no digest of it can be made")
 
 

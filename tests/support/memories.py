@@ -19,6 +19,8 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.map_digests import BagStatics, map_settings
+from ros2_memory.history.view import View
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -91,11 +93,14 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     catalogue = Catalogue([bag_dir / FOLDER / FILE], "test")
     recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
-    digester = Digester(memory.reader, memory.extractor, limit)
+    digester = Digester(memory.reader, memory.extractor, limit, map_settings(memory.limits))
+    statics = BagStatics(View(memory, Call()))
     bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)
     for bag in bags[: round(part * len(bags))]:
         with suppress(BagError):  # one that is damaged inside stays without an entry
-            assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))
+            assert catalogue.put(
+                BagKey.of(bag, bag_dir), digester.digest(bag.path, statics.of(bag))
+            )
     return replace(memory, recall=recall)
 
 

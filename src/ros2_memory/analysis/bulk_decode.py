@@ -31,11 +31,12 @@ from ros2_memory.messages.detections import depends_on_numbers
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue, Quaternion, Vector3
+    from ros2_memory.core.model import JsonValue, Quaternion, StampedTransform, Vector3
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, CdrLayout, Record
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Times: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 Bytes: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.uint8]]"
 
 # Halves and quarters, so that a float32 holds them exactly. Two sets of marks: a number of the
@@ -60,6 +61,16 @@ class PointOffsets(NamedTuple):
     z: int | None
 
 
+class TransformOffsets(NamedTuple):
+    """The frames of a transform, and the offsets of its numbers in the payload."""
+
+    parent: str
+    child: str
+    stamp: int
+    numbers: tuple[int, ...]
+    """Of x, y, z of the translation and of x, y, z, w of the rotation."""
+
+
 @dataclass(frozen=True, slots=True)
 class PayloadTemplate:
     """What is common to all payloads of a template, and where the numbers are.
@@ -78,6 +89,7 @@ class PayloadTemplate:
         frame_id: of that pose.
         velocity: the linear velocity that it states; None without one.
         pairs: the frames of all transforms, valid or not.
+        transforms: all of them, in order.
     """
 
     type_name: str
@@ -93,6 +105,7 @@ class PayloadTemplate:
     frame_id: str
     velocity: PointOffsets | None
     pairs: frozenset[tuple[str, str]]
+    transforms: tuple[TransformOffsets, ...] = ()
 
     def matching(
         self, first: Record, records: Sequence[Record], among: Sequence[int]
@@ -151,10 +164,15 @@ class PayloadTemplate:
 
     def seconds(self, rows: Bytes, offset: int) -> list[float]:
         """Returns the time at an offset, of each row, as the extracted value has it."""
+        return [unix_from_ns(each) for each in self.nanoseconds(rows, offset).tolist()]
+
+    def nanoseconds(self, rows: Bytes, offset: int) -> Times:
+        """Returns the time at an offset, of each row."""
         parts = np.ascontiguousarray(rows[:, offset : offset + 8]).view(
             [("s", "<i4"), ("n", "<u4")]
-        )
-        return [unix_from_ns(s * NS_PER_S + n) for s, n in parts[:, 0].tolist()]
+        )[:, 0]
+        times: Times = parts["s"].astype(np.int64) * NS_PER_S + parts["n"]
+        return times
 
 
 class _NoTemplateError(Exception):
@@ -193,12 +211,28 @@ class _Marked:
         """Returns the offset of the pose's quaternion; None where it has no orientation."""
         if self.pose is None or self.pose.orientation is None:
             return None
+        return self._offset_of_rotation(self.pose.orientation)
+
+    def _offset_of_rotation(self, rotation: Quaternion) -> int:
         mark_at = {offset: mark for mark, offset in self.offset_of.items()}
         for offset in mark_at:
             x, y, z, w = (mark_at.get(offset + 8 * part, math.nan) for part in range(4))
-            if unit((x, y, z, w)) == self.pose.orientation:
+            if unit((x, y, z, w)) == rotation:
                 return offset
         raise _NoTemplateError
+
+    def transform_offsets(self) -> tuple[TransformOffsets, ...]:
+        """Returns where the numbers of all transforms are."""
+        return tuple(map(self._transform_offsets, self.transforms))
+
+    def _transform_offsets(self, each: StampedTransform) -> TransformOffsets:
+        x, y, z = (self.offset_of.get(part, -1) for part in each.transform.translation)
+        turn = self._offset_of_rotation(each.transform.rotation)
+        stamp = self.time_of.get(unix_from_ns(each.stamp), -1)
+        if -1 in {x, y, z, stamp}:
+            raise _NoTemplateError
+        numbers = (x, y, z, *(turn + 8 * part for part in range(4)))
+        return TransformOffsets(each.parent, each.child, stamp, numbers)
 
     def offsets(self, point: Vector3) -> PointOffsets:
         """Returns the offsets of a point of the value."""
@@ -236,6 +270,9 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
     points, orientation = one.points(), one.orientation()
     if points != other.points() or orientation != other.orientation():
         raise _NoTemplateError
+    transforms = one.transform_offsets()
+    if transforms != other.transform_offsets():
+        raise _NoTemplateError
     fixed = np.ones(layout.size, dtype=np.bool_)
     for offset in (*layout.doubles, *layout.times):
         fixed[offset : offset + 8] = False
@@ -255,6 +292,7 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
         frame_id="" if one.pose is None else one.pose.frame_id,
         velocity=None if one.twist is None else one.offsets(one.twist.linear),
         pairs=frozenset((each.parent, each.child) for each in one.transforms),
+        transforms=transforms,
     )
 
 
@@ -302,15 +340,15 @@ class BulkDecoder(Generic[T]):
     Args:
         decode: decodes one message; may raise UndecodableError.
         template: the template of a message that was decoded; None where it has none.
-        apply: what the messages of these rows decode into, by their template and what its first
-            message decoded into.
+        apply: what messages decode into, by their template, what its first message decoded into,
+            and their payloads as rows.
     """
 
     def __init__(
         self,
         decode: Callable[[Record], T],
         template: Callable[[Record], PayloadTemplate | None],
-        apply: Callable[[PayloadTemplate, T, Bytes], Iterable[T]],
+        apply: Callable[[PayloadTemplate, T, Sequence[Record], Bytes], Iterable[T]],
     ) -> None:
         self._decode = decode
         self._template = template
@@ -357,7 +395,8 @@ class BulkDecoder(Generic[T]):
         matched, rows = template.matching(first, records, rest)
         if not matched:
             return rest
-        found.update(zip(matched, self._apply(template, decoded, rows), strict=True))
+        among = [records[at] for at in matched]
+        found.update(zip(matched, self._apply(template, decoded, among, rows), strict=True))
         return deque(at for at in rest if at not in found)
 
 
@@ -385,6 +424,6 @@ def motion_sample(extractor: SchemaExtractor, message: object, type_name: str) -
 
 
 def _motion_samples(
-    template: PayloadTemplate, _: MotionSample, rows: Bytes
+    template: PayloadTemplate, _: MotionSample, _records: Sequence[Record], rows: Bytes
 ) -> Iterable[MotionSample]:
     return map(MotionSample, template.poses(rows), template.speeds(rows))

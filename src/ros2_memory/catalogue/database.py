@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-VERSION: Final = 4
+VERSION: Final = 5
 """Version of the tables below and of their content; a file of any other version is set aside."""
 
 BUSY_S: Final = 1.0
@@ -42,7 +42,8 @@ _SUFFIXES: Final = ("-wal", "-shm")
 """The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
 _FIRST_ROWS: Final = """
 SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
-  (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes)
+  (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes),
+  (SELECT 1 FROM maps)
 """
 _TABLES: Final = """
 CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
@@ -58,6 +59,8 @@ CREATE TABLE held (topic INTEGER NOT NULL, bag INTEGER NOT NULL, flags INTEGER N
   PRIMARY KEY (topic, bag)) WITHOUT ROWID;
 CREATE TABLE tales (topic INTEGER NOT NULL, bag INTEGER NOT NULL, rests BLOB, story BLOB,
   PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
+  sights BLOB NOT NULL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
   log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,

@@ -9,13 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.catalogue.map_digest import NO_STATICS, MapCollector, MapSettings
 from ros2_memory.catalogue.topic_digest import TopicCollector
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
+    from ros2_memory.catalogue.map_digest import MapDigest, SightsBuilder, Statics
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
@@ -28,6 +31,7 @@ _MESSAGE_BYTES: Final = 200
 """Counted for each message besides its payload, since decoding it takes time too."""
 _MAX_EXPANSION: Final = 100
 """A bag whose messages decompress to more times its size is not digested."""
+_DEFAULT_MAP: Final = MapSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,26 +40,36 @@ class Digest:
 
     summary: BagSummary
     topics: tuple[TopicDigest, ...]
+    in_map: MapDigest | None = None
 
 
 class Digester:
-    """Builds digests; equal ones for the same bag.
+    """Builds digests; equal ones for the same bag and the same static transforms.
 
     Args:
         reader: gives the messages that count.
         extractor: gives the values that conditions are tested on.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
+        map_settings: which topics place the robot.
+        sights: returns what collects the sights of a bag; None where they are not wanted.
     """
 
     def __init__(
-        self, reader: BagReader, extractor: SchemaExtractor, max_plausible_speed_mps: float
+        self,
+        reader: BagReader,
+        extractor: SchemaExtractor,
+        max_plausible_speed_mps: float,
+        map_settings: MapSettings = _DEFAULT_MAP,
+        sights: Callable[[], SightsBuilder] | None = None,
     ) -> None:
         self._reader = reader
+        self._map_settings = map_settings
+        self._sights = sights
         self._extractor = extractor
         self._max_plausible_speed_mps = max_plausible_speed_mps
 
-    def digest(self, path: Path) -> Digest:
-        """Reads a bag and returns its digest.
+    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
+        """Reads a bag and returns its digest, given the static transforms in force.
 
         Raises:
             BagVanishedError: the file is gone.
@@ -65,6 +79,8 @@ class Digester:
         latched: dict[str, bool] = {}
         for each in summary.topics:
             latched[each.topic] = latched.get(each.topic, False) or each.latched
+        sights = None if self._sights is None else self._sights()
+        in_map = MapCollector(self._map_settings, sights)
         collectors = {
             topic: TopicCollector(
                 topic,
@@ -72,6 +88,7 @@ class Digester:
                 self._extractor,
                 self._max_plausible_speed_mps,
                 latched=is_latched,
+                in_map=in_map,
             )
             for topic, is_latched in latched.items()
         }
@@ -82,10 +99,8 @@ class Digester:
                 raise BagError(str(path), "its messages unpack to more than they can be worth")
             collectors[record.channel.topic].add(record)
         reasons = self._reasons(path)
-        return Digest(
-            summary,
-            tuple(each.digest(reasons.get(topic, {})) for topic, each in collectors.items()),
-        )
+        topics = tuple(each.digest(reasons.get(topic, {})) for topic, each in collectors.items())
+        return Digest(summary, topics, in_map.digest(statics))
 
     def _reasons(self, path: Path) -> dict[str, dict[str, str]]:
         """Returns, by topic and type, why messages cannot be decoded."""

@@ -118,6 +118,10 @@ class SegmentDigests:
             self._messages, topic, lambda: self.catalogue.messages(topic, self._entries_with(topic))
         )
 
+    def map_keys(self) -> Mapping[int, int]:
+        """Returns, by entry, the hash of the static transforms its map digest was made with."""
+        return self.derived("map keys", lambda: self.catalogue.map_keys([*self.numbers.values()]))
+
     def derived(self, name: str, compute: Callable[[], T]) -> T:
         """Returns what is computed from the entries of this segment once, by name.
 

@@ -18,12 +18,14 @@ from ros2_memory.catalogue.codec import (
     encode_standstills,
     encode_topic_events,
 )
+from ros2_memory.catalogue.map_digest import encode_map_track
 
 if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Sequence
 
     from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import Record
@@ -87,6 +89,7 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
             connection.execute(
                 f"DELETE FROM {table} WHERE topic = ? AND bag {_AMONG}", (topic, listed)
             )
+    connection.execute(f"DELETE FROM maps WHERE bag {_AMONG}", (listed,))
     connection.execute(f"DELETE FROM bags WHERE id {_AMONG}", (listed,))
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
@@ -102,12 +105,30 @@ def insert_entry(
         (config, *key, schema, digest.summary.numbers),
     )
     bag = int(cursor.lastrowid or 0)
+    if digest.in_map is not None:
+        _insert_map(connection, bag, digest.in_map)
     for topic in digest.topics:
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
         _insert_events(connection, (number, bag), topic, digest.summary)
         for nth, record in enumerate(topic.kept or ()):
             _insert_record(connection, (bag, number, nth), record)
+
+
+def _insert_map(connection: sqlite3.Connection, bag: int, digest: MapDigest) -> None:
+    connection.execute(
+        "INSERT INTO maps VALUES (?, ?, ?, ?)",
+        (bag, digest.statics, encode_map_track(digest), digest.sights),
+    )
+
+
+def map_rows(
+    connection: sqlite3.Connection, columns: str, row_ids: Sequence[int]
+) -> list[sqlite3.Row]:
+    """Returns row id, key of the static transforms, and these columns of map digests."""
+    return connection.execute(
+        f"SELECT bag, statics, {columns} FROM maps WHERE bag {_AMONG}", (json.dumps(row_ids),)
+    ).fetchall()
 
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:

@@ -24,6 +24,7 @@ from ros2_memory.catalogue.codec import (
     decode_topic_events,
 )
 from ros2_memory.catalogue.database import CatalogueDatabase
+from ros2_memory.catalogue.map_digest import decode_map_track
 from ros2_memory.catalogue.sql import (
     EDGES,
     EVENTS,
@@ -34,6 +35,7 @@ from ros2_memory.catalogue.sql import (
     delete_entries,
     entry_rows,
     insert_entry,
+    map_rows,
     message_rows,
     topic_rows,
     zone_map,
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.timebase import Ns
 
@@ -200,6 +203,27 @@ class Catalogue(CatalogueDatabase):
             return EdgeDigest(pairs[text], first, last)
 
         return self._of_topic(topic, numbers, EDGES, decode)
+
+    def maps(self, numbers: Sequence[int]) -> dict[int, MapDigest]:
+        """Returns the map digests of entries, without their sights."""
+        return self._of_map(numbers, "track", lambda row: decode_map_track(row[2], row[1]))
+
+    def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
+        """Returns, by entry, the hash of the static transforms its map digest was made with."""
+        return self._of_map(numbers, "1", lambda row: int(row[1]))
+
+    def sights(self, numbers: Sequence[int]) -> dict[int, tuple[int, bytes]]:
+        """Returns, by entry, the hash as of `map_keys`, and the bytes of its sights."""
+        return self._of_map(numbers, "sights", lambda row: (int(row[1]), bytes(row[2])))
+
+    def _of_map(
+        self, numbers: Sequence[int], columns: str, decode: Callable[[sqlite3.Row], T]
+    ) -> dict[int, T]:
+        def ask(connection: sqlite3.Connection) -> dict[int, T]:
+            rows = map_rows(connection, columns, self.row_ids(numbers))
+            return {self.offset + row[0]: decode(row) for row in rows}
+
+        return self.read(ask, {})
 
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns, by message type, why messages of the topic cannot be decoded; mostly nothing."""

@@ -16,14 +16,15 @@ from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
-    from ros2_memory.core.model import Pose, StampedTransform
+    from ros2_memory.catalogue.map_digest import MapCollector
+    from ros2_memory.core.model import JsonValue, Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record
@@ -74,11 +75,15 @@ class TopicDigest:
 
 
 class _Sample(NamedTuple):
-    """What one message contributes to the digest besides its numbers and edges."""
+    """What one message contributes to the digest besides its numbers and edges.
+
+    `value` is the extracted value where somebody asked for it, and the message was decoded alone.
+    """
 
     pose: Pose | None
     speed_mps: float | None
     state: State
+    value: JsonValue | None = None
 
 
 class TopicCollector:
@@ -90,6 +95,7 @@ class TopicCollector:
         extractor: gives the values that conditions are tested on.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         latched: whether its messages are stored whole where they are few.
+        in_map: takes the robot's poses, moving transforms and sights of all topics of the bag.
     """
 
     def __init__(
@@ -100,8 +106,13 @@ class TopicCollector:
         max_plausible_speed_mps: float,
         *,
         latched: bool,
+        in_map: MapCollector | None = None,
     ) -> None:
         self._topic = topic
+        self._map = in_map
+        self._map_poses = in_map is not None and in_map.has_poses(topic)
+        self._map_transforms = in_map is not None and in_map.has_transforms(topic)
+        self._sights: dict[str, bool] = {}
         self._reader = reader
         self._extractor = extractor
         self._latched = latched
@@ -177,6 +188,8 @@ class TopicCollector:
                 continue
             self._events.add(record.log_time, sample.state)
             pose = sample.pose
+            if self._map is not None:
+                self._add_to_map(self._map, record, sample)
             if pose is None:
                 self._poses = None
             elif self._poses is not None:
@@ -184,20 +197,37 @@ class TopicCollector:
                 if is_place(pose.position):
                     self._standstills.add(record.log_time, pose.position)
 
+    def _add_to_map(self, to: MapCollector, record: Record, sample: _Sample) -> None:
+        if self._map_poses and sample.pose is not None:
+            to.add_pose(record.log_time, sample.pose)
+        if to.sights is not None and self._wants_sights(record.channel.type):
+            to.sights.add(record, sample.value)
+
+    def _wants_sights(self, type_name: str) -> bool:
+        if type_name not in self._sights:
+            to = None if self._map is None else self._map.sights
+            self._sights[type_name] = to is not None and to.wants(self._topic, type_name)
+        return self._sights[type_name]
+
     def _decode(self, record: Record) -> _Sample:
         """Decodes one message; its value and edges count at once, since their order does not."""
         type_name = record.channel.type
         message = self._reader.decode(record)
         value = self._extractor.exact(message, type_name)
         self._zone_map.add(value)
+        if self._pairs is not None or self._map_transforms:
+            self._add_transforms(self._transforms(message, record))
+        motion = motion_sample(self._extractor, message, type_name)
+        shown = value if self._wants_sights(type_name) else None
+        return _Sample(*motion, state_of(value, type_name), shown)
+
+    def _add_transforms(self, transforms: Sequence[StampedTransform]) -> None:
+        if self._map is not None and self._map_transforms:
+            self._map.add_transforms(transforms)
         if self._pairs is not None:
-            self._pairs.update(
-                (each.parent, each.child) for each in self._transforms(message, record)
-            )
+            self._pairs.update((each.parent, each.child) for each in transforms)
             if len(self._pairs) > _MAX_EDGES:
                 self._pairs = None
-        motion = motion_sample(self._extractor, message, type_name)
-        return _Sample(*motion, state_of(value, type_name))
 
     def _template(self, record: Record) -> PayloadTemplate | None:
         template = template_for(self._reader, self._extractor, record)
@@ -207,8 +237,12 @@ class TopicCollector:
             return None
         return template
 
-    def _apply(self, template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterable[_Sample]:
+    def _apply(
+        self, template: PayloadTemplate, first: _Sample, records: Sequence[Record], rows: Bytes
+    ) -> Iterable[_Sample]:
         self._zone_map.add_rows(template, rows)
+        if self._map is not None and self._map_transforms:
+            self._map.add_rows(template, records, rows)
         return map(
             _Sample, template.poses(rows), template.speeds(rows), _states(template, first, rows)
         )

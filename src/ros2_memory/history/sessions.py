@@ -83,6 +83,10 @@ class Sessions:
             return True
         return any(f"{self._root}/{each}" in session for each in origin.recordings)
 
+    def has_all_kinds(self, session: Session) -> bool:
+        """Whether a session holds moving and static transforms: then it borrows none."""
+        return len(self._kinds(session)) == len(self._spans)
+
     def is_carried(self, bag: BagFile) -> bool:
         """Whether a bag holds carried messages, which are of several sessions."""
         return self.folder(bag.recording) == self._carried

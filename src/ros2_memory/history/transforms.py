@@ -208,6 +208,22 @@ def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransfo
     return list(newest.values())
 
 
+def static_changes(static: list[StampedTransform]) -> list[Ns]:
+    """Returns the log times at which a child's static transform differs from the one before."""
+    changes: dict[Ns, None] = {}
+    latest: dict[str, StampedTransform] = {}
+    for each in static:
+        child = each.child.lstrip("/")
+        before = latest.get(child)
+        if before is not None and not (
+            before.parent.lstrip("/") == each.parent.lstrip("/")
+            and alike(before.transform, each.transform)
+        ):
+            changes[each.log_time] = None
+        latest[child] = each
+    return [*changes]
+
+
 def sessions_of(view: View) -> Sessions:
     """Returns the sessions of a view, made once."""
     if view.sessions is None:

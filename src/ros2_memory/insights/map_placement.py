@@ -26,6 +26,7 @@ from ros2_memory.history.transforms import (
     moving_in,
     sessions_of,
     static_at,
+    static_changes,
     static_transforms,
 )
 
@@ -154,7 +155,7 @@ class MapPlacement:
     def _transforms_of(self, session: Session) -> _SessionTransforms:
         if session not in self._known:
             recorded = static_transforms(self.view, session)
-            changes = _change_times(recorded)
+            changes = static_changes(recorded)
             fixed = None
             children = {each.child.lstrip("/") for each in recorded}
             if not changes and children.isdisjoint(children_moving(self.view, session)):
@@ -198,19 +199,3 @@ def _map_or_own(view: View, topic: str, own: MapPlacement) -> MapPlacement:
     if any(connected(view, (target, pose_frame), among=each) for each in lending):
         return MapPlacement(view, target, pose_frame)
     return own
-
-
-def _change_times(transforms: list[StampedTransform]) -> list[Ns]:
-    """Returns the log times at which a child's transform differs from the one before."""
-    changes: dict[Ns, None] = {}
-    latest: dict[str, StampedTransform] = {}
-    for each in transforms:
-        child = each.child.lstrip("/")
-        before = latest.get(child)
-        if before is not None and not (
-            before.parent.lstrip("/") == each.parent.lstrip("/")
-            and alike(before.transform, each.transform)
-        ):
-            changes[each.log_time] = None
-        latest[child] = each
-    return [*changes]

@@ -26,8 +26,10 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ms_from_ns, unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange
+from ros2_memory.history.map_digests import BagStatics, MapDigests
+from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index.scan import settled
+from ros2_memory.index.segment import in_time
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 
 if TYPE_CHECKING:
@@ -35,8 +37,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue.digest import Digester
+    from ros2_memory.catalogue.map_digest import Statics
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.context import Memory
+    from ros2_memory.index.timeline import Timeline
 
 T = TypeVar("T")
 
@@ -86,11 +90,39 @@ class Backfill:
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
+        self._view: View | None = None
+        self._stale: tuple[Timeline, int, list[BagFile]] | None = None
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags to be digested, the newest first."""
-        missing = bags_without_entry(self._memory.index.snapshot().timeline.segments, self._digests)
-        return [bag for bag in reversed(missing) if not self._is_refused(self._key(bag))]
+        timeline = self._memory.index.snapshot().timeline
+        missing = bags_without_entry(timeline.segments, self._digests)
+        missing += self._with_other_statics(timeline)
+        missing.sort(key=in_time, reverse=True)
+        return [bag for bag in missing if not self._is_refused(self._key(bag))]
+
+    def _with_other_statics(self, timeline: Timeline) -> list[BagFile]:
+        """Returns the bags whose entry was made with static transforms that are not in force now.
+
+        Looked up once for each timeline and state of the catalogue.
+        """
+        newest = self.catalogue.newest()
+        if self._stale is None or self._stale[:2] != (timeline, newest):
+            maps = MapDigests(self._view_of(timeline))
+            stale: list[BagFile] = []
+            for segment in timeline.segments:
+                digests = self._digests.digests_for(segment, newest)
+                known = [bag for bag in segment.bags if bag.file in digests.numbers]
+                valid = maps.valid_numbers(digests, known)
+                stale += [bag for bag in known if bag.file not in valid]
+            self._stale = timeline, newest, stale
+        return self._stale[2]
+
+    def _view_of(self, timeline: Timeline) -> View:
+        """Returns a view of the memory; the same one while the timeline is the same."""
+        if self._view is None or self._view.snapshot.timeline is not timeline:
+            self._view = View(self._memory, Call())
+        return self._view
 
     def progress(self) -> Progress:
         """Returns how much of the catalogue is filled."""
@@ -105,7 +137,7 @@ class Backfill:
             return False
         begun = time.perf_counter_ns()
         try:
-            digest = self._digester.digest(bag.path)
+            digest = self._digester.digest(bag.path, self._statics_of(bag))
         except BagError as error:
             self._refuse(bag, error.reason)
             return False
@@ -123,6 +155,10 @@ class Backfill:
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )
         return True
+
+    def _statics_of(self, bag: BagFile) -> Statics:
+        view = self._view_of(self._memory.index.snapshot().timeline)
+        return BagStatics(view).of(bag)
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Returns the catalogue to its file, unless the bag directory itself is missing.

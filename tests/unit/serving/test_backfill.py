@@ -19,6 +19,7 @@ from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache
+from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli import main
 from ros2_memory.cli.index import describe_progress, fill_catalogue
@@ -103,14 +104,14 @@ def test_a_changed_bag_or_sidecar_has_the_bag_digested_again(tmp_path: Path) -> 
 class Meddling(Digester):
     """Something happens to the bag while it is read."""
 
-    def digest(self, path: Path) -> Digest:
-        found = super().digest(path)
+    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
+        found = super().digest(path, statics)
         write_handover(path.parent, Handover())
         return found
 
 
 class Failing(Digester):
-    def digest(self, path: Path) -> Digest:
+    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
         raise BagError(str(path), "damaged in the middle")
 
 

@@ -1,0 +1,268 @@
+"""What one bag says about the map: where the robot was in it, and what it saw there.
+
+Made from the bag's own messages and from the static transforms of its session, which are its
+context: an entry made under others is of no use, so a hash of them is stored with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+
+from ros2_memory.analysis.bag_frames import BagFrames, TransformColumns, multiply
+from ros2_memory.analysis.odometry import is_place
+from ros2_memory.analysis.robot_track import (
+    RobotTrack,
+    decode_track,
+    encode_track,
+    track_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from ros2_memory.analysis.bag_frames import Floats, Mask, Times
+    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.core.model import JsonValue, Pose, StampedTransform
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import Record
+
+ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
+
+_NEAR_NS: Final[Ns] = 1_000_000_000
+"""Between two poses that are farther apart, where the robot was is not known."""
+_FLAT: Final = (0.0, 0.0, 0.0, 1.0)
+_HEAD: Final = struct.Struct("<IH")
+
+
+@dataclass(frozen=True, slots=True)
+class MapSettings:
+    """The part of the configuration that map digests depend on; as in `QuerySettings`."""
+
+    pose_topic: str = "/odom"
+    map_frame: str | None = "map"
+    tf_topics: tuple[str, ...] = ("/tf",)
+    tf_clock: ClockOfTransforms = "auto"
+
+
+class Statics(NamedTuple):
+    """The static transforms in force for a bag, and a hash of them that entries are stored with."""
+
+    transforms: tuple[StampedTransform, ...]
+    key: int
+
+
+def statics_of(transforms: Iterable[StampedTransform]) -> Statics:
+    """Returns static transforms, one for each child, with their hash."""
+    ordered = tuple(sorted(transforms, key=lambda each: (each.child, each.parent)))
+    described = json.dumps(
+        [
+            (each.parent, each.child, each.transform.translation, each.transform.rotation)
+            for each in ordered
+        ]
+    )
+    digest = hashlib.sha256(described.encode("utf-8", "surrogatepass")).digest()
+    return Statics(ordered, int.from_bytes(digest[:8], "big", signed=True))
+
+
+NO_STATICS: Final = statics_of(())
+
+
+@dataclass(frozen=True, slots=True)
+class MapDigest:
+    """What is stored of a bag about the map.
+
+    Attributes:
+        frame_id: of the track and of the sights: the map, or the poses' own frame where transforms
+            of the bag lead to no map; empty without a pose.
+        statics: the hash of the static transforms that it was made with.
+        track: of the robot.
+        left_out: how many poses could not be placed.
+        sights: what `SightsBuilder.digest` returned; empty without a builder.
+    """
+
+    frame_id: str
+    statics: int
+    track: RobotTrack
+    left_out: int = 0
+    sights: bytes = b""
+
+
+class RobotPoses(NamedTuple):
+    """The robot at some times, in the target frame; only meaningful where `valid`."""
+
+    x: Floats
+    y: Floats
+    heading: Floats
+    valid: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedPoses:
+    """All poses of the robot in one bag that could be placed, in log-time order.
+
+    Attributes:
+        frames: looks up any frame of the bag.
+    """
+
+    frames: BagFrames
+    times: Times
+    x: Floats
+    y: Floats
+    heading: Floats
+
+    def at(self, times: Times) -> RobotPoses:
+        """Returns where the robot was at some log times; not valid farther than 1 s from a pose."""
+        if not len(self.times):
+            none = np.full(len(times), np.nan)
+            return RobotPoses(none, none, none, np.zeros(len(times), np.bool_))
+        last = len(self.times) - 1
+        after = np.searchsorted(self.times, times, side="right")
+        before, after = np.clip(after - 1, 0, last), np.clip(after, 0, last)
+        start, stop = self.times[before], self.times[after]
+        ratio = np.clip((times - start) / np.maximum(stop - start, 1), 0.0, 1.0)
+        near = np.minimum(np.abs(times - start), np.abs(stop - times)) <= _NEAR_NS
+        turn = np.remainder(self.heading[after] - self.heading[before] + np.pi, 2 * np.pi) - np.pi
+        return RobotPoses(
+            self.x[before] + (self.x[after] - self.x[before]) * ratio,
+            self.y[before] + (self.y[after] - self.y[before]) * ratio,
+            self.heading[before] + turn * ratio,
+            near & (stop - start <= 2 * _NEAR_NS),
+        )
+
+
+class SightsBuilder(Protocol):
+    """Collects what detectors saw in one bag, and digests it as bytes that only it can read."""
+
+    def wants(self, topic: str, type_name: str) -> bool:
+        """Returns whether messages of a topic are to be added."""
+
+    def add(self, record: Record, value: JsonValue | None) -> None:
+        """Takes the next message of a topic, in log-time order by topic.
+
+        `value` is the extracted value (`SchemaExtractor.exact`); None where many messages were
+        decoded at once and this one was not: the builder decodes the record where it needs to.
+        """
+
+    def digest(self, robot: PlacedPoses) -> bytes:
+        """Returns the digest; `robot.frames` places any frame, `robot.at` the robot itself."""
+
+
+class MapCollector:
+    """Collects the poses and moving transforms of one bag, and makes its `MapDigest`.
+
+    Args:
+        settings: which topics, and which frame is the map.
+        sights: collects what detectors saw; None where that is not wanted.
+    """
+
+    def __init__(self, settings: MapSettings, sights: SightsBuilder | None = None) -> None:
+        self._settings = settings
+        self.sights = sights
+        self._moving = TransformColumns()
+        self._times: list[Ns] = []
+        self._poses: list[Pose] = []
+        self._frames: dict[str, int] = {}
+
+    def has_poses(self, topic: str) -> bool:
+        """Returns whether poses of a topic are the robot's."""
+        return topic == self._settings.pose_topic
+
+    def has_transforms(self, topic: str) -> bool:
+        """Returns whether a topic is one of moving transforms."""
+        return topic in self._settings.tf_topics
+
+    def add_pose(self, time: Ns, pose: Pose) -> None:
+        """Takes the robot's next pose."""
+        self._times.append(time)
+        self._poses.append(pose)
+        self._frames[pose.frame_id] = self._frames.get(pose.frame_id, 0) + 1
+
+    def add_transforms(self, transforms: Iterable[StampedTransform]) -> None:
+        """Takes the moving transforms of a message."""
+        for each in transforms:
+            self._moving.add(each)
+
+    def add_rows(self, template: PayloadTemplate, records: Sequence[Record], rows: Bytes) -> None:
+        """Takes the moving transforms of many messages of one template."""
+        log_times = np.array([each.log_time for each in records], np.int64)
+        for each in template.transforms:
+            numbers = np.stack([template.column(rows, offset) for offset in each.numbers], axis=1)
+            stamps = template.nanoseconds(rows, each.stamp)
+            self._moving.add_rows((each.parent, each.child), stamps, log_times, numbers)
+
+    def digest(self, statics: Statics) -> MapDigest:
+        """Returns the digest of all that was added."""
+        placed, frame_id = self._placed(statics)
+        track = track_of(placed.times, placed.x, placed.y, placed.heading)
+        return MapDigest(
+            frame_id,
+            statics.key,
+            track,
+            len(self._times) - len(placed.times),
+            b"" if self.sights is None else self.sights.digest(placed),
+        )
+
+    def _placed(self, statics: Statics) -> tuple[PlacedPoses, str]:
+        """Returns the poses in the map, or in their own frame; and the name of that frame."""
+        # Poses of one topic nearly always have one frame: those of others are left out.
+        own = max(self._frames, key=lambda each: self._frames[each], default="")
+        clock = self._settings.tf_clock
+        target = self._settings.map_frame or own
+
+        def frames_to(frame: str) -> BagFrames:
+            chosen = None if clock == "auto" else clock
+            return BagFrames(statics.transforms, self._moving, frame, chosen)
+
+        frames = frames_to(target)
+        leads = own and (own == target or frames.reaches(own))
+        # Without poses the frames may still lead from a camera to the map.
+        if not leads and self._poses:
+            target, frames = own, frames_to(own)
+        pairs = [
+            (time, pose)
+            for time, pose in zip(self._times, self._poses, strict=True)
+            if pose.frame_id == own and is_place(pose.position)
+        ]
+        times = np.array([time for time, _ in pairs], np.int64)
+        numbers = np.array(
+            [(*pose.position, *(pose.orientation or _FLAT)) for _, pose in pairs], np.float64
+        ).reshape(-1, 7)
+        x, y, z, qx, qy, qz, qw = numbers.T
+        poses = frames.poses(own, times)
+        if poses is None:
+            return PlacedPoses(frames, times[:0], x[:0], y[:0], x[:0]), target
+        px, py, _ = poses.points((x, y, z))
+        tx, ty, tz, tw = multiply(poses.rotation, (qx, qy, qz, qw))
+        heading = np.arctan2(2 * (tw * tz + tx * ty), 1 - 2 * (ty * ty + tz * tz))
+        if any(pose.orientation is None for _, pose in pairs):
+            turned = [pose.orientation is not None for _, pose in pairs]
+            heading = np.where(np.array(turned, np.bool_), heading, np.nan)
+        valid = poses.valid
+        return PlacedPoses(frames, times[valid], px[valid], py[valid], heading[valid]), target
+
+
+def encode_map_track(digest: MapDigest) -> bytes:
+    """Encodes a map digest but for its sights and its key, which have columns of their own."""
+    frame = digest.frame_id.encode("utf-8", "surrogatepass")
+    return _HEAD.pack(digest.left_out, len(frame)) + frame + encode_track(digest.track)
+
+
+def decode_map_track(packed: bytes, statics: int) -> MapDigest:
+    """Decodes a map digest, without its sights.
+
+    Raises:
+        ValueError: the bytes are not one.
+    """
+    try:
+        left_out, size = _HEAD.unpack_from(packed)
+    except struct.error as error:
+        raise ValueError(f"not a map digest: {error}") from error
+    end = _HEAD.size + size
+    frame = packed[_HEAD.size : end].decode("utf-8", "surrogatepass")
+    return MapDigest(frame, statics, decode_track(packed[end:]), left_out)

@@ -1,0 +1,261 @@
+"""The map digests of bags: those of the catalogue that are valid, and others made from the bags.
+
+A digest depends on the static transforms that its bag's session has at the bag's end. An entry
+that was made with others, as of a session whose later bags were not there yet, is not used: the
+answer is then computed from the bag, and is the same with the catalogue and without.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from weakref import WeakKeyDictionary
+
+from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
+from ros2_memory.catalogue.map_digest import (
+    NO_STATICS,
+    MapCollector,
+    MapDigest,
+    MapSettings,
+    Statics,
+    statics_of,
+)
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
+from ros2_memory.history.transforms import (
+    sessions_of,
+    static_at,
+    static_changes,
+    static_transforms,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.catalogue.map_digest import SightsBuilder
+    from ros2_memory.core.model import BagFile, Pose, StampedTransform
+    from ros2_memory.history.context import QuerySettings
+    from ros2_memory.history.sessions import Session
+    from ros2_memory.history.view import View
+    from ros2_memory.index.timeline import Timeline
+    from ros2_memory.storage.base import Record
+
+T = TypeVar("T")
+
+_BATCH: Final = 1024
+_CACHED: Final = 256
+"""Digests that were made from bags, and stay in memory: those without an entry are few."""
+
+
+def map_settings(limits: QuerySettings) -> MapSettings:
+    """Returns the settings that map digests depend on."""
+    return MapSettings(limits.pose_topic, limits.map_frame, limits.tf_topics, limits.tf_clock)
+
+
+@dataclass(slots=True)
+class _SessionStatics:
+    """The static transforms of a session in log-time order, and when one of them changed."""
+
+    transforms: list[StampedTransform]
+    changes: list[Ns]
+    periods: dict[int, Statics] = field(default_factory=dict)
+
+    def at(self, time: Ns) -> Statics:
+        """Returns those in force at a moment."""
+        number = bisect_right(self.changes, time + AT_OR_BEFORE_SLACK_NS)
+        if number not in self.periods:
+            since = self.changes[number - 1] if number else MIN_NS
+            self.periods[number] = statics_of(static_at(self.transforms, since))
+        return self.periods[number]
+
+
+_StaticsOf: TypeAlias = "dict[tuple[Session, tuple[str, ...]], _SessionStatics]"
+_KNOWN: Final[WeakKeyDictionary[Timeline, _StaticsOf]] = WeakKeyDictionary()
+"""Statics of a timeline's sessions; a new bag makes a new timeline."""
+
+
+class BagStatics:
+    """The static transforms in force for each bag of a view, at the bag's end."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._known = _KNOWN.setdefault(view.snapshot.timeline, {})
+        self._complete: dict[Path, Session] = {}
+
+    def of(self, bag: BagFile) -> Statics:
+        """Returns the static transforms of a bag's session at its end."""
+        session = self._session(bag)
+        return self._statics(session).at(bag.end) if session else NO_STATICS
+
+    def _session(self, bag: BagFile) -> Session:
+        known = self._complete.get(bag.recording)
+        if known is not None:
+            return known
+        sessions = sessions_of(self._view)
+        own = sessions.of(bag.recording)
+        if sessions.has_all_kinds(own):
+            self._complete[bag.recording] = own
+            return own
+        return sessions.lending_to(bag.recording, bag.end)
+
+    def _statics(self, session: Session) -> _SessionStatics:
+        key = session, self._view.memory.limits.tf_static_topics
+        known = self._known.get(key)
+        if known is None:
+            static = static_transforms(self._view, session)
+            known = _SessionStatics(static, static_changes(static))
+            if self._view.notes.complete:
+                self._known[key] = known
+        return known
+
+
+class _MadeDigests:
+    """The digests that were made from bags last. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._made: OrderedDict[tuple[object, ...], MapDigest] = OrderedDict()
+
+    def get(self, key: tuple[object, ...]) -> MapDigest | None:
+        """Returns one, and marks it as used."""
+        with self._lock:
+            found = self._made.get(key)
+            if found is not None:
+                self._made.move_to_end(key)
+            return found
+
+    def put(self, key: tuple[object, ...], digest: MapDigest) -> None:
+        """Stores one, and drops the one that was not used for longest."""
+        with self._lock:
+            self._made[key] = digest
+            if len(self._made) > _CACHED:
+                self._made.popitem(last=False)
+
+
+_MADE: Final = _MadeDigests()
+
+
+class MapDigests:
+    """The map digests of the bags of a view."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._settings = map_settings(view.memory.limits)
+        self.statics = BagStatics(view)
+
+    def valid_numbers(self, digests: SegmentDigests, bags: Sequence[BagFile]) -> dict[str, int]:
+        """Returns, by file, the entries of some bags of a segment whose map digest is valid."""
+        keys, numbers = digests.map_keys(), digests.numbers
+        return {
+            bag.file: number
+            for bag in bags
+            if (number := numbers.get(bag.file)) is not None
+            and keys.get(number) == self.statics.of(bag).key
+        }
+
+    def made(self, bag: BagFile, sights: SightsBuilder | None = None) -> MapDigest:
+        """Returns the digest of a bag, read from it; with sights where a builder is given.
+
+        What cannot be read of the bag is left out, with a note. Without sights the digests of the
+        bags that were asked for last stay in memory.
+        """
+        statics = self.statics.of(bag)
+        stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
+        key = (*stat, statics.key, self._settings, id(self._view.memory.reader))
+        known = None if sights is not None else _MADE.get(key)
+        if known is not None:
+            return known
+        reader = _MapReader(self._view, self._settings, sights)
+        made = reader.digest(bag, statics)
+        if sights is None and reader.is_complete and bag.state is not BagState.ACTIVE:
+            _MADE.put(key, made)
+        return made
+
+
+class _MapReader:
+    """Makes the map digest of a bag as the catalogue's `Digester` does."""
+
+    def __init__(
+        self, view: View, settings: MapSettings, sights: SightsBuilder | None = None
+    ) -> None:
+        self._view = view
+        self._settings = settings
+        self._collector = MapCollector(settings, sights)
+        self._decoders: dict[str, BulkDecoder[Pose | None]] = {}
+        self.is_complete = True
+
+    def digest(self, bag: BagFile, statics: Statics) -> MapDigest:
+        """Returns the digest of all messages of the bag that can be read."""
+        sights, held = self._collector.sights, bag.summary.schema.topics
+        topics = {
+            each.topic
+            for each in held
+            if self._collector.has_poses(each.topic)
+            or self._collector.has_transforms(each.topic)
+            or (sights is not None and sights.wants(each.topic, each.type))
+        }
+        waiting: dict[str, list[Record]] = {topic: [] for topic in topics}
+        before = self._view.notes.keys()
+        if topics:
+            read = self._view.bags.read(bag, sorted(topics), TimeWindow.everything())
+            for found in self._view.bags.track_sources(read):
+                batch = waiting[found.record.channel.topic]
+                batch.append(found.record)
+                if len(batch) == _BATCH:
+                    self._add(batch)
+                    batch.clear()
+        for batch in waiting.values():
+            self._add(batch)
+        self.is_complete = self._view.notes.keys() == before
+        return self._collector.digest(statics)
+
+    def _add(self, batch: Sequence[Record]) -> None:
+        if not batch:
+            return
+        topic = batch[0].channel.topic
+        to = self._collector
+        if to.has_poses(topic) or to.has_transforms(topic):
+            if topic not in self._decoders:
+                self._decoders[topic] = BulkDecoder(self._decode, self._template, self._apply)
+            samples = self._decoders[topic].decode(batch)
+            for record, pose in zip(batch, samples, strict=True):
+                if isinstance(pose, UndecodableError) or pose is None or not to.has_poses(topic):
+                    continue
+                to.add_pose(record.log_time, pose)
+        if to.sights is not None:
+            for record in batch:
+                if to.sights.wants(topic, record.channel.type):
+                    to.sights.add(record, None)
+
+    def _decode(self, record: Record) -> Pose | None:
+        extractor = self._view.memory.extractor
+        message = self._view.memory.reader.decode(record)
+        if self._collector.has_transforms(record.channel.topic):
+            self._collector.add_transforms(
+                extractor.transforms(message, record.log_time, static=False)
+            )
+        return motion_sample(extractor, message, record.channel.type).pose
+
+    def _template(self, record: Record) -> PayloadTemplate | None:
+        memory = self._view.memory
+        template = template_for(memory.reader, memory.extractor, record)
+        valid = memory.extractor.transforms(
+            memory.reader.decode(record), record.log_time, static=False
+        )
+        if template is None or template.pairs != {(each.parent, each.child) for each in valid}:
+            return None
+        return template
+
+    def _apply(
+        self, template: PayloadTemplate, _: Pose | None, records: Sequence[Record], rows: Bytes
+    ) -> Iterable[Pose | None]:
+        if self._collector.has_transforms(records[0].channel.topic):
+            self._collector.add_rows(template, records, rows)
+        return template.poses(rows)

@@ -1,0 +1,88 @@
+"""A robot whose map moves under its odometry: a localiser corrects it, now and then by a lot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from random import Random
+from typing import TYPE_CHECKING
+
+from tests.support.bags import Msg, detections, odom, tf, transform, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+MS = 10**6
+BEGIN = 1_784_000_000 * S
+_WAYPOINTS = ((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0))
+
+
+@dataclass
+class MovingMap:
+    """What is true: where the robot was in the map, 5 times a second; see `write_moving_map`."""
+
+    times: list[int] = field(default_factory=list)
+    places: list[tuple[float, float]] = field(default_factory=list)
+
+    def inside(self, x: float, y: float, radius: float) -> list[int]:
+        """The times at which it was within a radius of a place."""
+        return [
+            at
+            for at, place in zip(self.times, self.places, strict=True)
+            if math.dist(place, (x, y)) <= radius
+        ]
+
+
+def moving_map(draw: Random, seconds: int, *, ahead_s: float = 0.3) -> tuple[MovingMap, list[Msg]]:
+    """Drives between waypoints and stands at each, while odometry drifts against the map."""
+    truth, messages = MovingMap(), []
+    x, y, heading, stands = 0.0, 0.0, 0.0, 30
+    target = 1
+    dx, dy, turn = 0.5, -0.3, 0.2
+    messages.append(
+        tf(BEGIN, transform(BEGIN, "base_link", "cam", (0.2, 0, 0.5)), topic="/tf_static")
+    )
+    for step in range(seconds * 5):
+        at = BEGIN + step * 200 * MS
+        goal = _WAYPOINTS[target]
+        if stands:
+            stands -= 1
+        elif math.dist((x, y), goal) < 0.1:
+            stands, target = draw.randint(10, 60), draw.randrange(len(_WAYPOINTS))
+        else:
+            heading = math.atan2(goal[1] - y, goal[0] - x)
+            x, y = x + 0.08 * math.cos(heading), y + 0.08 * math.sin(heading)
+        dx, dy = dx + draw.gauss(0, 0.004), dy + draw.gauss(0, 0.004)
+        turn += draw.gauss(0, 0.002)
+        if draw.random() < 0.003:
+            dx += draw.uniform(-2, 2)
+        truth.times.append(at)
+        truth.places.append((x, y))
+        # The robot's pose in odom: the correction taken off its pose in the map.
+        cos, sin = math.cos(-turn), math.sin(-turn)
+        ox = (x - dx) * cos - (y - dy) * sin
+        oy = (x - dx) * sin + (y - dy) * cos
+        messages.append(odom(at, ox, oy, heading - turn, vx=0.0 if stands else 0.4))
+        base = transform(at, "odom", "base_link", (ox, oy, 0.0), heading - turn)
+        messages.append(tf(at, base))
+        ahead = at + round(ahead_s * S)
+        correction = transform(ahead, "map", "odom", (dx, dy, 0.0), turn)
+        messages.append(tf(ahead, correction, log_time=at + 3 * MS))
+        if step % 5 == 0:
+            messages.append(detections(at + MS, ["cup"], at=(1.0, 0.2, 0.1)))
+    return truth, messages
+
+
+def write_moving_map(
+    bag_dir: Path, seed: int, *, seconds: int = 120, split_s: float = 10.0
+) -> MovingMap:
+    """Writes one recording in splits."""
+    truth, messages = moving_map(Random(seed), seconds)
+    splits: dict[int, list[Msg]] = {}
+    for each in messages:
+        splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
+    for number, some in splits.items():
+        ordered = sorted(some, key=lambda each: each.log_time)
+        write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", ordered)
+    return truth
