@@ -7,47 +7,26 @@ answer is then computed from the bag, and is the same with the catalogue and wit
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import OrderedDict
-from dataclasses import dataclass, field
 from threading import Lock
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
-from ros2_memory.catalogue.map_digest import (
-    NO_STATICS,
-    MapCollector,
-    MapDigest,
-    MapSettings,
-    Statics,
-    statics_of,
-)
+from ros2_memory.catalogue.map_digest import MapCollector, MapDigest, MapSettings
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
-from ros2_memory.history.transforms import (
-    sessions_of,
-    static_at,
-    static_changes,
-    static_transforms,
-)
+from ros2_memory.history.bag_statics import BagStatics
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.catalogue.map_digest import SightsBuilder
-    from ros2_memory.core.model import BagFile, Pose, StampedTransform
+    from ros2_memory.catalogue.map_digest import SightsBuilder, Statics
+    from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.history.context import QuerySettings
-    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-    from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Record
-
-T = TypeVar("T")
 
 _BATCH: Final = 1024
 _CACHED: Final = 256
@@ -57,63 +36,6 @@ _CACHED: Final = 256
 def map_settings(limits: QuerySettings) -> MapSettings:
     """Returns the settings that map digests depend on."""
     return MapSettings(limits.pose_topic, limits.map_frame, limits.tf_topics, limits.tf_clock)
-
-
-@dataclass(slots=True)
-class _SessionStatics:
-    """The static transforms of a session in log-time order, and when one of them changed."""
-
-    transforms: list[StampedTransform]
-    changes: list[Ns]
-    periods: dict[int, Statics] = field(default_factory=dict)
-
-    def at(self, time: Ns) -> Statics:
-        """Returns those in force at a moment."""
-        number = bisect_right(self.changes, time + AT_OR_BEFORE_SLACK_NS)
-        if number not in self.periods:
-            since = self.changes[number - 1] if number else MIN_NS
-            self.periods[number] = statics_of(static_at(self.transforms, since))
-        return self.periods[number]
-
-
-_StaticsOf: TypeAlias = "dict[tuple[Session, tuple[str, ...]], _SessionStatics]"
-_KNOWN: Final[WeakKeyDictionary[Timeline, _StaticsOf]] = WeakKeyDictionary()
-"""Statics of a timeline's sessions; a new bag makes a new timeline."""
-
-
-class BagStatics:
-    """The static transforms in force for each bag of a view, at the bag's end."""
-
-    def __init__(self, view: View) -> None:
-        self._view = view
-        self._known = _KNOWN.setdefault(view.snapshot.timeline, {})
-        self._complete: dict[Path, Session] = {}
-
-    def of(self, bag: BagFile) -> Statics:
-        """Returns the static transforms of a bag's session at its end."""
-        session = self._session(bag)
-        return self._statics(session).at(bag.end) if session else NO_STATICS
-
-    def _session(self, bag: BagFile) -> Session:
-        known = self._complete.get(bag.recording)
-        if known is not None:
-            return known
-        sessions = sessions_of(self._view)
-        own = sessions.of(bag.recording)
-        if sessions.has_all_kinds(own):
-            self._complete[bag.recording] = own
-            return own
-        return sessions.lending_to(bag.recording, bag.end)
-
-    def _statics(self, session: Session) -> _SessionStatics:
-        key = session, self._view.memory.limits.tf_static_topics
-        known = self._known.get(key)
-        if known is None:
-            static = static_transforms(self._view, session)
-            known = _SessionStatics(static, static_changes(static))
-            if self._view.notes.complete:
-                self._known[key] = known
-        return known
 
 
 class _MadeDigests:

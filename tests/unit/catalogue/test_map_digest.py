@@ -23,8 +23,9 @@ from ros2_memory.catalogue.map_digest import (
     statics_of,
 )
 from ros2_memory.core.model import StampedTransform, Transform
+from ros2_memory.history.bag_statics import BagStatics
 from ros2_memory.history.context import Call
-from ros2_memory.history.map_digests import BagStatics, MapDigests, map_settings
+from ros2_memory.history.map_digests import MapDigests, map_settings
 from ros2_memory.history.view import View
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.memories import extractor, memory_of, recalling

@@ -1,0 +1,203 @@
+"""Regions of the plane: circles, boxes and polygons, and when a path is inside of one.
+
+Lengths are metres. The border of a region is inside.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Floats: TypeAlias = "NDArray[np.float64]"
+Point: TypeAlias = "tuple[float, float]"
+
+
+class Steps(NamedTuple):
+    """Straight steps of a path: where each begins and ends."""
+
+    x: Floats
+    y: Floats
+    to_x: Floats
+    to_y: Floats
+
+
+class Parts(NamedTuple):
+    """Parts of steps: which step, and from which share of it to which (0 to 1)."""
+
+    step: NDArray[np.intp]
+    start: Floats
+    stop: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Circle:
+    """All points within a radius."""
+
+    x: float
+    y: float
+    radius_m: float
+
+    def contains(self, x: float, y: float) -> bool:
+        """Returns whether a point is inside."""
+        return math.hypot(x - self.x, y - self.y) <= self.radius_m
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The least and greatest x, and the least and greatest y."""
+        x, y, radius = self.x, self.y, self.radius_m
+        return x - radius, x + radius, y - radius, y + radius
+
+    def parts(self, steps: Steps) -> tuple[Floats, Floats]:
+        """Returns the share of each step from which and to which it is inside; reversed if never."""
+        dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
+        px, py = steps.x - self.x, steps.y - self.y
+        a = dx * dx + dy * dy
+        b = px * dx + py * dy
+        c = px * px + py * py - self.radius_m * self.radius_m
+        moves = a > 0
+        root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+        size = np.where(moves, a, 1.0)
+        start = np.where(moves, (-b - root) / size, 0.0)
+        stop = np.where(moves, (-b + root) / size, 1.0)
+        meets = np.where(moves, b * b - a * c >= 0, c <= 0)
+        return np.where(meets, start, 2.0), np.where(meets, stop, -1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """All points between two x and two y."""
+
+    min_x: float
+    max_x: float
+    min_y: float
+    max_y: float
+
+    def contains(self, x: float, y: float) -> bool:
+        """Returns whether a point is inside."""
+        return self.min_x <= x <= self.max_x and self.min_y <= y <= self.max_y
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The least and greatest x, and the least and greatest y."""
+        return self.min_x, self.max_x, self.min_y, self.max_y
+
+    def parts(self, steps: Steps) -> tuple[Floats, Floats]:
+        """Returns the share of each step from which and to which it is inside; reversed if never."""
+        start, stop = np.zeros(len(steps.x)), np.ones(len(steps.x))
+        for at, to, low, high in (
+            (steps.x, steps.to_x, self.min_x, self.max_x),
+            (steps.y, steps.to_y, self.min_y, self.max_y),
+        ):
+            along = to - at
+            moves = along != 0
+            size = np.where(moves, along, 1.0)
+            one, other = (low - at) / size, (high - at) / size
+            still = (at >= low) & (at <= high)
+            start = np.maximum(start, np.where(moves, np.minimum(one, other), ~still * 2.0))
+            stop = np.minimum(stop, np.where(moves, np.maximum(one, other), 1.0))
+        return start, stop
+
+
+@dataclass(frozen=True, slots=True)
+class Polygon:
+    """All points inside of a closed line through these corners, by the even-odd rule."""
+
+    corners: tuple[Point, ...]
+
+    def contains(self, x: float, y: float) -> bool:
+        """Returns whether a point is inside; of the border itself, either."""
+        return bool(_inside(self.corners, np.array([x]), np.array([y]))[0])
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The least and greatest x, and the least and greatest y."""
+        xs, ys = zip(*self.corners, strict=True)
+        return min(xs), max(xs), min(ys), max(ys)
+
+    def crossings(self, steps: Steps) -> Parts:
+        """Returns the parts of steps inside: between the crossings of the polygon's sides."""
+        count = len(steps.x)
+        shares = [np.zeros(count), np.ones(count)]
+        dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
+        for (ax, ay), (bx, by) in zip(
+            self.corners, (*self.corners[1:], self.corners[0]), strict=True
+        ):
+            ex, ey = bx - ax, by - ay
+            cross = dx * ey - dy * ex
+            size = np.where(cross != 0, cross, 1.0)
+            along = ((ax - steps.x) * ey - (ay - steps.y) * ex) / size
+            beside = ((ax - steps.x) * dy - (ay - steps.y) * dx) / size
+            meets = (cross != 0) & (along > 0) & (along < 1) & (beside >= 0) & (beside <= 1)
+            shares.append(np.where(meets, along, 1.0))
+        table = np.sort(np.stack(shares), axis=0)
+        middle = (table[1:] + table[:-1]) / 2
+        inside = _inside(self.corners, steps.x + dx * middle, steps.y + dy * middle)
+        inside &= table[1:] > table[:-1]
+        # A step of no length is inside as a whole, or not.
+        still = (dx == 0) & (dy == 0)
+        inside[:, still] = False
+        inside[0, still] = _inside(self.corners, steps.x[still], steps.y[still])
+        which, step = np.nonzero(inside)
+        order = np.lexsort((which, step))
+        which, step = which[order], step[order]
+        stop = np.where(still[step], 1.0, table[which + 1, step])
+        return Parts(step, table[which, step], stop)
+
+
+Region: TypeAlias = "Circle | Box | Polygon"
+
+
+def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> NDArray[np.bool_]:
+    inside = np.zeros(np.shape(x), np.bool_)
+    for (ax, ay), (bx, by) in zip(corners, (*corners[1:], corners[0]), strict=True):
+        crosses = (ay > y) != (by > y)
+        height = (by - ay) or 1.0
+        inside ^= crosses & (x < (bx - ax) * (y - ay) / height + ax)
+    return inside
+
+
+def parts_inside(region: Region, steps: Steps) -> Parts:
+    """Returns the parts of steps that are inside of a region, in order."""
+    low_x, high_x, low_y, high_y = region.bounds
+    near = np.flatnonzero(
+        (np.minimum(steps.x, steps.to_x) <= high_x)
+        & (np.maximum(steps.x, steps.to_x) >= low_x)
+        & (np.minimum(steps.y, steps.to_y) <= high_y)
+        & (np.maximum(steps.y, steps.to_y) >= low_y)
+    )
+    some = Steps(*(each[near] for each in steps))
+    if isinstance(region, Polygon):
+        found = region.crossings(some)
+        return Parts(near[found.step], found.start, found.stop)
+    start, stop = region.parts(some)
+    start, stop = np.maximum(start, 0.0), np.minimum(stop, 1.0)
+    meets = start <= stop
+    return Parts(near[meets], start[meets], stop[meets])
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A named region of a frame."""
+
+    name: str
+    frame_id: str
+    region: Region
+
+
+def place_at(places: tuple[Place, ...], frame_id: str, x: float, y: float) -> str | None:
+    """Returns the name of the smallest place of a frame that a point is in; None in none."""
+    inside = [
+        each for each in places if each.frame_id == frame_id and each.region.contains(x, y)
+    ]
+    return min(inside, key=lambda each: _area(each.region)).name if inside else None
+
+
+def _area(region: Region) -> float:
+    low_x, high_x, low_y, high_y = region.bounds
+    return (high_x - low_x) * (high_y - low_y)
