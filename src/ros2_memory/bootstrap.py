@@ -20,7 +20,12 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 
 from ros2_memory import PACKAGE, package_version
-from ros2_memory.config import NullRecorderNode, load_labels, load_message_schemas
+from ros2_memory.config import (
+    NullRecorderNode,
+    load_labels,
+    load_message_schemas,
+    load_places,
+)
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.telemetry import SILENT, Telemetry
@@ -34,7 +39,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
-    from ros2_memory.config import AdapterNode, Settings
+    from ros2_memory.config import AdapterNode, PlaceShape, Settings
+    from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.telemetry import Observer
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.recorder.base import Housekeeper
@@ -294,6 +300,32 @@ def query_settings_of(settings: Settings) -> QuerySettings:
         ),
         min_score=data.min_score,
         labels=load_labels(settings),
+        places=places_of(settings),
+    )
+
+
+def places_of(settings: Settings) -> tuple[Place, ...]:
+    """Returns the named places as regions.
+
+    Raises:
+        ConfigError: their file is missing or refused.
+    """
+    from ros2_memory.core.regions import Box, Circle, Place, Polygon
+
+    def region(shape: PlaceShape) -> Region:
+        if shape.polygon is not None:
+            return Polygon(shape.polygon)
+        if isinstance(shape.x, tuple) and isinstance(shape.y, tuple):
+            return Box(*shape.x, *shape.y)
+        # The model allows no other shape.
+        numbers = (shape.x, shape.y, shape.radius_m)
+        x, y, radius_m = (each if isinstance(each, float) else 0.0 for each in numbers)
+        return Circle(x, y, radius_m)
+
+    default = settings.data.map_frame or ""
+    return tuple(
+        Place(name, shape.frame or default, region(shape))
+        for name, shape in load_places(settings).items()
     )
 
 

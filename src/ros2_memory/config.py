@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 EXIT_CODE: Final = 2
+_FEWEST_CORNERS: Final = 3
 
 
 def _home_expanded(path: Path) -> Path:
@@ -106,6 +107,7 @@ def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[s
 
 Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
 Flag: TypeAlias = Annotated[bool, Field(strict=True)]
+Metres: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
 Count: TypeAlias = Annotated[int, Field(strict=True, gt=0)]
 Mebibytes: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=1024)]
 Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
@@ -166,6 +168,7 @@ class DataSettings:
     tf_clock: Literal["auto", "stamp", "log"]
     max_plausible_speed_mps: Positive
     latched_topics: LatchedTopics
+    places_file: ConfigFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -304,6 +307,43 @@ class Labels:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class PlaceShape:
+    """A circle (x, y, radius_m), a rectangle (x and y as [from, to]) or a polygon, in metres.
+
+    `frame` is the frame of its coordinates; without it, `data.map_frame`.
+    """
+
+    frame: Text | None = None
+    x: Metres | tuple[Metres, Metres] | None = None
+    y: Metres | tuple[Metres, Metres] | None = None
+    radius_m: Positive | None = None
+    polygon: tuple[tuple[Metres, Metres], ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses what is not exactly one of the three shapes."""
+        x, y = self.x, self.y
+        circle = isinstance(x, float) and isinstance(y, float) and self.radius_m is not None
+        box = isinstance(x, tuple) and isinstance(y, tuple) and x[0] < x[1] and y[0] < y[1]
+        alone = x is None and y is None
+        if self.polygon is not None:
+            is_shape = alone and self.radius_m is None and len(self.polygon) >= _FEWEST_CORNERS
+        else:
+            is_shape = circle or (box and self.radius_m is None)
+        if not is_shape:
+            raise ValueError(
+                "must be a circle (x, y, radius_m), a rectangle (x: [from, to], y: [from, to]) "
+                "or a polygon of 3 corners or more ([[x, y], ...])"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class PlacesFile:
+    """The named places."""
+
+    places: dict[Text, PlaceShape]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class Settings:
     """The whole configuration, validated."""
 
@@ -412,6 +452,15 @@ def load_labels(settings: Settings) -> Mapping[str, Sequence[str]]:
     """
     path = settings.data.labels_file
     return {} if path is None else _load_file(Labels, "data.labels_file", path).labels
+
+
+def load_places(settings: Settings) -> Mapping[str, PlaceShape]:
+    """Returns the named places of `data.places_file`.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or its content is refused.
+    """
+    return _load_file(PlacesFile, "data.places_file", settings.data.places_file).places
 
 
 def _load_file(model: type[_T], key: str, path: Path) -> _T:

@@ -439,34 +439,53 @@ class Visit:
         departed: of its last one; None where it is there still, by a pose recent enough to know.
         duration: between the first and the last that are known.
         closest_m: distance (m, in the plane) of the nearest recorded pose; the robot may have been
-            nearer between two messages.
-        closest_at: log time of that pose.
+            nearer between two messages. None where the place is no circle.
+        closest_at: log time of that pose; None likewise.
         restarts: how often odometry was reset since.
     """
 
     arrived: Ns | None
     departed: Ns | None
     duration: Ns
-    closest_m: float
-    closest_at: Ns
+    closest_m: float | None
+    closest_at: Ns | None
     restarts: int
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceVisits:
+    """How often and how long the robot was in a named place: entries, the first and the last."""
+
+    place: str
+    entries: int
+    duration: Ns
+    first: Ns | None
+    last: Ns | None
 
 
 @dataclass(frozen=True, slots=True)
 class Visits(AnswerWithNotes):
     """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
 
-    `total` is how many were found; a note says so where there may be more.
+    Attributes:
+        where: the name of the place, where it has one.
+        x: of a circle, with y and radius_m; None of another region.
+        total: how many were found; a note says so where there may be more.
+        duration: of all of these.
+        places: of every named place, where none was asked for; then there are no visits.
     """
 
     frame_id: str
-    x: float
-    y: float
-    radius_m: float
+    x: float | None
+    y: float | None
+    radius_m: float | None
     visits: tuple[Visit, ...]
     more: bool
     total: int
     now: Ns
+    duration: Ns = 0
+    where: str | None = None
+    places: tuple[PlaceVisits, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

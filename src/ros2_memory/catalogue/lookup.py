@@ -43,6 +43,7 @@ class SegmentDigests:
         numbers: by file, the number of its entry.
         whole: whether every bag of the segment has an entry.
         as_of: the state of the catalogue when the entries were looked up.
+        is_outdated: whether some entry is to be replaced by another of the same bag.
     """
 
     def __init__(self, cache: DigestCache, segment: Segment, as_of: int) -> None:
@@ -58,6 +59,7 @@ class SegmentDigests:
             if number is not None
         }
         self.whole = len(self.numbers) == len(segment.bags)
+        self.is_outdated = False
         every = [*self.numbers.values()]
         self._with_topic: dict[str, list[int]] = {
             # Most topics are in all bags: these share one list.
@@ -75,7 +77,8 @@ class SegmentDigests:
     @property
     def is_complete(self) -> bool:
         """Whether no later state of the catalogue adds to this."""
-        return self.whole and self.catalogue.is_current(self.as_of)
+        is_final = self.whole and not self.is_outdated
+        return is_final and self.catalogue.is_current(self.as_of)
 
     def zone_map(self, topic: str) -> ZoneMap:
         """Returns what can be in any message of the topic in the bags with an entry."""

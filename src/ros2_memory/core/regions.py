@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 Floats: TypeAlias = "NDArray[np.float64]"
@@ -54,7 +56,7 @@ class Circle:
         return x - radius, x + radius, y - radius, y + radius
 
     def parts(self, steps: Steps) -> tuple[Floats, Floats]:
-        """Returns the share of each step from which and to which it is inside; reversed if never."""
+        """Returns from and to which share each step is inside; reversed where it never is."""
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
         px, py = steps.x - self.x, steps.y - self.y
         a = dx * dx + dy * dy
@@ -88,7 +90,7 @@ class Box:
         return self.min_x, self.max_x, self.min_y, self.max_y
 
     def parts(self, steps: Steps) -> tuple[Floats, Floats]:
-        """Returns the share of each step from which and to which it is inside; reversed if never."""
+        """Returns from and to which share each step is inside; reversed where it never is."""
         start, stop = np.zeros(len(steps.x)), np.ones(len(steps.x))
         for at, to, low, high in (
             (steps.x, steps.to_x, self.min_x, self.max_x),
@@ -190,11 +192,9 @@ class Place:
     region: Region
 
 
-def place_at(places: tuple[Place, ...], frame_id: str, x: float, y: float) -> str | None:
+def place_at(places: Sequence[Place], frame_id: str, x: float, y: float) -> str | None:
     """Returns the name of the smallest place of a frame that a point is in; None in none."""
-    inside = [
-        each for each in places if each.frame_id == frame_id and each.region.contains(x, y)
-    ]
+    inside = [each for each in places if each.frame_id == frame_id and each.region.contains(x, y)]
     return min(inside, key=lambda each: _area(each.region)).name if inside else None
 
 

@@ -19,8 +19,10 @@ from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
 from ros2_memory.history.transforms import sessions_of, static_at, static_changes
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
+    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile, StampedTransform, Transform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Session
@@ -64,6 +66,9 @@ class _OfTimeline:
     """What is known of a timeline: a new bag makes a new one."""
 
     gathered: _Gathered | None = None
+    valid: WeakKeyDictionary[SegmentDigests, dict[str, int]] = field(
+        default_factory=WeakKeyDictionary
+    )
     sessions: dict[Session, _SessionStatics] = field(default_factory=dict)
 
 
@@ -92,6 +97,15 @@ class BagStatics:
             return known.at(bag.end)
         session = sessions.lending_to(bag.recording, bag.end)
         return self._statics(session).at(bag.end) if session else NO_STATICS
+
+    def remembered(
+        self, digests: SegmentDigests, compute: Callable[[], dict[str, int]]
+    ) -> dict[str, int]:
+        """Returns what follows from digests and these static transforms, computed once."""
+        known = self._known.valid.get(digests)
+        if known is None:
+            known = self._known.valid[digests] = compute()
+        return known
 
     def _statics(self, session: Session) -> _SessionStatics:
         known = self._known.sessions.get(session)

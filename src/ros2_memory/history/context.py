@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.regions import Place
     from ros2_memory.core.text import Reason
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
@@ -54,6 +55,7 @@ class QuerySettings:
     latching: Latching = field(default_factory=lambda: Latching(("/tf_static",)))
     min_score: float = 0.0
     labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    places: tuple[Place, ...] = ()
 
 
 class SnapshotSource(Protocol):

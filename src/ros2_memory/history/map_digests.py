@@ -8,6 +8,7 @@ answer is then computed from the bag, and is the same with the catalogue and wit
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING, Final
 
@@ -18,7 +19,7 @@ from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.bag_statics import BagStatics
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.catalogue.lookup import SegmentDigests
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
+    from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Record
 
 _BATCH: Final = 1024
@@ -72,29 +74,42 @@ class MapDigests:
         self._settings = map_settings(view.memory.limits)
         self.statics = BagStatics(view)
 
-    def valid_numbers(self, digests: SegmentDigests, bags: Sequence[BagFile]) -> dict[str, int]:
-        """Returns, by file, the entries of some bags of a segment whose map digest is valid."""
-        keys, numbers = digests.map_keys(), digests.numbers
-        return {
-            bag.file: number
-            for bag in bags
-            if (number := numbers.get(bag.file)) is not None
-            and keys.get(number) == self.statics.of(bag).key
-        }
+    def valid_in(self, digests: SegmentDigests, segment: Segment) -> Mapping[str, int]:
+        """Returns, by file, the entries of a segment's bags whose map digest is valid.
 
-    def made(self, bag: BagFile, sights: SightsBuilder | None = None) -> MapDigest:
+        Valid is what was made with the static transforms that are in force in this view.
+        """
+
+        def valid() -> dict[str, int]:
+            keys, numbers = digests.map_keys(), digests.numbers
+            found = {
+                bag.file: number
+                for bag in segment.bags
+                if (number := numbers.get(bag.file)) is not None
+                and keys.get(number) == self.statics.of(bag).key
+            }
+            digests.is_outdated |= len(found) < len(numbers)
+            return found
+
+        return self.statics.remembered(digests, valid)
+
+    def made(
+        self, bag: BagFile, sights: SightsBuilder | None = None, *, in_map: bool = True
+    ) -> MapDigest:
         """Returns the digest of a bag, read from it; with sights where a builder is given.
 
         What cannot be read of the bag is left out, with a note. Without sights the digests of the
-        bags that were asked for last stay in memory.
+        bags that were asked for last stay in memory. Without `in_map` all is placed in the poses'
+        own frame.
         """
+        settings = self._settings if in_map else replace(self._settings, map_frame=None)
         statics = self.statics.of(bag)
         stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
-        key = (*stat, statics.key, self._settings, id(self._view.memory.reader))
+        key = (*stat, statics.key, settings, id(self._view.memory.reader))
         known = None if sights is not None else _MADE.get(key)
         if known is not None:
             return known
-        reader = _MapReader(self._view, self._settings, sights)
+        reader = _MapReader(self._view, settings, sights)
         made = reader.digest(bag, statics)
         if sights is None and reader.is_complete and bag.state is not BagState.ACTIVE:
             _MADE.put(key, made)

@@ -6,7 +6,7 @@ another frame is read, and placed by the transforms of whatever bags have them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -14,21 +14,16 @@ import numpy as np
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.analysis.robot_track import RobotTrack, empty_track
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Steps, parts_inside
 from ros2_memory.core.timebase import Deadline, Ns
-from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.map_digests import MapDigests
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
-    from ros2_memory.analysis.bag_frames import Floats, Mask, Times
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.catalogue.map_digest import MapDigest
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Region
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
@@ -73,6 +68,7 @@ class RobotTracks:
         self._maps = MapDigests(view)
         self._topic = view.memory.limits.pose_topic
         self._reading: Deadline | None = None
+        self._is_map = frame_id == view.memory.limits.map_frame
 
     def over(self, window: TimeWindow) -> JoinedTrack:
         """Returns the track in a window, and a little beyond.
@@ -109,35 +105,39 @@ class RobotTracks:
     def _of_segment(self, segment: Segment, window: TimeWindow) -> tuple[RobotTrack, int]:
         """Returns the track of the bags of a segment that reach into a window."""
         digests = self._view.bags.digests_of(segment)
-        extents = [each.bag for each in segment.extents(self._topic, window)]
-        bags = list(dict.fromkeys(extents))
-        valid = {} if digests is None else self._maps.valid_numbers(digests, bags)
-        if digests is not None and len(valid) == len(segment.bags_with(self._topic)):
-            columns = self._stored(digests, segment, valid)
-            return columns
-        stored = {} if digests is None else digests.catalogue.maps([*valid.values()])
+        valid = {} if digests is None else self._maps.valid_in(digests, segment)
+        if digests is not None and len(valid) == len(segment.bags):
+            return self._stored(digests, segment, valid)
+        bags = [each.bag for each in segment.extents(self._topic, window)]
+        known = {} if digests is None else digests.catalogue.maps([*valid.values()])
         found: list[MapDigest] = []
-        for bag in reversed(bags):
-            known = stored.get(valid.get(bag.file, -1))
+        for bag in reversed([*dict.fromkeys(bags)]):
+            stored = known.get(valid.get(bag.file, -1))
             try:
-                found.append(known if known is not None else self._made(bag))
+                found.append(self._made(bag) if stored is None else self._own(bag, stored))
             except QueryTimeoutError as error:
                 raise _PartlyReadError(self._columns(found[::-1])[0], bag.end) from error
         return self._columns(found[::-1])
 
     def _stored(
-        self, digests: SegmentDigests, segment: Segment, valid: dict[str, int]
+        self, digests: SegmentDigests, segment: Segment, valid: Mapping[str, int]
     ) -> tuple[RobotTrack, int]:
         """Returns the track of a whole segment, joined once for as long as it is in use."""
 
         def joined() -> tuple[RobotTrack, int]:
             stored = digests.catalogue.maps([*valid.values()])
             bags = segment.bags_with(self._topic)
-            return self._columns([stored[valid[each.file]] for each in bags])
+            # An entry that was deleted meanwhile is of a bag that is gone.
+            known = [(bag, stored.get(valid[bag.file])) for bag in bags]
+            return self._columns([self._own(bag, each) for bag, each in known if each is not None])
 
-        keys = digests.map_keys()
-        state = hash(tuple(keys[number] for number in valid.values()))
-        return digests.derived(f"track {self._frame_id} {state}", joined)
+        # The numbers of entries do not change in a whole segment, the frame may be another.
+        return digests.derived(f"track in {self._frame_id}", joined)
+
+    def _own(self, bag: BagFile, digest: MapDigest) -> MapDigest:
+        """Returns the digest, or one in the poses' own frame where that is asked for."""
+        other = digest.frame_id != self._frame_id and len(digest.track.times)
+        return self._made(bag) if other and not self._is_map else digest
 
     def _made(self, bag: BagFile) -> MapDigest:
         """Returns the digest of a bag that has none, unless reading has taken too long."""
@@ -145,12 +145,12 @@ class RobotTracks:
             self._reading = Deadline.after(_READING_S)
         if self._reading.expired():
             raise QueryTimeoutError("reading bags without a digest takes too long")
-        return self._maps.made(bag)
+        return self._maps.made(bag, in_map=self._is_map)
 
     def _columns(self, found: Sequence[MapDigest]) -> tuple[RobotTrack, int]:
         """Returns the joined track of digests in order of time, and how many poses it lacks."""
         here = [each for each in found if each.frame_id == self._frame_id]
-        elsewhere = sum(len(each.track.times) for each in found if each not in here)
+        elsewhere = sum(len(each.track.times) for each in found if each.frame_id != self._frame_id)
         track = _joined([each.track for each in here])
         return track, sum(each.left_out for each in here) + elsewhere
 
@@ -166,19 +166,25 @@ class _PartlyReadError(Exception):
 def _joined(tracks: Sequence[RobotTrack]) -> RobotTrack:
     """Returns tracks in order of time as one; of two of one time the earlier one counts."""
     some = [each for each in tracks if len(each.times)]
-    if not some:
-        return empty_track()
+    if len(some) < 2:
+        return some[0] if some else empty_track()
     times = np.concatenate([each.times for each in some])
     reach = np.maximum.accumulate(np.concatenate((times[:1] - 1, times[:-1])))
     fresh = times > reach
-    x, y, heading, begins = (
-        np.concatenate([getattr(each, name) for each in some])[fresh]
-        for name in ("x", "y", "heading", "begins")
-    )
+    number = np.repeat(np.arange(len(some)), [len(each.times) for each in some])[fresh]
     times = times[fresh]
-    # A bag begins a piece only where the one before ended long ago, or was of another place.
-    firsts = np.diff(times, prepend=times[:1] - SILENCE_NS - 1) > SILENCE_NS
-    return RobotTrack(times, x, y, heading, firsts, max(each.error_m for each in some))
+    begins = np.concatenate([each.begins for each in some])[fresh]
+    # Where a track ends and the next one begins, the time between the two decides.
+    seams = np.append([True], number[1:] != number[:-1])
+    silent = np.append([True], np.diff(times) > SILENCE_NS)
+    return RobotTrack(
+        times,
+        np.concatenate([each.x for each in some])[fresh],
+        np.concatenate([each.y for each in some])[fresh],
+        np.concatenate([each.heading for each in some])[fresh],
+        np.where(seams, silent, begins),
+        max(each.error_m for each in some),
+    )
 
 
 def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:

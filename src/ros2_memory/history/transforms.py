@@ -387,6 +387,14 @@ def connected(
     return target in components(linked).get(origin, ())
 
 
+def connected_by_statics(view: View, frames: tuple[str, str]) -> bool:
+    """Whether static transforms alone lead from one frame to the other, in some recording."""
+    pairs = _pairs(view, view.memory.limits.tf_static_topics)
+    origin, target = (name.lstrip("/") for name in frames)
+    linked = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(_is_edge, pairs))
+    return target in components(linked).get(origin, ())
+
+
 def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
     """Returns the failure of a lookup by header stamps, wherever in log time they were recorded."""
     if nothing_near:

@@ -227,6 +227,25 @@ def last_window(now: Ns, length: Ns) -> TimeWindow:
     return TimeWindow(max(now - length, MIN_NS), min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
 
 
+def search_window(span: TimeRange, now: Ns) -> TimeWindow:
+    """Returns the window to search, with the slack of floats of seconds.
+
+    Raises:
+        InvalidArgumentsError: the end lies before the start, or a bound is not finite, or both
+            kinds of bounds are given.
+    """
+    start_s, end_s = span.start_s, span.end_s
+    if span.last_s is not None:
+        if start_s is not None or end_s is not None:
+            raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
+        return last_window(now, ns_argument("seconds", span.last_s))
+    start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
+    end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
+    if end < start:
+        raise InvalidArgumentsError(f"end ({end_s}) lies before start ({start_s})")
+    return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
+
+
 def clamped(view: View, window: TimeWindow) -> TimeWindow:
     """Returns the window without what lies before both the epoch and the memory."""
     earliest = view.snapshot.earliest

@@ -22,9 +22,9 @@ from ros2_memory.analysis.time_bins import Held
 from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.segment_fold import SegmentFold
-from ros2_memory.history.view import TimeRange, clamped, open_view
+from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.bins import BinnedWindow
-from ros2_memory.insights.sightings import read_sightings, search_window
+from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import TOPIC_EVENTS, collect_events
 
 if TYPE_CHECKING:

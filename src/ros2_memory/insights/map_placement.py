@@ -21,6 +21,7 @@ from ros2_memory.history.context import Note
 from ros2_memory.history.transforms import (
     children_moving,
     connected,
+    connected_by_statics,
     graph_of,
     lending_to,
     moving_in,
@@ -84,6 +85,12 @@ class MapPlacement:
     def is_map(self) -> bool:
         """Whether the coordinates of places keep their meaning when odometry is reset."""
         return self.frame_id == self.view.memory.limits.map_frame
+
+    @property
+    def moves(self) -> bool:
+        """Whether the frame of the poses may move in that of the places."""
+        frames = self.frame_id, self.pose_frame
+        return self.frame_id != self.pose_frame and not connected_by_statics(self.view, frames)
 
     def use_window(self, window: TimeWindow) -> None:
         """Sets the window of the next poses: the moving transforms in it are gathered once."""

@@ -23,10 +23,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.geometry import transform_point
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
-    AT_OR_BEFORE_SLACK_NS,
-    MAX_NS,
     MIN_NS,
-    START_SLACK_NS,
     Ns,
 )
 from ros2_memory.history.coverage import note_unread, unix_text
@@ -34,7 +31,7 @@ from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
 from ros2_memory.history.silences import describe_silences
 from ros2_memory.history.transforms import newest_in_session, transform_at
-from ros2_memory.history.view import TimeRange, clamped, last_window, ns_argument, open_view
+from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
@@ -136,25 +133,6 @@ def find_matches(
         now=now,
         notes=view.notes.sentences(),
     )
-
-
-def search_window(span: TimeRange, now: Ns) -> TimeWindow:
-    """Returns the window to search, with the slack of floats of seconds.
-
-    Raises:
-        InvalidArgumentsError: the end lies before the start, or a bound is not finite, or both
-            kinds of bounds are given.
-    """
-    start_s, end_s = span.start_s, span.end_s
-    if span.last_s is not None:
-        if start_s is not None or end_s is not None:
-            raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
-        return last_window(now, ns_argument("seconds", span.last_s))
-    start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
-    end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
-    if end < start:
-        raise InvalidArgumentsError(f"end ({end_s}) lies before start ({start_s})")
-    return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
 
 
 def read_sightings(

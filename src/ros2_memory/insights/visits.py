@@ -8,9 +8,10 @@ coordinates are another place: visits from before that are marked.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import chain, islice, pairwise
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.conditions import Condition, NearPosition
@@ -25,6 +26,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import Circle
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.bag_groups import StoredDigests, groups_of
 from ros2_memory.history.coverage import note_unread, unix_text
@@ -38,8 +40,10 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import describe_lack, resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
-from ros2_memory.history.view import open_view
+from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.map_placement import map_placement
+from ros2_memory.insights.region_visits import place_visits, region_visits, track_in, visit_of
+from ros2_memory.insights.where import Where, parse_where
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
@@ -47,9 +51,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.dwell import Dwell
     from ros2_memory.analysis.odometry import PoseDigest
-    from ros2_memory.core.model import Pose, Vector3
+    from ros2_memory.core.model import JsonValue, Pose, Vector3
+    from ros2_memory.core.regions import Region
     from ros2_memory.history.bag_groups import Group
-    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.insights.map_placement import MapPlacement
@@ -67,38 +72,135 @@ _MOST_TRIED: Final = 1000
 def visits(
     memory: Memory,
     call: Call,
-    x: float,
-    y: float,
+    x: float | None = None,
+    y: float | None = None,
     *,
+    where: JsonValue = None,
     frame_id: str | None = None,
     radius_m: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
     limit: int = 10,
 ) -> Visits:
-    """Returns when the robot was within a radius (m) of a place in the plane, newest visits first.
+    """Returns when the robot was in a place, newest visits first; of no place, all named ones.
 
-    `x` and `y` (m) are in `frame_id`: the map, which is the default, or the frame of the poses.
+    A place is a circle around `x` and `y` (m), or `where`. Coordinates are in `frame_id`: the map,
+    which is the default, or the frame of the poses. Between `start_s` and `end_s` (Unix seconds,
+    inclusive) alone, where these are given.
 
     Raises:
-        InvalidArgumentsError: the pose topic carries no position, the radius is not positive, or
-            the frame is another one.
+        InvalidArgumentsError: the pose topic carries no position, the place is none, the frame is
+            another one, or the bounds are reversed.
         NoDataError: the memory holds nothing, or no poses.
         QueryTimeoutError: the call's time is over before anything is known.
     """
-    radius = memory.limits.position_tolerance_m if radius_m is None else radius_m
-    if not (radius > 0 and math.isfinite(radius)):
-        raise InvalidArgumentsError(f"radius_m must be more than 0, and was {radius_m}")
+    place = _place(memory.limits, (x, y), radius_m, where)
     wall = memory.clock.now()
     view = open_view(memory, call, wall)
+    window = search_window(TimeRange(start_s, end_s), wall)
     topic = resolve_pose_topic(view)
-    placement = map_placement(view, _pose_frame(view, topic), topic, frame_id)
-    search = _VisitSearch(view, topic, placement, (x, y, radius))
-    latest, newest = view.snapshot.latest, search.newest_time
-    now = memory.now(wall, latest)
-    stale = _SPLITS * ns_from_unix(memory.limits.split_duration_s)
-    known = newest is not None and newest >= now - stale
-    found, total = search.newest(limit)
-    resets = () if placement.is_map or not found else _resets(view, topic, found[-1][0].arrived)
-    note_unread(view, TimeWindow.everything(), nothing=not found)
+    named_frame = None if place is None else place.frame_id
+    asked = frame_id if named_frame is None else named_frame
+    placement = map_placement(view, _pose_frame(view, topic), topic, asked)
+    now = memory.now(wall, view.snapshot.latest)
+    if place is None:
+        found = place_visits(view, memory.limits.places, placement.frame_id, window)
+        note_unread(view, window, nothing=not any(each.entries for each in found))
+        return Visits(
+            frame_id=placement.frame_id,
+            x=None,
+            y=None,
+            radius_m=None,
+            visits=(),
+            more=False,
+            total=sum(each.entries for each in found),
+            now=now,
+            places=found,
+            notes=view.notes.sentences(),
+        )
+    search = _VisitSearch(view, topic, placement, place.region)
+    by_track = where is not None or start_s is not None or end_s is not None
+    if by_track or placement.moves or not isinstance(place.region, Circle):
+        known = _by_track(view, search, placement.frame_id, place, (window, now, limit))
+    else:
+        known = _by_poses(view, search, now, limit)
+    if not placement.is_map:
+        known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
+    _note_doubts(view, known)
+    circle = place.region if isinstance(place.region, Circle) and place.name is None else None
+    return Visits(
+        frame_id=placement.frame_id,
+        x=None if circle is None else circle.x,
+        y=None if circle is None else circle.y,
+        radius_m=None if circle is None else circle.radius_m,
+        visits=known.shown,
+        more=known.total > len(known.shown),
+        total=known.total,
+        now=now,
+        duration=known.duration,
+        where=place.name,
+        notes=view.notes.sentences(),
+    )
+
+
+class _Known(NamedTuple):
+    """The visits that are shown, and how many there are and how long in all."""
+
+    shown: tuple[Visit, ...]
+    total: int
+    duration: Ns
+    newest: Ns | None
+
+
+def _place(
+    limits: QuerySettings,
+    point: tuple[float | None, float | None],
+    radius_m: float | None,
+    where: JsonValue,
+) -> Where | None:
+    """Returns the place that is asked about; None for all named ones.
+
+    Raises:
+        InvalidArgumentsError: the arguments name none, or two.
+    """
+    radius = limits.position_tolerance_m if radius_m is None else radius_m
+    if not (radius > 0 and math.isfinite(radius)):
+        raise InvalidArgumentsError(f"radius_m must be more than 0, and was {radius_m}")
+    x, y = point
+    if where is not None:
+        if x is not None or y is not None:
+            raise InvalidArgumentsError("where is a place, and x and y are another: give one")
+        return parse_where(limits.places, where, radius)
+    if x is not None and y is not None:
+        return Where(Circle(x, y, radius))
+    if x is not None or y is not None:
+        raise InvalidArgumentsError("x and y must both be given, or neither")
+    if not limits.places:
+        raise InvalidArgumentsError("no place is named in data.places_file: give x and y, or where")
+    return None
+
+
+def _by_track(
+    view: View,
+    search: _VisitSearch,
+    frame_id: str,
+    place: Where,
+    bounds: tuple[TimeWindow, Ns, int],
+) -> _Known:
+    """Returns the visits by the robot's track."""
+    window, now, limit = bounds
+    found = region_visits(track_in(view, frame_id, window), place, window)
+    newest = search.newest_time
+    current = newest if _is_current(view, newest, now) else None
+    shown = tuple(visit_of(found, each, place, current) for each in found.all[:limit])
+    return _Known(shown, len(found.all), found.duration, newest)
+
+
+def _by_poses(view: View, search: _VisitSearch, now: Ns, limit: int) -> _Known:
+    """Returns the visits pose by pose."""
+    newest = search.newest_time
+    known = _is_current(view, newest, now)
+    found, every = search.newest(limit)
     shown = tuple(
         Visit(
             arrived=dwell.arrived if dwell.begun else None,
@@ -106,10 +208,37 @@ def visits(
             duration=dwell.departed - dwell.arrived,
             closest_m=closest.distance_m,
             closest_at=closest.time,
-            restarts=sum(reset > dwell.departed for reset in resets),
+            restarts=0,
         )
         for dwell, closest in found
     )
+    duration = sum(each.departed - each.arrived for each in every)
+    return _Known(shown, len(every), duration, newest)
+
+
+def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
+    """Whether the newest pose is recent enough to know where the robot is now."""
+    stale = _SPLITS * ns_from_unix(view.memory.limits.split_duration_s)
+    return newest is not None and newest >= now - stale
+
+
+def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) -> tuple[Visit, ...]:
+    """Returns visits with how often odometry began anew since."""
+    if not shown:
+        return shown
+    last = shown[-1]
+    began = (last.departed or now) - last.duration if last.arrived is None else last.arrived
+    resets = _resets(view, topic, began)
+    return tuple(
+        replace(each, restarts=sum(reset > (each.departed or now) for reset in resets))
+        for each in shown
+    )
+
+
+def _note_doubts(view: View, known: _Known) -> None:
+    """Notes what visits may not be."""
+    shown, newest = known.shown, known.newest
+    note_unread(view, TimeWindow.everything(), nothing=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
             f"the newest pose, of {unix_text(newest)}, is too old to know whether the robot is "
@@ -120,17 +249,6 @@ def visits(
             "visits with restarts_since are of before odometry began anew: "
             "the same coordinates may have been another place"
         )
-    return Visits(
-        frame_id=placement.frame_id,
-        x=x,
-        y=y,
-        radius_m=radius,
-        visits=shown,
-        more=total > len(shown),
-        total=total,
-        now=now,
-        notes=view.notes.sentences(),
-    )
 
 
 def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
@@ -178,14 +296,12 @@ def _pose_frame(view: View, topic: str) -> str:
 class _VisitSearch:
     """Goes through the poses of a topic from the newest on, without bags that are ruled out."""
 
-    def __init__(
-        self, view: View, topic: str, placement: MapPlacement, target: tuple[float, float, float]
-    ) -> None:
+    def __init__(self, view: View, topic: str, placement: MapPlacement, region: Region) -> None:
         self._view = view
         self._topic = topic
         self._placement = placement
-        self._x, self._y, self._radius = target
-        self._is_fixed = placement.is_fixed(topic)
+        circle = region if isinstance(region, Circle) else Circle(0.0, 0.0, 0.0)
+        self._x, self._y, self._radius = circle.x, circle.y, circle.radius_m
         self._digests = StoredDigests(view, topic, POSES, TimeWindow.everything())
         self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
@@ -195,8 +311,8 @@ class _VisitSearch:
         """The log time of the newest pose; None without one."""
         return next((found.time for found, _ in self._positions(TimeWindow.everything())), None)
 
-    def newest(self, limit: int) -> tuple[list[tuple[Dwell, Approach]], int]:
-        """Returns the newest visits, each with its closest approach, and how many there are.
+    def newest(self, limit: int) -> tuple[list[tuple[Dwell, Approach]], list[Dwell]]:
+        """Returns the newest visits, each with its closest approach, and all that there are.
 
         Where the time is over before the end, a note says how far back they were counted.
         """
@@ -220,7 +336,7 @@ class _VisitSearch:
             self._view.notes.add(
                 f"total counts the visits back to {unix_text(before)}: there may be more"
             )
-        return [(visit, self._closest(visit)) for visit in visits.all[:limit]], len(visits.all)
+        return [(visit, self._closest(visit)) for visit in visits.all[:limit]], visits.all
 
     def _check_counting(self) -> None:
         """Checks that there is time left to count visits that are not shown.
@@ -271,7 +387,9 @@ class _VisitSearch:
             yield TimeWindow.everything()
             return
         bags = self._view.stream.overlapping_bags([self._topic], TimeWindow.everything())
-        target = self._target_in(bags[0]) if self._is_fixed and bags else None
+        target = (
+            self._target_in(bags[0]) if self._placement.is_fixed(self._topic) and bags else None
+        )
         if target is None:  # its coordinates are not the same in all bags, so none is ruled out
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:

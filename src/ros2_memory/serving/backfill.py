@@ -113,8 +113,8 @@ class Backfill:
             stale: list[BagFile] = []
             for segment in timeline.segments:
                 digests = self._digests.digests_for(segment, newest)
-                known = [bag for bag in segment.bags if bag.file in digests.numbers]
-                valid = maps.valid_numbers(digests, known)
+                valid = maps.valid_in(digests, segment)
+                known = (bag for bag in segment.bags if bag.file in digests.numbers)
                 stale += [bag for bag in known if bag.file not in valid]
             self._stale = timeline, newest, stale
         return self._stale[2]

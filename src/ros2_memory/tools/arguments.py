@@ -88,6 +88,14 @@ def _parse_json(text: str) -> object:
         return None
 
 
+def _as_region(value: object) -> object:
+    """Returns a region, which planners also send as JSON text."""
+    if not isinstance(value, str):
+        return value
+    parsed = _parse_json(_check_text(value, LONGEST_VALUE))
+    return parsed if isinstance(parsed, dict) else value
+
+
 def _as_integer(value: object) -> object:
     """Returns 100.0 as an int, since JSON does not distinguish the two."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
@@ -169,6 +177,17 @@ _Fields: TypeAlias = Annotated[
 ]
 _Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
+]
+_Where: TypeAlias = Annotated[
+    JsonValue,
+    BeforeValidator(_as_region),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": kind} for kind in ("string", "object")],
+            "examples": ["kitchen"],
+        }
+    ),
+    Field(description="A place: see instructions."),
 ]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
@@ -403,8 +422,11 @@ class TypeArguments(Arguments):
 class VisitsArguments(Arguments):
     """A place in the plane."""
 
-    x: _Coordinate
-    y: _Coordinate
+    x: _Coordinate | None = None
+    y: _Coordinate | None = None
+    where: _Where | None = None
+    start_s: _Time | None = Field(default=None, alias="start")
+    end_s: _Time | None = Field(default=None, alias="end")
     frame_id: (
         Annotated[_Name, Field(description="Of x and y, as replies name it; default: the map.")]
         | None

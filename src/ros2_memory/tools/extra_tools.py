@@ -51,9 +51,11 @@ _STATUS = ToolDeclaration(
 )
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
-    "When, how long and how often the robot was near a place, newest first, in {map_frame} where "
-    "transforms lead there, else in the frame of {pose_topic}. Reply: {{frame_id, there_now, "
-    "visits: [{{arrived, departed, duration_s, closest_m, ago_s}}], total}}.",
+    "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
+    "{map_frame} where transforms lead there, else in the frame of {pose_topic}. Without a place: "
+    "every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
+    "closest_m, ago_s}}], total, minutes}} or {{places: [{{place, minutes, entries, first_entry, "
+    "last_exit}}]}}.",
     VisitsArguments,
     visits,
     blocking=True,

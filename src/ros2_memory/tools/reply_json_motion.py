@@ -143,18 +143,44 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
 
 @render.register(results.Visits)
 def _visits(answer: results.Visits) -> JsonObject:
+    frame: JsonObject = {"frame_id": answer.frame_id or None}
+    if answer.places is not None:
+        places: JsonObject = {**frame, "places": [_place_visits(each) for each in answer.places]}
+        return with_notes(places, answer.notes)
+    circle: JsonObject = {"x": answer.x, "y": answer.y, "radius_m": answer.radius_m}
     known = (at for each in answer.visits for at in (each.arrived, each.departed) if at is not None)
     local = LocalTimes(min(known, default=None), answer.now)
     reply: JsonObject = {
-        "frame_id": answer.frame_id or None,
-        "x": answer.x,
-        "y": answer.y,
-        "radius_m": answer.radius_m,
+        **frame,
+        **({} if answer.where is None else {"where": answer.where}),
+        **({} if answer.radius_m is None else circle),
         "there_now": any(each.departed is None for each in answer.visits),
         "visits": [_visit(each, answer.now, local) for each in answer.visits],
         "total": answer.total,
+        "minutes": _minutes(answer.duration),
     }
     return with_notes(reply, answer.notes, more=answer.more)
+
+
+def _place_visits(place: results.PlaceVisits) -> JsonObject:
+    seen: JsonObject = {"first_entry": moment(place.first), "last_exit": moment(place.last)}
+    return {
+        "place": place.place,
+        "minutes": _minutes(place.duration),
+        "entries": place.entries,
+        **(seen if place.entries else {}),
+    }
+
+
+def _minutes(duration: Ns) -> float:
+    return round(duration / 60e9, 2)
+
+
+def _closest(visit: results.Visit) -> JsonObject:
+    return {
+        "closest_m": rounded(visit.closest_m or 0.0, 3),
+        "closest_at": moment(visit.closest_at),
+    }
 
 
 def _visit(visit: results.Visit, now: Ns, local: LocalTimes) -> JsonObject:
@@ -163,8 +189,7 @@ def _visit(visit: results.Visit, now: Ns, local: LocalTimes) -> JsonObject:
         "departed": moment(visit.departed),
         **local.of(visit.arrived, visit.departed),
         "duration_s": seconds(visit.duration),
-        "closest_m": rounded(visit.closest_m, 3),
-        "closest_at": moment(visit.closest_at),
+        **({} if visit.closest_m is None else _closest(visit)),
         "ago_s": 0.0 if visit.departed is None else seconds(now - visit.departed),
     }
     if visit.restarts:

@@ -112,9 +112,10 @@ def test_an_entry_made_with_other_static_transforms_is_not_used(tmp_path: Path) 
     view = View(memory, Call())
     first, second = view.snapshot.timeline.bags
     maps = MapDigests(view)
-    digests = view.bags.digests_of(view.snapshot.timeline.segment_of(first))
+    segment = view.snapshot.timeline.segment_of(second)
+    digests = view.bags.digests_of(segment)
     assert digests is not None
-    assert maps.valid_numbers(digests, [first, second]) == {}
+    assert maps.valid_in(digests, segment) == {}
     assert maps.made(first).frame_id == "map"
     assert maps.made(first).track.x.tolist()[0] == 5.0
 
@@ -133,7 +134,7 @@ def test_the_digest_is_the_same_in_the_catalogue_and_from_the_bag(seed: int) -> 
         for segment in fresh.snapshot.timeline.segments:
             digests = fresh.bags.digests_of(segment)
             assert digests is not None
-            valid = again.valid_numbers(digests, segment.bags)
+            valid = again.valid_in(digests, segment)
             stored = known.recall.catalogue.maps([*valid.values()])
             for bag in segment.bags:
                 if bag.file in valid:

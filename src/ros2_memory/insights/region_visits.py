@@ -1,0 +1,128 @@
+"""Visits to regions by the robot's track: in a map that moves, and of any shape.
+
+The track is joined from digests of bags, so all visits of a week are counted in milliseconds. A
+time is as exact as the track: no pose is farther than some 5 cm from it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ros2_memory.core.regions import Circle
+from ros2_memory.core.timebase import NS_PER_MS, Ns
+from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.robot_tracks import RobotTracks, robot_inside
+from ros2_memory.results import PlaceVisits, Visit
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.analysis.robot_track import RobotTrack
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.regions import Place
+    from ros2_memory.history.robot_tracks import Inside
+    from ros2_memory.history.view import View
+    from ros2_memory.insights.where import Where
+
+
+class RegionVisits(NamedTuple):
+    """All visits to a region in a window, newest first, and the track that they are of."""
+
+    track: RobotTrack
+    all: list[Inside]
+
+    @property
+    def duration(self) -> Ns:
+        """How long they were in all."""
+        return sum(each.stop - each.start for each in self.all)
+
+
+def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
+    """Returns the robot's track in a window; a note says how far back it reaches, if not all.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    joined = RobotTracks(view, frame_id).over(window)
+    if joined.since is not None:
+        view.notes.complete = False
+        view.notes.add(
+            f"visits are known back to {unix_text(joined.since)}: the time was over before older "
+            "bags without a digest were read"
+        )
+    if joined.left_out:
+        view.notes.add(f"poses that no transform places in {frame_id} are left out")
+    return joined.track
+
+
+def region_visits(track: RobotTrack, where: Where, window: TimeWindow) -> RegionVisits:
+    """Returns the visits to a region."""
+    return RegionVisits(track, robot_inside(track, where.region, window)[::-1])
+
+
+def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:
+    """Returns a visit for the reply; `newest` is the newest pose, if that is recent enough."""
+    there_still = newest is not None and one.stop >= newest // NS_PER_MS * NS_PER_MS
+    distance_m, at = None, None
+    if isinstance(where.region, Circle):
+        distance_m, at = _closest(found.track, one, where.region)
+    return Visit(
+        arrived=one.start,
+        departed=None if there_still and not one.left else one.stop,
+        duration=one.stop - one.start,
+        closest_m=distance_m,
+        closest_at=at,
+        restarts=0,
+    )
+
+
+def _closest(track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]:
+    """Returns how near (m) the track came to the middle of a circle in a visit, and when."""
+    first = max(int(np.searchsorted(track.times, one.start, side="right")) - 1, 0)
+    last = int(np.searchsorted(track.times, one.stop, side="left"))
+    times = track.times[first : last + 1]
+    inner = np.concatenate(([one.start], times, [one.stop])).clip(one.start, one.stop)
+    since = times[0]
+    x, y = (
+        np.interp(inner - since, times - since, column[first : last + 1])
+        for column in (track.x, track.y)
+    )
+    dx, dy = np.diff(x), np.diff(y)
+    size = dx * dx + dy * dy
+    along = ((circle.x - x[:-1]) * dx + (circle.y - y[:-1]) * dy) / np.where(size > 0, size, 1.0)
+    along = np.where(size > 0, along.clip(0.0, 1.0), 0.0)
+    off = np.hypot(x[:-1] + along * dx - circle.x, y[:-1] + along * dy - circle.y)
+    where = int(off.argmin())
+    at = int(inner[where] + round(float(along[where]) * int(inner[where + 1] - inner[where])))
+    return float(min(off[where], circle.radius_m)), at
+
+
+def place_visits(
+    view: View, places: Sequence[Place], frame_id: str, window: TimeWindow
+) -> tuple[PlaceVisits, ...]:
+    """Returns how often, and for how long, the robot was in each named place of a frame.
+
+    Those in which it was longest come first.
+    """
+    track = track_in(view, frame_id, window)
+    found: list[PlaceVisits] = []
+    for place in places:
+        if place.frame_id != frame_id:
+            view.notes.add(
+                f"{place.name} is left out: it is in {place.frame_id}, and these places are in "
+                f"{frame_id}"
+            )
+            continue
+        inside = robot_inside(track, place.region, window)
+        found.append(
+            PlaceVisits(
+                place=place.name,
+                entries=len(inside),
+                duration=sum(each.stop - each.start for each in inside),
+                first=inside[0].start if inside else None,
+                last=inside[-1].stop if inside else None,
+            )
+        )
+    return tuple(sorted(found, key=lambda each: (-each.duration, each.place)))

@@ -1,0 +1,110 @@
+"""The argument `where`: a named place, a circle or a rectangle, and when the robot was there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.regions import Box, Circle
+from ros2_memory.core.text import abbreviate
+from ros2_memory.history.robot_tracks import robot_inside
+from ros2_memory.insights.region_visits import track_in
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.regions import Place, Region
+    from ros2_memory.history.robot_tracks import Inside
+    from ros2_memory.history.view import View
+
+_EXPECTED: Final = (
+    "give the name of a place, "
+    '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m)'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """A region, and the frame that it is in.
+
+    Attributes:
+        frame_id: None for the frame that places are in by default.
+        name: of a named place; None for any other region.
+    """
+
+    region: Region
+    frame_id: str | None = None
+    name: str | None = None
+
+
+def parse_where(
+    places: Sequence[Place], value: JsonValue, default_radius_m: float | None = None
+) -> Where:
+    """Returns what a value of the argument `where` means.
+
+    Args:
+        places: the named ones.
+        value: as the client gave it.
+        default_radius_m: of a circle without a radius; None where it must have one.
+
+    Raises:
+        InvalidArgumentsError: it is no region, or no place has that name.
+    """
+    if isinstance(value, str):
+        return _named(places, value)
+    if not isinstance(value, dict):
+        raise InvalidArgumentsError(f"where was {abbreviate(value)}; {_EXPECTED}")
+    unknown = value.keys() - {"x", "y", "radius_m"}
+    if unknown:
+        raise InvalidArgumentsError(f"where has no {abbreviate(min(unknown))}; {_EXPECTED}")
+    x, y = value.get("x"), value.get("y")
+    if isinstance(x, list) or isinstance(y, list):
+        if "radius_m" in value:
+            raise InvalidArgumentsError(f"where has a radius_m and a range; {_EXPECTED}")
+        return Where(Box(*_bounds("x", x), *_bounds("y", y)))
+    radius = value.get("radius_m", default_radius_m)
+    numbers = [_number(each) for each in (x, y, radius)]
+    if None in numbers or not (numbers[2] or 0) > 0:
+        raise InvalidArgumentsError(f"where was {abbreviate(value)}; {_EXPECTED}")
+    at_x, at_y, size = (each or 0.0 for each in numbers)
+    return Where(Circle(at_x, at_y, size))
+
+
+def _named(places: Sequence[Place], name: str) -> Where:
+    asked = " ".join(name.split()).casefold()
+    for place in places:
+        if " ".join(place.name.split()).casefold() == asked:
+            return Where(place.region, place.frame_id, place.name)
+    known = ", ".join(sorted(each.name for each in places))
+    listed = f"there are: {known}" if known else "none are named in data.places_file"
+    raise InvalidArgumentsError(f"where: no place is named {abbreviate(name)}; {listed}")
+
+
+def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
+    ends = [_number(each) for each in value] if isinstance(value, list) else []
+    if len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
+        raise InvalidArgumentsError(
+            f"where: {axis} was {abbreviate(value)}, which is no range [from, to]; {_EXPECTED}"
+        )
+    return ends[0], ends[1]
+
+
+def _number(value: JsonValue) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def times_inside(view: View, where: Where, frame_id: str, window: TimeWindow) -> list[Inside]:
+    """Returns when the robot was in a region, in order; a note says where that is not all known.
+
+    `frame_id` is the frame of regions that name none.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    track = track_in(view, where.frame_id or frame_id, window)
+    return robot_inside(track, where.region, window)

@@ -1,0 +1,80 @@
+"""Regions of the plane, and when a path is inside of one."""
+
+from __future__ import annotations
+
+from random import Random
+
+import numpy as np
+import pytest
+
+from ros2_memory.core.regions import (
+    Box,
+    Circle,
+    Place,
+    Polygon,
+    Region,
+    Steps,
+    parts_inside,
+    place_at,
+)
+
+CIRCLE = Circle(1.0, 2.0, 1.5)
+BOX = Box(-1.0, 2.0, 0.0, 3.0)
+SQUARE = Polygon(((-1.0, 0.0), (2.0, 0.0), (2.0, 3.0), (-1.0, 3.0)))
+HORSESHOE = Polygon(
+    ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (3.0, 4.0), (3.0, 1.0), (1.0, 1.0), (1.0, 4.0), (0.0, 4.0))
+)
+
+
+def steps(draw: Random, count: int = 300) -> Steps:
+    points = np.array([(draw.uniform(-3, 6), draw.uniform(-3, 6)) for _ in range(count + 1)])
+    points[5] = points[4]  # the robot stands
+    return Steps(points[:-1, 0], points[:-1, 1], points[1:, 0], points[1:, 1])
+
+
+@pytest.mark.parametrize(
+    "region", [CIRCLE, BOX, SQUARE, HORSESHOE], ids=lambda each: repr(each)[:6]
+)
+@pytest.mark.parametrize("seed", range(5))
+def test_the_parts_inside_are_those_whose_points_are(region: Region, seed: int) -> None:
+    draw = Random(seed)
+    path = steps(draw)
+    parts = parts_inside(region, path)
+    assert (parts.start <= parts.stop).all()
+    for _ in range(2000):
+        step, share = draw.randrange(len(path.x)), draw.random()
+        x = path.x[step] + (path.to_x[step] - path.x[step]) * share
+        y = path.y[step] + (path.to_y[step] - path.y[step]) * share
+        mine = parts.step == step
+        apart = np.abs(np.concatenate((parts.start[mine], parts.stop[mine])) - share)
+        if len(apart) and apart.min() < 1e-9:
+            continue  # on the border
+        inside = bool(((parts.start[mine] <= share) & (share <= parts.stop[mine])).any())
+        assert inside == region.contains(x, y)
+
+
+def test_a_path_may_be_inside_of_a_horseshoe_twice_in_one_step() -> None:
+    path = Steps(np.array([-1.0]), np.array([3.0]), np.array([5.0]), np.array([3.0]))
+    parts = parts_inside(HORSESHOE, path)
+    assert parts.step.tolist() == [0, 0]
+    assert (6 * parts.start - 1).tolist() == pytest.approx([0.0, 3.0])
+    assert (6 * parts.stop - 1).tolist() == pytest.approx([1.0, 4.0])
+
+
+@pytest.mark.parametrize("region", [CIRCLE, BOX, SQUARE])
+def test_a_robot_that_stands_is_inside_or_not(region: Region) -> None:
+    path = Steps(*(np.array(each) for each in ([1.0, 9.0], [2.0, 9.0], [1.0, 9.0], [2.0, 9.0])))
+    parts = parts_inside(region, path)
+    assert [each.tolist() for each in parts] == [[0], [0.0], [1.0]]
+
+
+def test_of_places_within_each_other_the_smallest_is_named() -> None:
+    places = (
+        Place("kitchen", "map", Box(0, 5, 0, 5)),
+        Place("dock", "map", Circle(1, 1, 0.5)),
+        Place("yard", "odom", Box(0, 5, 0, 5)),
+    )
+    assert place_at(places, "map", 1.2, 1.0) == "dock"
+    assert place_at(places, "map", 3.0, 1.0) == "kitchen"
+    assert place_at(places, "map", 7.0, 1.0) is None
+    assert place_at(places, "odom", 3.0, 1.0) == "yard"

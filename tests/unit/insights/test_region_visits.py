@@ -1,0 +1,160 @@
+"""Visits to places of any shape, in a map that moves under odometry."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.regions import Box, Circle, Place, Polygon
+from ros2_memory.history.context import Call
+from ros2_memory.insights.visits import visits
+from ros2_memory.tools.replies import Replies
+from tests.support.memories import memory_of, recalling
+from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.random_histories import write_history
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+PLACES = (
+    Place("corner", "map", Circle(4.0, 3.0, 0.5)),
+    Place("start", "map", Box(-0.6, 0.6, -0.6, 0.6)),
+    Place("far side", "map", Polygon(((3.0, -1.0), (5.0, -1.0), (5.0, 4.0), (3.0, 4.0)))),
+    Place("garden", "map", Box(50.0, 60.0, 0.0, 9.0)),
+    Place("yard", "elsewhere", Box(-9.0, 9.0, -9.0, 9.0)),
+)
+
+
+def in_places(memory: Memory) -> Memory:
+    return replace(memory, limits=replace(memory.limits, places=PLACES))
+
+
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+@pytest.mark.parametrize("seed", range(3))
+def test_visits_in_a_moving_map_are_when_the_robot_was_there(
+    tmp_path: Path, seed: int, recalls: bool
+) -> None:
+    truth = write_moving_map(tmp_path, seed, seconds=300)
+    memory = in_places(memory_of(tmp_path))
+    memory = recalling(memory, tmp_path) if recalls else memory
+    found = visits(memory, Call(), where="corner", limit=100)
+    there = truth.inside(4.0, 3.0, 0.5)
+    assert found.where == "corner"
+    # A correction that jumps is late at the ends of bags: less than a second for each.
+    assert found.duration / S == pytest.approx(len(there) / 5, abs=4.0)
+    assert found.total == len(found.visits)
+    near = [
+        at
+        for at in truth.inside(4.0, 3.0, 0.3)
+        if any(
+            (each.arrived or 0) <= at <= (each.departed or BEGIN + 300 * S) for each in found.visits
+        )
+    ]
+    assert len(near) >= 0.97 * len(truth.inside(4.0, 3.0, 0.3))
+
+
+def test_without_a_place_all_named_ones_are_told_at_once(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 1, seconds=300)
+    memory = in_places(memory_of(tmp_path))
+    found = visits(memory, Call())
+    assert found.places is not None
+    by_name = {each.place: each for each in found.places}
+    assert set(by_name) == {"corner", "start", "far side", "garden"}
+    for name in ("corner", "start", "far side"):
+        alone = visits(memory, Call(), where=name, limit=100)
+        assert by_name[name].entries == alone.total
+        assert by_name[name].duration == alone.duration
+        assert by_name[name].first == alone.visits[-1].arrived
+    assert by_name["garden"].entries == 0
+    assert any("yard is left out" in note for note in found.notes)
+
+
+def test_a_window_cuts_visits(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 2, seconds=200)
+    memory = in_places(memory_of(tmp_path))
+    begin = BEGIN / S
+    whole = visits(memory, Call(), where="start", limit=100)
+    parts = [
+        visits(memory, Call(), where="start", start_s=begin + a, end_s=begin + b, limit=100)
+        for a, b in ((0, 2), (2, 90), (90, 400))
+    ]
+    assert sum(each.duration for each in parts) / S == pytest.approx(whole.duration / S, abs=0.01)
+    [first] = parts[0].visits
+    assert first.duration / S == pytest.approx(2.0, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"where": "attic"}, "there are: corner"),
+        ({"where": {"x": [1, 0], "y": [0, 1]}}, "no range"),
+        ({"where": {"x": 1.0}}, "give the name"),
+        ({"where": {"x": 1.0, "y": 1.0, "z": 0}}, "has no"),
+        ({"where": 5}, "give the name"),
+        ({"where": "corner", "x": 1.0}, "give one"),
+        ({"x": 1.0}, "both"),
+        ({"where": {"x": [0, 1], "y": [0, 1], "radius_m": 1}}, "radius_m and a range"),
+        ({"where": "yard"}, "frame_id was"),
+    ],
+)
+def test_what_is_no_place_is_refused(tmp_path: Path, given: dict[str, Any], reason: str) -> None:
+    write_moving_map(tmp_path, 2, seconds=10)
+    with pytest.raises(InvalidArgumentsError, match=reason):
+        visits(in_places(memory_of(tmp_path)), Call(), **given)
+
+
+def test_without_named_places_a_place_must_be_given(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 2, seconds=10)
+    with pytest.raises(InvalidArgumentsError, match="no place is named"):
+        visits(memory_of(tmp_path), Call())
+
+
+def test_a_place_of_the_poses_own_frame_is_known_in_a_moving_map_too(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 2, seconds=30)
+    everywhere: dict[str, Any] = {"x": [-99, 99], "y": [-99, 99]}
+    found = visits(memory_of(tmp_path), Call(), where=everywhere, frame_id="odom")
+    assert found.frame_id == "odom"
+    assert found.duration / S == pytest.approx(29.8, abs=0.01)
+
+
+def answer(memory: Memory, given: dict[str, Any]) -> str:
+    replies = Replies(Path("/bags"), 24_000)
+    try:
+        return replies.answer(visits(memory, Call(), **given), from_active=False).text
+    except EpisodicError as error:
+        return replies.error(error).text
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 10_000),
+    part=st.sampled_from([0.3, 1.0]),
+    split_s=st.sampled_from([3.0, 10.0, 25.0]),
+    moving=st.booleans(),
+)
+def test_visits_are_the_same_whatever_the_catalogue_knows(
+    seed: int, part: float, split_s: float, moving: bool
+) -> None:
+    with TemporaryDirectory() as folder:
+        if moving:
+            write_moving_map(Path(folder), seed, seconds=60, split_s=split_s)
+        else:
+            write_history(Path(folder), random.Random(seed))
+        memory = in_places(memory_of(Path(folder)))
+        known = recalling(memory, Path(folder), part=part)
+        for given in (
+            {},
+            {"where": "start"},
+            {"where": {"x": [-1, 1], "y": [-2, 2]}},
+            {"x": 0.5, "y": 0.0, "radius_m": 1.0},
+            {"where": {"x": 0, "y": 0, "radius_m": 1.0}, "frame_id": "odom"},
+        ):
+            assert answer(memory, given) == answer(known, given)
