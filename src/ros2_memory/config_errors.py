@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Final, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Final, TypeVar, get_args, get_origin, get_type_hints
 
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
@@ -138,7 +138,10 @@ def _known_keys(model: type, fault: ErrorDetails, nodes: Mapping[str, type]) -> 
     """Returns the keys that exist in the section of a fault's unknown key."""
     *sections, _unknown = fault["loc"]
     for section in sections:
-        model = nodes.get(str(section)) or get_type_hints(model)[str(section)]
+        if get_origin(model) is dict:  # the section is any of its keys
+            model = get_args(model)[1]
+        else:
+            model = nodes.get(str(section)) or get_type_hints(model)[str(section)]
     names = (field.name for field in fields(model) if is_dataclass(model))
     return ["_target_" if name == "target" else name for name in names]
 

@@ -187,7 +187,7 @@ _Where: TypeAlias = Annotated[
             "examples": ["kitchen"],
         }
     ),
-    Field(description="A place: see instructions."),
+    Field(description="A place."),
 ]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)

@@ -32,6 +32,7 @@ _HAPPENED: Final = """\
 happened, where did you stop?": recap; "why then?": with around. "Have you been here?": visits. \
 "How low was it?": get_topic_in_last with fields and max_samples 1. "Usually, on each day?": by. \
 "Can I trust this?": memory_status.
+- where: a place's name, {{x, y, radius_m}} or {{"x": [from, to], "y": [from, to]}}.
 """
 _REST: Final = """\
 - Positions are metres, yaw_deg is counter-clockwise from x, in frame_id ({pose_topic}: usually \

@@ -72,7 +72,7 @@ BLOCKING = {
 }
 OPTIONAL = {
     "remember_moment": {"seconds_before", "seconds_after"},
-    "visits": {"frame_id", "radius_m", "limit"},
+    "visits": {"x", "y", "where", "start", "end", "frame_id", "radius_m", "limit"},
     "find_matches": {
         "field",
         "min_score",
