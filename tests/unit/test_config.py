@@ -47,6 +47,7 @@ class TestDefaults:
                 "tf_clock": "auto",
                 "max_plausible_speed_mps": 10.0,
                 "latched_topics": {"include": (), "exclude": ()},
+                "places_file": ROOT / "config/places.yaml",
             },
             "reader": {
                 "index_refresh_s": 5.0,

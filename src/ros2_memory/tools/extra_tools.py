@@ -52,8 +52,8 @@ _STATUS = ToolDeclaration(
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
-    "{map_frame} where transforms lead there, else in the frame of {pose_topic}; without a place, in "
-    "every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
+    "{map_frame} where transforms lead there, else in the frame of {pose_topic}; without a place, "
+    "in every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
     "closest_m, ago_s}}], total, minutes}} or {{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,
     visits,
