@@ -263,12 +263,17 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
 
 def build_digester(memory: Memory) -> Digester:
     """Returns what digests the bags of a memory."""
+    from ros2_memory.catalogue.detector_sights import DetectorSights
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.history.map_digests import map_settings
 
     limits = memory.limits
     return Digester(
-        memory.reader, memory.extractor, limits.max_plausible_speed_mps, map_settings(limits)
+        memory.reader,
+        memory.extractor,
+        limits.max_plausible_speed_mps,
+        map_settings(limits),
+        partial(DetectorSights, memory.reader, memory.extractor),
     )
 
 

@@ -489,6 +489,75 @@ class Visits(AnswerWithNotes):
 
 
 @dataclass(frozen=True, slots=True)
+class ThingStay:
+    """A time at which a thing was at a place (m): first and last seen there, and how often."""
+
+    start: Ns
+    end: Ns
+    place: Vector3
+    count: int
+    inside: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StillThere:
+    """What is known of a thing since it was last seen, in the words of the reply.
+
+    Attributes:
+        state: `seen_since`, `not_looked_at_since` or `not_seen_where_expected`.
+        at: when it was seen again, last seen, or known to be missed.
+        looks: detector messages that should have had it.
+    """
+
+    state: str
+    at: Ns
+    looks: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """One thing that detectors saw, or one label of things that move by themselves.
+
+    Attributes:
+        also_seen_as: other labels that it was seen under, the commonest first.
+        place: its last one (m), in `frame_id`; `spread_m` is the root mean square distance of its
+            detections there.
+        inside: the named place that it is in.
+        best, median: of its scores; None without any.
+        robot: x, y (m) and yaw (rad) from which it was last seen; None where that is not known.
+        moved: its places in order, where there are several.
+        at_once: of what moves by itself, how many were seen at the same time; else None.
+    """
+
+    label: str
+    also_seen_as: tuple[str, ...]
+    place: Vector3
+    spread_m: float
+    frame_id: str
+    inside: str | None
+    first: Ns
+    last: Ns
+    count: int
+    best: float | None
+    median: float | None
+    robot: tuple[float, float, float] | None
+    still_there: StillThere | None
+    moved: tuple[ThingStay, ...] = ()
+    at_once: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Things(AnswerWithNotes):
+    """Things, those seen last first; `labels` counts all of them, also those that are not shown."""
+
+    frame_id: str
+    things: tuple[Thing, ...]
+    total: int
+    labels: tuple[tuple[str, int], ...]
+    now: Ns
+
+
+@dataclass(frozen=True, slots=True)
 class TypeFields(AnswerWithNotes):
     """The fields that replies show of a message type, and the topics recorded under it."""
 

@@ -6,12 +6,13 @@ import json
 import time
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
@@ -94,7 +95,13 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     catalogue = Catalogue([bag_dir / FOLDER / FILE], "test")
     recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
-    digester = Digester(memory.reader, memory.extractor, limit, map_settings(memory.limits))
+    digester = Digester(
+        memory.reader,
+        memory.extractor,
+        limit,
+        map_settings(memory.limits),
+        partial(DetectorSights, memory.reader, memory.extractor),
+    )
     statics = BagStatics(View(memory, Call()))
     bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)
     for bag in bags[: round(part * len(bags))]:

@@ -449,3 +449,14 @@ class MatchesArguments(ConditionArguments):
     ] = False
     limit: _Limit = 5
     by: _By | None = None
+
+
+class ThingsArguments(Arguments):
+    """Which things, where, and when."""
+
+    label: Annotated[_Name, Field(description="Whole name.", examples=["mug"])] | None = None
+    where: _Where | None = None
+    start_s: _Time | None = Field(default=None, alias="start")
+    end_s: _Time | None = Field(default=None, alias="end")
+    min_score: _Score | None = None
+    limit: _Limit = 12

@@ -9,11 +9,13 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status
 from ros2_memory.insights.type_fields import describe_type
 from ros2_memory.insights.visits import visits
+from ros2_memory.things.find import find_things
 from ros2_memory.tools.arguments import (
     MatchesArguments,
     NoArguments,
     RecapTime,
     SaveMomentArguments,
+    ThingsArguments,
     TypeArguments,
     VisitsArguments,
     WindowArguments,
@@ -59,6 +61,15 @@ _VISITS = ToolDeclaration(
     visits,
     blocking=True,
 )
+_THINGS = ToolDeclaration(
+    (ToolName("find_things", "Things"),),
+    "What there is and where: how many chairs, what is in a place, where is X, since when and "
+    "where before; as of end. Reply: {{things: [{{label, place, in, first_seen, last_seen, ago_s, "
+    "count, seen_from, still_there, moved: [{{from, to, place, times}}]}}], total, labels}}.",
+    ThingsArguments,
+    find_things,
+    blocking=True,
+)
 TYPE = ToolDeclaration(
     (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
@@ -80,7 +91,7 @@ _SAVE_MOMENT = ToolDeclaration(
     blocking=True,
     writes=True,
 )
-DECLARATIONS = (_SIGHTINGS, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
+DECLARATIONS = (_SIGHTINGS, _THINGS, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
 """The tools, in the order in which clients see them."""
 READABLE = (TYPE, MOMENTS)
 """What is read as a resource, and is no tool."""

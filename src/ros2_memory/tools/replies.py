@@ -15,7 +15,11 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.timebase import unix_rounded_up
-from ros2_memory.tools import reply_json_bins, reply_json_motion  # noqa: F401 - register replies
+from ros2_memory.tools import (  # noqa: F401 - register replies
+    reply_json_bins,
+    reply_json_motion,
+    reply_json_things,
+)
 from ros2_memory.tools.reply_json import render, with_notes
 from ros2_memory.tools.reply_json_memory import file_name, time_range
 from ros2_memory.tools.reply_json_topics import fit_topics

@@ -1,0 +1,206 @@
+"""Collects what the detectors of one bag saw, for `MapDigest.sights`.
+
+Which topics are of detectors shows in their messages: they hold detections, or their type is named
+for them. Other messages of such a topic count as looks that saw nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.sights import SeenThing, SightsBuilder, encode_sights
+from ros2_memory.analysis.transform_tree import AGREEMENT_NS
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.messages.detections import detections_of
+
+if TYPE_CHECKING:
+    from ros2_memory.analysis.bag_frames import BagFrames, Times
+    from ros2_memory.catalogue.map_digest import PlacedPoses
+    from ros2_memory.core.model import JsonValue, Vector3
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.messages.detections import Detection
+    from ros2_memory.storage.base import BagReader, Record
+
+_NO_DETECTIONS: Final = frozenset(
+    {
+        "action_msgs",
+        "actionlib_msgs",
+        "builtin_interfaces",
+        "diagnostic_msgs",
+        "geometry_msgs",
+        "map_msgs",
+        "nav_msgs",
+        "px4_msgs",
+        "rcl_interfaces",
+        "rosgraph_msgs",
+        "sensor_msgs",
+        "shape_msgs",
+        "stereo_msgs",
+        "tf2_msgs",
+        "trajectory_msgs",
+    }
+)
+"""Packages whose messages hold no detections, so that nothing is looked for in them."""
+_TEXTS: Final = frozenset({"std_msgs/msg/String"})
+_OF_DETECTORS: Final = ("detection", "recognizedobject")
+_TRIED: Final = 16
+"""After so many messages without a detection, a topic of any other type is of no detector."""
+_HEADER: Final = struct.Struct("<iII")
+_ENCAPSULATION: Final = 4
+_NS_PER_S: Final = 1_000_000_000
+_MAX_DETECTIONS: Final = 1_000_000
+
+
+@dataclass(slots=True)
+class _Topic:
+    """What is known of one topic of the bag.
+
+    Attributes:
+        is_detector: whether its type is named for detections, or a message has held one.
+        begins_with_header: whether the bytes of a message begin with its header; None until tried.
+    """
+
+    is_detector: bool
+    times: list[Ns] = field(default_factory=list)
+    log_times: list[Ns] = field(default_factory=list)
+    detections: list[tuple[Detection, ...]] = field(default_factory=list)
+    begins_with_header: bool | None = None
+
+
+class DetectorSights:
+    """A `SightsBuilder` of `map_digest`.
+
+    Args:
+        reader: decodes messages whose value is not given.
+        extractor: gives their values and frames.
+    """
+
+    def __init__(self, reader: BagReader, extractor: SchemaExtractor) -> None:
+        self._reader = reader
+        self._extractor = extractor
+        self._topics: dict[str, _Topic | None] = {}
+        self._left = _MAX_DETECTIONS
+
+    def wants(self, topic: str, type_name: str) -> bool:
+        """Returns whether messages of a type may hold detections."""
+        package, _, name = type_name.partition("/")
+        if type_name not in _TEXTS and (package in _NO_DETECTIONS or package == "std_msgs"):
+            return False
+        if topic not in self._topics:
+            named = any(each in name.casefold() for each in _OF_DETECTORS)
+            self._topics[topic] = _Topic(named)
+        return True
+
+    def add(self, record: Record, value: JsonValue | None) -> None:
+        """Takes the next message of a topic."""
+        of_topic = self._topics.get(record.channel.topic)
+        if of_topic is None:
+            return
+        try:
+            frame, stamp, value = self._read(record, value, of_topic)
+        except UndecodableError:
+            return
+        found = detections_of(value, frame)
+        self._left -= len(found)
+        if self._left < 0:
+            return
+        of_topic.is_detector |= bool(found)
+        log_time = record.log_time
+        # A stamp of another clock says nothing of when the transforms were.
+        agrees = stamp is not None and abs(stamp - log_time) <= AGREEMENT_NS
+        of_topic.times.append(stamp if stamp is not None and agrees else log_time)
+        of_topic.log_times.append(log_time)
+        of_topic.detections.append(found)
+        if not of_topic.is_detector and len(of_topic.times) >= _TRIED:
+            self._topics[record.channel.topic] = None
+
+    def _read(
+        self, record: Record, value: JsonValue | None, of_topic: _Topic
+    ) -> tuple[str, Ns | None, JsonValue]:
+        """Returns the frame, the stamp and the value of a message.
+
+        Raises:
+            UndecodableError: it cannot be decoded.
+        """
+        if value is not None and of_topic.begins_with_header:
+            front = _front_header(record.payload)
+            if front is not None:
+                return *front, value
+        message = self._reader.decode(record)
+        frame, stamp = self._extractor.frame(message), _stamp_of(message)
+        if of_topic.begins_with_header is None:
+            of_topic.begins_with_header = _front_header(record.payload) == (frame, stamp)
+        if value is None:
+            value = self._extractor.exact(message, record.channel.type)
+        return frame, stamp, value
+
+    def digest(self, robot: PlacedPoses) -> bytes:
+        """Returns the encoded sights."""
+        builder = SightsBuilder()
+        for topic, of_topic in self._topics.items():
+            if of_topic is None or not of_topic.is_detector:
+                continue
+            times = np.array(of_topic.times, np.int64)
+            places = _places(of_topic, times, robot.frames)
+            poses = robot.at(times)
+            known = poses.valid & np.isfinite(poses.x + poses.y + poses.heading)
+            columns = (poses.x.tolist(), poses.y.tolist(), poses.heading.tolist(), known.tolist())
+            for log_time, found, placed, x, y, yaw, valid in zip(
+                of_topic.log_times, of_topic.detections, places, *columns, strict=True
+            ):
+                seen = [
+                    SeenThing(each.label, place, each.score)
+                    for each, place in zip(found, placed, strict=True)
+                ]
+                builder.add(topic, log_time, (x, y, yaw) if valid else None, seen)
+        return encode_sights(builder.sights(robot.frames.target))
+
+
+def _places(of_topic: _Topic, times: Times, frames: BagFrames) -> list[list[Vector3 | None]]:
+    """Returns the places of all detections in the target frame; None where that is not known."""
+    places: list[list[Vector3 | None]] = [[None] * len(each) for each in of_topic.detections]
+    by_frame: dict[str, list[tuple[int, int, Vector3]]] = {}
+    for nth, found in enumerate(of_topic.detections):
+        for which, each in enumerate(found):
+            if each.place is not None and each.frame_id:
+                by_frame.setdefault(each.frame_id, []).append((nth, which, each.place))
+    for frame, points in by_frame.items():
+        numbers = np.array([nth for nth, _, _ in points], np.int64)
+        poses = frames.poses(frame, times[numbers])
+        if poses is None:
+            continue
+        x, y, z = np.array([place for _, _, place in points], np.float64).T
+        placed = (each.tolist() for each in poses.points((x, y, z)))
+        for (nth, which, _), valid, *place in zip(
+            points, poses.valid.tolist(), *placed, strict=True
+        ):
+            if valid:
+                px, py, pz = place
+                places[nth][which] = (px, py, pz)
+    return places
+
+
+def _front_header(payload: bytes) -> tuple[str, Ns] | None:
+    """Returns frame and stamp of a std_msgs/Header at the front of a message, if it may be one."""
+    if len(payload) < _ENCAPSULATION + _HEADER.size or payload[1] != 1:
+        return None
+    seconds, nanoseconds, size = _HEADER.unpack_from(payload, _ENCAPSULATION)
+    start = _ENCAPSULATION + _HEADER.size
+    text = bytes(payload[start : start + size])
+    if not size or len(text) < size:
+        return None
+    return text[:-1].decode("utf-8", "replace"), seconds * _NS_PER_S + nanoseconds
+
+
+def _stamp_of(message: object) -> Ns | None:
+    """Returns the stamp in a message's header; None where it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    seconds, nanoseconds = getattr(stamp, "sec", None), getattr(stamp, "nanosec", None)
+    if isinstance(seconds, int) and isinstance(nanoseconds, int):
+        return seconds * _NS_PER_S + nanoseconds
+    return None

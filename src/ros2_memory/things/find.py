@@ -1,0 +1,288 @@
+"""Answers which things there are, where, since when, and where they were before."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
+from ros2_memory.core.regions import place_at
+from ros2_memory.core.text import abbreviate, counted, listed
+from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.insights.where import parse_where
+from ros2_memory.results import StillThere, Thing, Things, ThingStay
+from ros2_memory.things.known import KnownThings, known_things
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.analysis.sights import Ints
+    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.regions import Place
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.insights.where import Where
+    from ros2_memory.things.instances import Instance, Mover, PlacedStay
+
+LIMIT: Final = 12
+_MOST_NAMES: Final = 5
+_MOST_STAYS: Final = 8
+_MM: Final = 1000.0
+
+
+def find_things(
+    memory: Memory,
+    call: Call,
+    label: str | None = None,
+    *,
+    where: JsonValue = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    min_score: float | None = None,
+    limit: int = LIMIT,
+) -> Things:
+    """Returns the things of a label, or all, that were seen in a window, those seen last first.
+
+    A thing counts where it was at the window's end. `where` takes those that are in a region then;
+    of what moves by itself, what was seen in it. Bags count as a whole.
+
+    Raises:
+        InvalidArgumentsError: the bounds make no window, or `where` is no region.
+        NoDataError: the memory holds nothing.
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    limits = memory.limits
+    region = None if where is None else parse_where(limits.places, where)
+    span = TimeRange(start_s, end_s)
+    wall = memory.clock.now()
+    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
+    now = memory.now(wall, view.snapshot.latest)
+    window = clamped(view, search_window(span, now))
+    lowest = limits.min_score if min_score is None else min_score
+    known = known_things(view, lowest, limits.labels)
+    asked = None if label is None else known.labels.key(label)
+    finder = _Finder(known, window, region, limits.places)
+    found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
+    totals: dict[str, int] = {}
+    for each in found:
+        totals[each.label] = totals.get(each.label, 0) + (each.at_once or 1)
+    notes = [*view.notes.sentences(), *_notes(known, label, asked, found=bool(found))]
+    return Things(
+        frame_id=_frame_of(known, found),
+        things=tuple(found[:limit]),
+        total=sum(totals.values()),
+        labels=tuple(sorted(totals.items())),
+        now=now,
+        notes=tuple(notes),
+    )
+
+
+def _frame_of(known: KnownThings, found: Sequence[Thing]) -> str:
+    return found[0].frame_id if found else known.frames[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _Finder:
+    """Selects what a question is about, and describes it."""
+
+    known: KnownThings
+    window: TimeWindow
+    where: Where | None
+    places: tuple[Place, ...]
+
+    def find(self, key: str | None) -> Iterator[Thing]:
+        """Yields the things of a key, or all."""
+        result = self.known.estimate
+        for instance in result.instances:
+            if key in {None, instance.key}:
+                thing = self._instance(instance)
+                if thing is not None:
+                    yield thing
+        for mover in result.movers:
+            if key in {None, mover.key}:
+                thing = self._mover(mover)
+                if thing is not None:
+                    yield thing
+
+    def _instance(self, instance: Instance) -> Thing | None:
+        seen = ((stay, self._seen(stay.spots)) for stay in instance.stays)
+        parts = [(stay, rows) for stay, rows in seen if len(rows)]
+        if not parts:
+            return None
+        last, _ = parts[-1]
+        frame = self.known.frames[instance.epoch]
+        if not self._is_there(frame, last.x, last.y):
+            return None
+        every = np.concatenate([rows for _, rows in parts])
+        stays = [self._stay(frame, group) for group in _by_place(parts)]
+        best, median = self._scores(every)
+        spots = self.known.estimate.sights.spots[every]
+        return Thing(
+            label=self.known.estimate.names[instance.key],
+            also_seen_as=self._other_names(instance),
+            place=_place(last.x, last.y, last.z),
+            spread_m=last.dev_mm / _MM,
+            frame_id=frame,
+            inside=place_at(self.places, frame, last.x / _MM, last.y / _MM),
+            first=int(spots[:, Spot.FIRST].min()),
+            last=int(spots[:, Spot.LAST].max()),
+            count=int(self.known.estimate.counts[every].sum()),
+            best=best,
+            median=median,
+            robot=self._robot(int(every[int(spots[:, Spot.LAST].argmax())])),
+            still_there=self._still_there(instance, *parts[-1]),
+            moved=tuple(stays[-_MOST_STAYS:]) if len(stays) > 1 else (),
+        )
+
+    def _mover(self, mover: Mover) -> Thing | None:
+        """Returns what moves by itself: where it was last seen, inside of the region if one is."""
+        rows = self._seen(mover.spots)
+        result, frame = self.known.estimate, self.known.frames[mover.epoch]
+        if self.where is not None:
+            places = result.sights.spots[rows][:, [Spot.X, Spot.Y]].tolist()
+            rows = rows[[self._is_there(frame, x, y) for x, y in places]]
+        if not len(rows):
+            return None
+        spots = result.sights.spots[rows]
+        newest = int(spots[:, Spot.LAST].argmax())
+        x, y, z, dev = spots[newest, [Spot.X, Spot.Y, Spot.Z, Spot.DEV]].tolist()
+        best, median = self._scores(rows)
+        together = np.sort(spots[:, Spot.TOGETHER])
+        return Thing(
+            label=result.names[mover.key],
+            also_seen_as=(),
+            place=_place(x, y, z),
+            spread_m=dev / _MM,
+            frame_id=frame,
+            inside=place_at(self.places, frame, x / _MM, y / _MM),
+            first=int(spots[:, Spot.FIRST].min()),
+            last=int(spots[newest, Spot.LAST]),
+            count=int(result.counts[rows].sum()),
+            best=best,
+            median=median,
+            robot=self._robot(int(rows[newest])),
+            still_there=None,
+            # One message in a hundred may have a false one.
+            at_once=max(1, int(together[-max(1, len(together) // 100)])),
+        )
+
+    def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
+        where = self.where
+        if where is None:
+            return True
+        if where.frame_id not in {None, frame}:
+            return False
+        return where.region.contains(x_mm / _MM, y_mm / _MM)
+
+    def _seen(self, rows: Ints) -> Ints:
+        """Returns the spots of bags that reach into the window."""
+        spots = self.known.estimate.sights.spots[rows]
+        inside = (spots[:, Spot.FIRST] < self.window.stop) & (
+            spots[:, Spot.LAST] >= self.window.start
+        )
+        return rows[inside & (self.known.estimate.counts[rows] > 0)]
+
+    def _stay(self, frame: str, parts: Sequence[tuple[PlacedStay, Ints]]) -> ThingStay:
+        """Returns the stays at one place in a row, as one."""
+        last, _ = parts[-1]
+        rows = np.concatenate([rows for _, rows in parts])
+        spots = self.known.estimate.sights.spots[rows]
+        return ThingStay(
+            start=int(spots[:, Spot.FIRST].min()),
+            end=int(spots[:, Spot.LAST].max()),
+            place=_place(last.x, last.y, last.z),
+            count=int(self.known.estimate.counts[rows].sum()),
+            inside=place_at(self.places, frame, last.x / _MM, last.y / _MM),
+        )
+
+    def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
+        """Returns the best score of some spots, and the middle of the bin of their median."""
+        sights = self.known.estimate.sights
+        best = int(sights.spots[rows, Spot.BEST].max())
+        if best < 0:
+            return None, None
+        of = np.isin(sights.scores[:, Score.SPOT], rows)
+        counts = np.bincount(sights.scores[of, Score.BIN], sights.scores[of, Score.N], SCORE_BINS)
+        middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
+        return best / 1000, (middle + 0.5) / SCORE_BINS
+
+    def _robot(self, spot: int) -> tuple[float, float, float] | None:
+        """Returns the pose from which a spot was seen most."""
+        look = int(self.known.estimate.robots[spot])
+        if look < 0:
+            return None
+        x, y, yaw = self.known.estimate.sights.looks[look, [Look.X, Look.Y, Look.YAW]].tolist()
+        return x / _MM, y / _MM, float(np.radians((yaw / 10 + 180) % 360 - 180))
+
+    def _other_names(self, instance: Instance) -> tuple[str, ...]:
+        counts: dict[str, int] = {}
+        for stay in instance.stays:
+            for name, count in (*stay.spellings.items(), *stay.also.items()):
+                counts[name] = counts.get(name, 0) + count
+        counts.pop(self.known.estimate.names[instance.key], None)
+        return tuple(sorted(counts, key=lambda each: (-counts[each], each))[:_MOST_NAMES])
+
+    def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere:
+        """Returns what is known of a thing since it was last seen in the window."""
+        spots = self.known.estimate.sights.spots
+        last = int(spots[rows, Spot.LAST].max())
+        if stay.last > last:
+            return StillThere("seen_since", stay.last)
+        if stay is instance.stays[-1]:
+            looks, missed = instance.looks, instance.missed_by
+        else:
+            _, looks, missed = self.known.estimate.missing(instance, stay)
+        if missed is not None:
+            return StillThere("not_seen_where_expected", missed, looks)
+        return StillThere("not_looked_at_since", last)
+
+
+def _place(x_mm: float, y_mm: float, z_mm: float) -> tuple[float, float, float]:
+    return x_mm / _MM, y_mm / _MM, z_mm / _MM
+
+
+def _by_place(
+    parts: Sequence[tuple[PlacedStay, Ints]],
+) -> list[list[tuple[PlacedStay, Ints]]]:
+    """Returns the stays in groups of those that follow each other at one place."""
+    groups: list[list[tuple[PlacedStay, Ints]]] = []
+    for part in parts:
+        if groups and groups[-1][-1][0].place == part[0].place:
+            groups[-1].append(part)
+        else:
+            groups.append([part])
+    return groups
+
+
+def _notes(
+    known: KnownThings, label: str | None, asked: str | None, *, found: bool
+) -> Iterator[str]:
+    """Yields what else there is to know of a label, or of odometry that began anew."""
+    sights = known.estimate.sights
+    if len(known.frames) > 1 + bool(known.frames[0]):
+        yield (
+            "where there is no map, the places of each run of odometry are kept apart: a thing may "
+            "be listed once for each"
+        )
+    if label is None or asked is None:
+        return
+    mine = np.array([known.labels.key(each) == asked for each in sights.labels], bool)
+    unplaced = sights.unplaced[mine[sights.unplaced[:, Unplaced.LABEL]], Unplaced.N].sum()
+    if unplaced:
+        yield f"{counted(int(unplaced), 'detection')} of it could not be placed, and are left out"
+    if found:
+        return
+    seen = int(sights.spots[mine[sights.spots[:, Spot.LABEL]], Spot.N].sum())
+    names = sorted(set(known.estimate.names.values()))
+    if seen:
+        yield (
+            f"it was detected {counted(seen, 'time')} in all, but in this window and region not so "
+            "that it is a thing of its own: find_matches lists single detections"
+        )
+    elif names:
+        close = [each for each in names if asked in each or each in asked]
+        close += difflib.get_close_matches(asked, names, 3)
+        shown = [*dict.fromkeys(close)] or names
+        yield f"no detector reported {abbreviate(label)}; there are: {listed(shown)}"

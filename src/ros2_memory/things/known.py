@@ -1,0 +1,245 @@
+"""The things of a memory: estimated from the sights of all its bags, once for each timeline.
+
+Sights come from the catalogue, joined once for each segment of bags; of bags without a valid entry
+they are made from the bags, as the catalogue would have them. So the estimate is the same with the
+catalogue and without; where reading takes too long it begins later, and says so.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from threading import Lock
+from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
+
+from ros2_memory.analysis.sights import Sights, decode_sights, joined, no_sights
+from ros2_memory.catalogue.detector_sights import DetectorSights
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.model import BagState
+from ros2_memory.core.timebase import Deadline, Ns
+from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.map_digests import MapDigests
+from ros2_memory.history.transforms import sessions_of
+from ros2_memory.things.instances import Estimate, estimate
+from ros2_memory.things.labels import Labels
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.history.view import View
+    from ros2_memory.index.segment import Segment
+    from ros2_memory.index.timeline import Timeline
+
+_READING_S: Final = 4.0
+"""How long bags are read that have no entry, before the answer is partial."""
+_MADE: Final = 1024
+_ESTIMATES: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class KnownThings:
+    """The estimate of a memory.
+
+    Attributes:
+        labels: maps labels to keys.
+        frames: by epoch, the frame of its places; epoch 0 is the map.
+        since: how far back it reaches, where not all bags could be read in time; else None.
+    """
+
+    estimate: Estimate
+    labels: Labels
+    frames: tuple[str, ...]
+    since: Ns | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """The sights of some bags in order of time; with the frame and the folder of each bag."""
+
+    sights: Sights
+    frames: tuple[str, ...]
+    bags: tuple[BagFile, ...]
+
+
+class _Made:
+    """The sights that were made from bags last, and the estimates. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._sights: OrderedDict[tuple[object, ...], Sights] = OrderedDict()
+        self._estimates: WeakKeyDictionary[
+            Timeline, OrderedDict[tuple[object, ...], KnownThings]
+        ] = WeakKeyDictionary()
+
+    def sights(self, key: tuple[object, ...]) -> Sights | None:
+        with self._lock:
+            found = self._sights.get(key)
+            if found is not None:
+                self._sights.move_to_end(key)
+            return found
+
+    def put_sights(self, key: tuple[object, ...], sights: Sights) -> None:
+        with self._lock:
+            self._sights[key] = sights
+            if len(self._sights) > _MADE:
+                self._sights.popitem(last=False)
+
+    def estimate(self, timeline: Timeline, key: tuple[object, ...]) -> KnownThings | None:
+        with self._lock:
+            of_timeline = self._estimates.get(timeline)
+            return None if of_timeline is None else of_timeline.get(key)
+
+    def put_estimate(self, timeline: Timeline, key: tuple[object, ...], known: KnownThings) -> None:
+        with self._lock:
+            of_timeline = self._estimates.setdefault(timeline, OrderedDict())
+            of_timeline[key] = known
+            if len(of_timeline) > _ESTIMATES:
+                of_timeline.popitem(last=False)
+
+
+_CACHE: Final = _Made()
+
+
+def known_things(
+    view: View, min_score: float, spellings: Mapping[str, Sequence[str]]
+) -> KnownThings:
+    """Returns the things of all bags of a view; of what could not be read a note says so.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before any bag was read.
+    """
+    timeline = view.snapshot.timeline
+    described = tuple(sorted((name, tuple(each)) for name, each in spellings.items()))
+    key = (min_score, described, view.memory.limits.map_frame, id(view.memory.reader))
+    known = _CACHE.estimate(timeline, key)
+    if known is not None:
+        return known
+    before = view.notes.keys()
+    known = _Loader(view).load(min_score, Labels(spellings))
+    active = any(bag.state is BagState.ACTIVE for bag in view.snapshot.bags)
+    if known.since is None and not active and view.notes.keys() == before:
+        _CACHE.put_estimate(timeline, key, known)
+    return known
+
+
+class _Loader:
+    """Gathers the sights of all bags of a view, the newest segment first."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._maps = MapDigests(view)
+        self._reading: Deadline | None = None
+        self._since: Ns | None = None
+
+    def load(self, min_score: float, labels: Labels) -> KnownThings:
+        """Returns the things in all that could be read."""
+        parts: list[_Part] = []
+        for segment in reversed(self._view.snapshot.timeline.segments):
+            self._view.bags.check_deadline()
+            parts.append(self._part(segment))
+            if self._since is not None:
+                break
+        parts.reverse()
+        frames = [frame for part in parts for frame in part.frames]
+        bags = [bag for part in parts for bag in part.bags]
+        epochs, names = self._epochs(frames, bags)
+        found = estimate(joined(part.sights for part in parts), labels, epochs, min_score)
+        if self._since is not None:
+            self._view.notes.complete = False
+            self._view.notes.add(
+                f"things are known since {unix_text(self._since)} only: reading older bags takes "
+                f"too long; {self._view.bags.backfill_progress()}ask again"
+            )
+        return KnownThings(found, labels, names, self._since)
+
+    def _part(self, segment: Segment) -> _Part:
+        digests = self._view.bags.digests_of(segment)
+        valid = {} if digests is None else self._maps.valid_in(digests, segment)
+        if digests is not None and len(valid) == len(segment.bags):
+            keys = digests.map_keys()
+            state = hash(tuple(keys[number] for number in valid.values()))
+            known = digests
+            return digests.derived(f"things {state}", lambda: self._stored(known, segment, valid))
+        stored = {} if digests is None else digests.catalogue.sights([*valid.values()])
+        return self._read(segment, valid, {each: packed for each, (_, packed) in stored.items()})
+
+    def _stored(self, digests: SegmentDigests, segment: Segment, valid: Mapping[str, int]) -> _Part:
+        stored = digests.catalogue.sights([*valid.values()])
+        packed = {number: blob for number, (_, blob) in stored.items()}
+        return self._read(segment, valid, packed)
+
+    def _read(
+        self, segment: Segment, valid: Mapping[str, int], stored: Mapping[int, bytes]
+    ) -> _Part:
+        """Returns the sights of a segment's bags: stored ones decoded, others made."""
+        found: list[tuple[BagFile, Sights]] = []
+        for bag in sorted(segment.bags, key=lambda each: (each.start, each.file), reverse=True):
+            packed = stored.get(valid.get(bag.file, -1))
+            sights = None if packed is None else _decoded(packed)
+            if sights is None:
+                sights = self._made(bag)
+            if sights is None:
+                self._since = found[-1][0].start if found else bag.end
+                break
+            found.append((bag, sights))
+        found.reverse()
+        # Bags in which no detector published add nothing, and a week has thousands.
+        seen = [(bag, sights) for bag, sights in found if sights.topics]
+        return _Part(
+            joined(sights for _, sights in seen),
+            tuple(sights.frame_id for _, sights in seen),
+            tuple(bag for bag, _ in seen),
+        )
+
+    def _made(self, bag: BagFile) -> Sights | None:
+        """Returns the sights of a bag without an entry; None where there is no time to read it."""
+        memory = self._view.memory
+        stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
+        key = (*stat, self._maps.statics.of(bag).key, memory.limits.map_frame, id(memory.reader))
+        known = _CACHE.sights(key)
+        if known is not None:
+            return known
+        if self._reading is None:
+            self._reading = Deadline.after(_READING_S)
+        if self._reading.expired():
+            return None
+        before = self._view.notes.keys()
+        try:
+            digest = self._maps.made(bag, DetectorSights(memory.reader, memory.extractor))
+        except QueryTimeoutError:
+            return None
+        sights = _decoded(digest.sights) or no_sights()
+        if bag.state is not BagState.ACTIVE and self._view.notes.keys() == before:
+            _CACHE.put_sights(key, sights)
+        return sights
+
+    def _epochs(
+        self, frames: Sequence[str], bags: Sequence[BagFile]
+    ) -> tuple[list[int], tuple[str, ...]]:
+        """Returns the epoch of each bag, and the frame of each epoch.
+
+        All bags in the map are of epoch 0. Odometry begins anew in each session.
+        """
+        in_map = self._view.memory.limits.map_frame
+        sessions = sessions_of(self._view)
+        known: dict[object, int] = {in_map: 0}
+        names = [in_map or ""]
+        epochs = []
+        for frame, bag in zip(frames, bags, strict=True):
+            key: object = frame if frame == in_map else (frame, sessions.of(bag.recording))
+            if key not in known:
+                known[key] = len(known)
+                names.append(frame)
+            epochs.append(known[key])
+        return epochs, tuple(names)
+
+
+def _decoded(packed: bytes) -> Sights | None:
+    """Returns the sights in stored bytes; None where they are damaged."""
+    try:
+        return decode_sights(packed)
+    except ValueError:
+        return None

@@ -1,0 +1,287 @@
+"""Questions about things over bags, with a robot whose map moves under its odometry."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.regions import Box, Place
+from ros2_memory.history.context import QuerySettings
+from tests.support.bags import Msg, detections, header, make, odom, point, tf, transform, write_mcap
+from tests.support.memories import asked, memory_of, recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000
+TYPE = "ros2_vision_interfaces/msg/VisionDetectionArray"
+KITCHEN = Place("kitchen", "map", Box(0, 6, -2, 2))
+NAMED = QuerySettings(places=(KITCHEN,), labels={"mug": ["coffee mug"]})
+OFF = (3.0, -2.0, 0.5)
+"""Where odom begins in the map, and its yaw."""
+
+Seen = tuple[str, float, float]
+"""A label, and a place in the map."""
+
+
+def scene(
+    at_s: float,
+    robot: tuple[float, float, float],
+    seen: Sequence[Seen],
+    *,
+    in_map: bool = True,
+    score: float = 0.9,
+) -> list[Msg]:
+    """All messages of one moment: the robot at a pose in the map, and what it detects."""
+    at = BEGIN * S + round(at_s * S)
+    x, y, yaw = robot
+    ox, oy, turn = OFF if in_map else (0.0, 0.0, 0.0)
+    cos, sin = math.cos(-turn), math.sin(-turn)
+    px, py = (x - ox) * cos - (y - oy) * sin, (x - ox) * sin + (y - oy) * cos
+    messages = [odom(at, px, py, yaw - turn), tf(at, base(at, px, py, yaw - turn))]
+    if in_map:
+        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, 0.0), turn)))
+    cos, sin = math.cos(-yaw), math.sin(-yaw)
+    things = []
+    for label, thing_x, thing_y in seen:
+        dx, dy = thing_x - x, thing_y - y
+        place = point(dx * cos - dy * sin, dx * sin + dy * cos, 0.7)
+        things.append(
+            make(
+                "ros2_vision_interfaces/msg/VisionDetection",
+                label=label,
+                score=score,
+                point=place,
+                bbox=np.array([0, 0, 1, 1], np.int32),
+            )
+        )
+    body = make(TYPE, header=header(at, "base_link"), skill="scene", detections=things)
+    return [*messages, Msg("/vision/scene/scene_objects", TYPE, at, body)]
+
+
+def base(at: int, x: float, y: float, yaw: float) -> object:
+    return transform(at, "odom", "base_link", (x, y, 0.0), yaw)
+
+
+def write(bag_dir: Path, messages: Sequence[Msg], split_s: float = 10.0, name: str = "rec") -> None:
+    splits: dict[int, list[Msg]] = {}
+    for each in messages:
+        splits.setdefault(int((each.log_time / S - BEGIN) // split_s), []).append(each)
+    for number, some in splits.items():
+        write_mcap(bag_dir / name / f"{name}_{number}.mcap", some)
+
+
+HERE = (1.0, 0.0, 0.0)
+AWAY = (1.0, 0.0, math.pi)
+
+
+def looked(start: int, stop: int, robot: tuple[float, float, float], *seen: Seen) -> list[Msg]:
+    return [message for at in range(start, stop) for message in scene(at, robot, seen)]
+
+
+def ask(bag_dir: Path, limits: QuerySettings = NAMED, **given: object) -> Any:
+    memory = memory_of(bag_dir, limits=limits)
+    return asked(memory, bag_dir, "find_things", **given)
+
+
+def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    reply = ask(tmp_path, label="coffee mug")
+    [mug] = reply["things"]
+    assert reply["frame_id"] == "map"
+    assert reply["total"] == 1
+    assert (mug["label"], mug["also_seen_as"]) == ("mug", ["Mug"])
+    assert mug["place"] == {"x": 3.0, "y": 0.5, "z": 0.7}
+    assert mug["in"] == "kitchen"
+    assert (mug["first_seen"], mug["last_seen"]) == (BEGIN, BEGIN + 19)
+    assert mug["count"] == 20
+    assert mug["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
+    assert mug["score"]["best"] == 0.9
+    assert mug["still_there"] == {"not_looked_at_since": BEGIN + 19}
+
+
+def test_chairs_are_counted(tmp_path: Path) -> None:
+    chairs = [("chair", 3.0, 0.0), ("chair", 3.0, 1.2), ("chairs", 4.2, -1.0)]
+    write(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
+    assert ask(tmp_path, label="Chairs")["total"] == 3
+    assert ask(tmp_path)["labels"] == {"chair": 3, "table": 1}
+
+
+def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
+    mug, moved = ("mug", 3.0, 0.5), ("mug", -2.0, 0.5)
+    messages = [
+        *looked(0, 20, HERE, mug),
+        *looked(20, 30, AWAY),
+        *looked(30, 40, HERE),
+        *looked(40, 60, AWAY, moved),
+    ]
+    write(tmp_path, messages)
+    [thing] = ask(tmp_path, label="mug")["things"]
+    assert thing["moved"] == [
+        {
+            "from": BEGIN,
+            "to": BEGIN + 19,
+            "place": {"x": 3.0, "y": 0.5},
+            "in": "kitchen",
+            "times": 20,
+        },
+        {"from": BEGIN + 40, "to": BEGIN + 59, "place": {"x": -2.0, "y": 0.5}, "times": 20},
+    ]
+    assert ask(tmp_path, label="mug", where="kitchen")["things"] == []
+    [before] = ask(tmp_path, label="mug", where="kitchen", end=BEGIN + 25)["things"]
+    assert before["place"]["x"] == 3.0
+    assert "not_seen_where_expected" in before["still_there"]
+
+
+def test_a_thing_is_said_to_be_missed_only_after_looks_from_where_it_was_seen(
+    tmp_path: Path,
+) -> None:
+    mug = ("mug", 3.0, 0.5)
+    seen = looked(0, 20, HERE, mug)
+    write(tmp_path / "away", [*seen, *looked(20, 60, AWAY)])
+    [thing] = ask(tmp_path / "away", label="mug")["things"]
+    assert thing["still_there"] == {"not_looked_at_since": BEGIN + 19}
+    write(tmp_path / "missed", [*seen, *looked(20, 60, HERE)])
+    [thing] = ask(tmp_path / "missed", label="mug")["things"]
+    # Two looks in a split of ten: a split counts as a whole.
+    assert thing["still_there"] == {"not_seen_where_expected": BEGIN + 29, "looks": 40}
+
+
+def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 60, HERE, ("mug", 3.0, 0.5)))
+    [thing] = ask(tmp_path, label="mug", end=BEGIN + 25)["things"]
+    assert thing["still_there"] == {"seen_since": BEGIN + 59}
+    assert thing["last_seen"] == BEGIN + 29  # bags count as a whole
+    assert ask(tmp_path, label="mug", end=BEGIN - 5)["things"] == []
+
+
+def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
+    walk = [
+        message
+        for at in range(30)
+        for message in scene(at, HERE, [("person", 2.0 + at * 0.3, 0.0), ("person", 3.0, 1.0)])
+    ]
+    write(tmp_path, walk)
+    [people] = ask(tmp_path, label="people")["things"]
+    assert people["moves"] is True
+    assert people["at_once"] == 2
+    assert "still_there" not in people
+
+
+def test_low_scores_are_left_out_where_that_is_asked(tmp_path: Path) -> None:
+    messages = [
+        message for at in range(20) for message in scene(at, HERE, [("mug", 3.0, 0.5)], score=0.3)
+    ]
+    write(tmp_path, messages)
+    assert ask(tmp_path, label="mug")["total"] == 1
+    reply = ask(tmp_path, label="mug", min_score=0.5)
+    assert reply["total"] == 0
+    assert "20 times" in reply["notes"][0]
+
+
+def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 20, HERE, ("headphones", 3.0, 0.5)))
+    reply = ask(tmp_path, label="phone")
+    assert reply["things"] == []
+    assert reply["notes"] == ['no detector reported "phone"; there are: headphones']
+
+
+def test_detections_without_a_place_are_reported(tmp_path: Path) -> None:
+    at = BEGIN * S
+    write(tmp_path, [detections(at + nth * S, ["mug"], at=(0.0, 0.0, 0.0)) for nth in range(5)])
+    reply = ask(tmp_path, label="mug")
+    assert reply["total"] == 0
+    assert reply["notes"][0] == "5 detections of it could not be placed, and are left out"
+
+
+def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -> None:
+    for run in range(2):
+        messages = [
+            message
+            for at in range(run * 100, run * 100 + 20)
+            for message in scene(at, HERE, [("mug", 3.0, 0.5)], in_map=False)
+        ]
+        write(tmp_path, messages, name=f"run{run}")
+    reply = ask(tmp_path, label="mug")
+    assert reply["frame_id"] == "odom"
+    assert reply["total"] == 2
+    assert "each run of odometry" in reply["notes"][0]
+
+
+def test_a_split_that_is_cut_short_is_no_fault_of_the_answer(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 40, HERE, ("mug", 3.0, 0.5)))
+    path = tmp_path / "rec" / "rec_1.mcap"
+    path.write_bytes(path.read_bytes()[:-400])
+    assert ask(tmp_path, label="mug")["total"] == 1
+
+
+@pytest.mark.parametrize("limit", [1, 2])
+def test_the_limit_bounds_what_is_listed_and_not_what_is_counted(
+    tmp_path: Path, limit: int
+) -> None:
+    write(tmp_path, looked(0, 20, HERE, *[("chair", 3.0, each * 1.5) for each in range(3)]))
+    reply = ask(tmp_path, limit=limit)
+    assert len(reply["things"]) == limit
+    assert reply["total"] == 3
+
+
+def random_messages(draw: Random) -> list[Msg]:
+    """A robot that looks around while a few things are moved, now and then without a map."""
+    places = [(3.0, 0.5), (3.5, -1.0), (-1.5, 1.0), (-2.0, -1.0), (2.5, 2.0)]
+    where = {label: draw.choice(places) for label in ("mug", "cup", "book", "Mugs")}
+    robot, in_map = HERE, draw.random() < 0.8
+    messages: list[Msg] = []
+    for at in range(draw.choice((15, 60, 120))):
+        if draw.random() < 0.1:
+            robot = (draw.choice((1.0, 1.2)), draw.choice((0.0, 0.3)), draw.choice((0.0, math.pi)))
+        if draw.random() < 0.03:
+            where[draw.choice([*where])] = draw.choice(places)
+        seen = [
+            (label, x + draw.gauss(0, 0.1), y + draw.gauss(0, 0.1))
+            for label, (x, y) in where.items()
+            if ((x > robot[0]) == (robot[2] == 0.0)) and draw.random() < 0.8
+        ]
+        messages += scene(at, robot, seen, in_map=in_map, score=draw.uniform(0.2, 0.9))
+    return messages
+
+
+QUESTIONS: tuple[dict[str, object], ...] = (
+    {},
+    {"label": "mug"},
+    {"label": "cup", "min_score": 0.5},
+    {"where": "kitchen"},
+    {"start": BEGIN + 20, "end": BEGIN + 50},
+)
+
+
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    seed=st.integers(0, 2**32), split_s=st.sampled_from([3.0, 10.0, 1000.0]), part=st.floats(0, 1)
+)
+@example(seed=1, split_s=10.0, part=1.0)
+@example(seed=2, split_s=3.0, part=0.5)
+def test_answers_are_the_same_with_the_catalogue_and_without(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, split_s: float, part: float
+) -> None:
+    bag_dir = tmp_path_factory.mktemp("bags")
+    write(bag_dir, random_messages(Random(seed)), split_s)
+    plain = memory_of(bag_dir, limits=NAMED)
+    known = recalling(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
+    for question in QUESTIONS:
+        assert answer(known, bag_dir, question) == answer(plain, bag_dir, question)
+
+
+def answer(memory: Memory, bag_dir: Path, question: dict[str, object]) -> Any:
+    return asked(memory, bag_dir, "find_things", **question)
