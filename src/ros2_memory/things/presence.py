@@ -43,6 +43,11 @@ _FIRM: Final = 5.0
 _PRIOR: Final = 0.5
 _MISSED_BY_CHANCE: Final = 0.01
 _LEFT_BY_CHANCE: Final = 0.05
+_FEWEST_HITS: Final = 3
+_RARE_OF: Final = 20
+_LEAST_RATE: Final = 0.1
+_MANY_LOOKS: Final = 10
+_BLOCKED_SHARE: Final = 0.1
 _VIEW_SHARE: Final = 0.02
 _VIEW_MARGIN_DEG: Final = 2.0
 _VIEW_MARGIN_MM: Final = 100.0
@@ -136,7 +141,8 @@ class Evidence(NamedTuple):
         cell: of each look, numbered from 0 within the place.
         hits: how many messages of each of these looks have the label there.
         blind: hits of messages without a known pose, by bag.
-        fair: whether a look without a hit had the place well inside its field of view.
+        fair: whether a look that has no hit could have: from a cell that sees the place, and with
+            the place well inside the field of view.
     """
 
     looks: Ints
@@ -182,7 +188,28 @@ def evidence_at(
     fair = np.zeros(len(looks), bool)
     for topic, each in view.items():
         fair |= (cells.topic[looks] == topic) & each.covers(away, bearing)
+    fair &= _sees(cell, cells.n[looks], hits)[cell]
     return Evidence(looks, cell, hits, blind, fair)
+
+
+def _sees(cell: Ints, n: Ints, hits: Ints) -> Flags:
+    """Returns from which cells a place is seen, not only reported falsely once in a while.
+
+    From a dock that faces a wall, ten thousands of messages have some false detections behind it.
+    """
+    cells = int(cell.max(initial=-1)) + 1
+    seen, of = np.bincount(cell, hits, cells), np.bincount(cell, n, cells)
+    hit = hits > 0
+    looks, hit_looks = np.bincount(cell, minlength=cells), np.bincount(cell, hit, cells)
+    enough = (seen >= _FEWEST_HITS) | (of <= _RARE_OF * seen)
+    dense = seen >= _LEAST_RATE * np.bincount(cell[hit], n[hit], cells)
+    # What other cells see most of the time, a cell that sees it does not miss nearly always.
+    share, weight = hit_looks / looks, np.minimum(looks, _MANY_LOOKS)
+    others = weight.sum() - weight
+    pooled = ((share * weight).sum() - share * weight) / np.maximum(others, 1)
+    blocked = (looks >= _MANY_LOOKS) & (share < _BLOCKED_SHARE * pooled)
+    sees: Flags = enough & dense & ~blocked
+    return sees
 
 
 def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
