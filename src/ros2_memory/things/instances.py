@@ -249,7 +249,7 @@ class _Seen:
 def _counts(sights: Sights, min_score: float) -> Ints:
     """Returns how many detections of each spot have a score that counts."""
     counts = sights.spots[:, Spot.N].copy()
-    lowest = int(min_score * SCORE_BINS)
+    lowest = min(int(min_score * SCORE_BINS), SCORE_BINS - 1)
     if lowest > 0:
         low = sights.scores[sights.scores[:, Score.BIN] < lowest]
         np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])
