@@ -34,6 +34,7 @@ _POSITIONS: Final = (
 )
 _MAX_JSON_CHARS: Final = 1 << 16
 _MAX_DEPTH: Final = 4
+_JSON: Final = frozenset("[{")
 
 
 class Detection(NamedTuple):
@@ -92,7 +93,9 @@ def _detections(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detecti
         for name, inner in value.items():
             if name in LISTS and isinstance(inner, list):
                 yield from (Detection(each) for each in inner if isinstance(each, str) and each)
-            yield from _detections(inner, frame, depth - 1)
+            # Most fields are numbers and names: they are not worth a call each.
+            if isinstance(inner, dict | list) or (isinstance(inner, str) and inner[:1] in _JSON):
+                yield from _detections(inner, frame, depth - 1)
 
 
 def _without(value: JsonValue, least: float, depth: int) -> JsonValue:
@@ -209,7 +212,7 @@ def _position(value: dict[str, JsonValue]) -> Vector3 | None:
 
 def _from_json(text: str) -> JsonValue:
     """Parses a string that is JSON; None for any other."""
-    if len(text) > _MAX_JSON_CHARS or text[:1] not in {"[", "{"}:
+    if len(text) > _MAX_JSON_CHARS or text[:1] not in _JSON:
         return None
     try:
         value: JsonValue = json.loads(text)
