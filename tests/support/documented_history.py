@@ -85,6 +85,7 @@ CALLS: Final[dict[str, dict[str, object]]] = {
         "value": "scissors",
         "seconds": 64,
     },
+    "find_things": {"label": "scissors"},
     "recap": {"last_s": 30},
     "visits": {"x": 11, "y": 2, "radius_m": 1},
     "memory_status": {},

@@ -65,6 +65,7 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
         {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "cup"},
         "sightings",
     ),
+    ("find_things", {"label": "cup"}, "things"),
     ("recap", {"start": T0_S, "end": T0_S + LENGTH_S}, "events"),
     ("recap", {"last_s": 5}, "stood_s"),
     ("visits", {"x": 0.0, "y": 0.0}, "there_now"),

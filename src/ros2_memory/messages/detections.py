@@ -90,12 +90,22 @@ def _detections(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detecti
         if detection is not None:
             yield detection
             return
-        for name, inner in value.items():
-            if name in LISTS and isinstance(inner, list):
-                yield from (Detection(each) for each in inner if isinstance(each, str) and each)
-            # Most fields are numbers and names: they are not worth a call each.
-            if isinstance(inner, dict | list) or (isinstance(inner, str) and inner[:1] in _JSON):
-                yield from _detections(inner, frame, depth - 1)
+        yield from _in_fields(value, frame, depth)
+
+
+def _in_fields(value: dict[str, JsonValue], frame: str, depth: int) -> Iterator[Detection]:
+    for name, inner in value.items():
+        if name in LISTS and isinstance(inner, list):
+            yield from (Detection(each) for each in inner if isinstance(each, str) and each)
+        if _may_hold_detections(inner):
+            yield from _detections(inner, frame, depth - 1)
+
+
+def _may_hold_detections(value: JsonValue) -> bool:
+    """Returns whether a field is worth a look: most are numbers and names."""
+    if isinstance(value, str):
+        return value[:1] in _JSON
+    return isinstance(value, dict | list)
 
 
 def _without(value: JsonValue, least: float, depth: int) -> JsonValue:

@@ -28,10 +28,10 @@ _SEEN: Final = """\
 get_position_at with the timestamp it gives.
 """
 _HAPPENED: Final = """\
-- "When did you last see X, and where?": find_matches, with oldest_first for the first time. "What \
-happened, where did you stop?": recap; "why then?": with around. "Have you been here?": visits. \
-"How low was it?": get_topic_in_last with fields and max_samples 1. "Usually, on each day?": by. \
-"Can I trust this?": memory_status.
+- "Where is X, how many?": find_things. "When did you see X?": find_matches, with oldest_first for \
+the first time. "What happened, where did you stop?": recap; "why then?": with around. "Have you \
+been here?": visits. "How low was it?": get_topic_in_last with fields and max_samples 1. "Usually, \
+on each day?": by. "Can I trust this?": memory_status.
 - where: a place's name, {{x, y, radius_m}} or {{"x": [from, to], "y": [from, to]}}.
 """
 _REST: Final = """\
@@ -66,6 +66,8 @@ PROMPT: Final = """\
 Which question answers what, in one call each:
 - Where was I 10 s ago, at a time: get_position_seconds_ago, get_position_at. How fast: \
 get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
+- Where is X, since when, where was it before, is it still there, how many are there, what is in a \
+place: find_things.
 - When did you last see X, where were you, where was it, since when: find_matches with contains \
 on the vision topics. When first, how often: with oldest_first and limit 1. When was a number \
 beyond a limit: above or below, with field.

@@ -56,13 +56,14 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "recap", "visits", "memory_status"]
+ADDED = ["find_matches", "find_things", "recap", "visits", "memory_status"]
 WRITING = ["remember_moment"]
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
     "remember_moment",
     "visits",
     "find_matches",
+    "find_things",
     "recap",
     "list_frames",
     "find_last_match",
@@ -85,6 +86,7 @@ OPTIONAL = {
         "limit",
     },
     "recap": {"start", "end", "around", "seconds_before"},
+    "find_things": {"label", "where", "start", "end", "min_score", "limit"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
