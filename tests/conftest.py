@@ -7,6 +7,8 @@ import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import TYPE_CHECKING
+from unittest.mock import patch
 
 import pytest
 import structlog
@@ -15,6 +17,9 @@ from hypothesis import settings
 from xdist.remote import Producer
 
 from tests.support.workers import Groups, give_way, place, workers_for
+
+if TYPE_CHECKING:
+    from ros2_memory.typestore import MessageType
 
 # A loaded machine is slow, not wrong.
 settings.register_profile("steady", deadline=None)
@@ -142,6 +147,32 @@ def _logging_left_as_it_was() -> Iterator[None]:
     """A program that a test ran in process configures logging; the next test has its own."""
     yield
     structlog.reset_defaults()
+
+
+_COMPILED_TYPES: dict[tuple[str, str, bytes], "MessageType | str"] = {}
+
+
+@pytest.fixture(autouse=True)
+def types_compiled_once() -> Iterator[None]:
+    """A message type is compiled once for all readers of all tests, which make thousands of them.
+
+    Tests of the compiling itself have a fixture of this name that does nothing.
+    """
+    # Not imported before coverage is measured.
+    from ros2_memory.typestore import Typestores  # noqa: PLC0415
+
+    build = Typestores._build
+
+    def once(self: Typestores, name: str, encoding: str, text: bytes) -> "MessageType | str":
+        if self._folders:
+            return build(self, name, encoding, text)
+        key = (name, encoding, text)
+        if key not in _COMPILED_TYPES:
+            _COMPILED_TYPES[key] = build(self, name, encoding, text)
+        return _COMPILED_TYPES[key]
+
+    with patch.object(Typestores, "_build", once):
+        yield
 
 
 @pytest.fixture

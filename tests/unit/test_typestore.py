@@ -51,6 +51,11 @@ def lookup(name: str, definition_text: str, encoding: str = "ros2msg") -> Messag
 
 
 @pytest.fixture
+def types_compiled_once() -> None:
+    """Here each test compiles its own."""
+
+
+@pytest.fixture
 def vision(tmp_path: Path) -> Path:
     """The folder of the package `ros2_vision_interfaces`."""
     folder = tmp_path / "ros2_vision_interfaces"
