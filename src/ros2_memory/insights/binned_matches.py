@@ -6,7 +6,8 @@ What counts as once:
   back, or until nothing is recorded. It counts where it is seen to toggle.
 - A text on a topic of detections is a label. A thing is in view as in a recap: it may be missed
   for `FLICKER_NS`, since detectors miss things now and then, and it is gone after `SILENCE_NS`
-  without a message. These and booleans are counted by the digests of events.
+  without a message. These and booleans are counted by the digests of events, unless a least score
+  is asked for.
 - Any other condition holds in sightings, as `find_matches` returns them; these are read.
 """
 
@@ -16,11 +17,12 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from ros2_memory.analysis.conditions import Contains, Equals, parse_condition
+from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.time_bins import Held
 from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
 from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.segment_fold import SegmentFold
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.bins import BinnedWindow
@@ -55,6 +57,7 @@ def count_matches(
     start_s: float | None = None,
     end_s: float | None = None,
     last_s: float | None = None,
+    min_score: float | None = None,
 ) -> Bins:
     """Returns how often and how long a condition held in each bin, and how long was recorded.
 
@@ -64,7 +67,7 @@ def count_matches(
         NoDataError: the memory holds nothing in the window, or no such topic.
         QueryTimeoutError: the call's time is over before anything is known.
     """
-    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    condition = condition_of(memory.limits, condition_type, value, field, min_score)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
@@ -73,7 +76,9 @@ def count_matches(
     binned = BinnedWindow(view, asked, by, topics)
     binned.add_heard("topic_s", topics)
     held = None
-    if len(topics) == 1 and isinstance(condition.test, Contains | Equals):
+    # Events have labels without scores.
+    by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
+    if len(topics) == 1 and by_events:
         held, since = _by_events(binned, topics[0], condition, value)
         binned.note_since(since if held is not None else None)
     if held is None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import inspect
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.schema import Signature
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 Question: TypeAlias = "Callable[[Memory, Call], Answer]"
 """A query with its arguments bound."""
+SHOWN_ALONE: Final = frozenset({"limit", "oldest_first", "max_samples", "max_waypoints"})
+"""Arguments that bound what is shown, and change no count."""
 Query: TypeAlias = "Callable[..., Answer]"  # type: ignore[explicit-any]
 """A function of a memory, a call, and the fields of its arguments as keywords, as a test holds."""
 
@@ -69,8 +72,8 @@ class ToolDeclaration:
     """A query and all its names.
 
     `shows_example`: its schema alone does not show how it is called.
-    `count` answers in place of `query` where `by` is given, and takes those of the arguments that
-    bear on it.
+    `count` answers in place of `query` where `by` is given. It need not take arguments that only
+    bound what is shown (`SHOWN_ALONE`); others that it does not take are refused.
     """
 
     names: tuple[ToolName, ...]
@@ -122,5 +125,12 @@ class ToolDeclaration:
         if by is None:
             return lambda memory, call: self.query(memory, call, **arguments)
         count, taken = self.count, inspect.signature(self.count).parameters
+        refused = [
+            self.arguments.model_fields[name].alias or name
+            for name, value in arguments.items()
+            if name not in taken and name not in SHOWN_ALONE and value not in (None, ())
+        ]
+        if refused:
+            raise InvalidArgumentsError(f"{', '.join(refused)} cannot be combined with by")
         chosen = {name: value for name, value in arguments.items() if name in taken}
         return lambda memory, call: count(memory, call, by=by, **chosen)

@@ -243,3 +243,38 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
             plain = asked(memory, bags, name, **given_)
             assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
             assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
+
+
+def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:
+    seen = [(0, 0.9), (1, 0.3), (30, 0.3), (31, 0.3), (60, 0.9)]
+    messages = [detections(BEGIN + at * S, ["cup"], score=score) for at, score in seen]
+    write_mcap(tmp_path / "rec_0.mcap", messages)
+    memory = recalling(memory_of(tmp_path, limits=LATEST), tmp_path)
+
+    def count(**more: object) -> object:
+        question: dict[str, object] = {
+            "topic": OBJECTS,
+            "condition_type": "contains",
+            "value": "cup",
+            "by": "day",
+        }
+        reply = asked(memory, tmp_path, "find_matches", **question, **more)
+        return dict(zip(reply["columns"][1:], reply["all"], strict=True))["count"]
+
+    assert [count(), count(min_score=0.5), count(min_score=0.95)] == [3, 2, 0]
+
+
+def test_by_refuses_what_it_does_not_take_and_ignores_how_much_is_shown(
+    memories: list[Memory],
+) -> None:
+    question: dict[str, object] = {
+        "topic": "/is_docked",
+        "condition_type": "equals",
+        "value": True,
+        "by": "day",
+    }
+    refused = asked(memories[0], Path(), "find_matches", **question, fields=["data"])
+    assert refused["error"] == "invalid_arguments"
+    assert "fields" in refused["detail"]
+    shown = asked(memories[0], Path(), "find_matches", **question, limit=1, oldest_first=True)
+    assert shown == asked(memories[0], Path(), "find_matches", **question)
