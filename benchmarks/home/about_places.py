@@ -103,7 +103,12 @@ def _visited(asked: Asked) -> list[Question]:
                 )
             },
             ask("visits", **asked.yesterday),
-            lambda found: {"minutes": replies.bins(found[0], "minutes")},
+            lambda found: {
+                "minutes": {
+                    replies.text(each, "place"): replies.get(each, "minutes")
+                    for each in replies.rows(found[0], "places")
+                }
+            },
         ),
         Question(
             "never-dining",

@@ -135,9 +135,19 @@ def stays(thing: Row) -> list[Row]:
 
 
 def bins(reply: Row, *names: str) -> dict[str, JsonValue]:
-    """Returns the value of each bin of a reply that was asked `by` something, by its name."""
-    found: dict[str, JsonValue] = {}
-    for each in rows(reply, "bins", "by", "days", "places"):
-        name = text(each, "bin", "day", "date", "place", "in", "name", "key")
-        found[name] = get(each, *names)
-    return found
+    """Returns the value of each bin of a reply that was asked `by` something, by its name.
+
+    The column is the first with one of the names, also as what is said of a field (`charge.min`).
+
+    Raises:
+        UnreadableError: it has no such column, or rows of another length.
+    """
+    columns, listed = get(reply, "columns"), get(reply, "rows")
+    if not isinstance(columns, list) or not isinstance(listed, list):
+        raise UnreadableError("columns or rows is no list")
+    wanted = (each for each in columns if str(each).rpartition(".")[2] in names)
+    column = next(wanted, None)
+    if column is None:
+        raise UnreadableError(f"no column {names[0]} in {', '.join(map(str, columns))}")
+    at = columns.index(column)
+    return {str(each[0]): each[at] for each in listed if isinstance(each, list)}

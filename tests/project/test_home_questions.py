@@ -98,6 +98,7 @@ def test_the_script_counts_what_is_right_and_what_no_tool_answers_yet(
     outcomes = json.loads(told.read_text(encoding="utf-8"))
     right = {each["id"] for each in outcomes if each["result"] == "right"}
     assert right >= {"never-seen", "last-outing", "battery-low", "since-when", "outage", "crash"}
+    assert right >= {"metres", "battery", "first-departures", "outings", "minutes-everywhere"}
 
 
 def _reported(thing: ThingTruth, **more: object) -> dict[str, object]:
