@@ -93,9 +93,13 @@ def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
 
 
 def _number(value: JsonValue) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        return None
+    return number if math.isfinite(number) else None
 
 
 def times_inside(view: View, where: Where, frame_id: str, window: TimeWindow) -> list[Inside]:
