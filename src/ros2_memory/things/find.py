@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
@@ -49,7 +50,8 @@ def find_things(
     of what moves by itself, what was seen in it. Bags count as a whole.
 
     Raises:
-        InvalidArgumentsError: the bounds make no window, or `where` is no region.
+        InvalidArgumentsError: the bounds make no window, `where` is no region, or `min_score` is
+            above 1.
         NoDataError: the memory holds nothing.
         QueryTimeoutError: the call's time is over before anything is known.
     """
@@ -61,6 +63,10 @@ def find_things(
     now = memory.now(wall, view.snapshot.latest)
     window = clamped(view, search_window(span, now))
     lowest = limits.min_score if min_score is None else min_score
+    if lowest > 1:
+        raise InvalidArgumentsError(
+            f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
+        )
     known = known_things(view, lowest, limits.labels)
     asked = None if label is None else known.labels.key(label)
     finder = _Finder(known, window, region, limits.places)

@@ -189,6 +189,11 @@ def test_low_scores_are_left_out_where_that_is_asked(tmp_path: Path) -> None:
     assert "20 times" in reply["notes"][0]
 
 
+def test_a_score_that_no_thing_can_have_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    assert "from 0 to 1" in ask(tmp_path, label="mug", min_score=60)["detail"]
+
+
 def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) -> None:
     write(tmp_path, looked(0, 20, HERE, ("headphones", 3.0, 0.5)))
     reply = ask(tmp_path, label="phone")
