@@ -290,7 +290,10 @@ def _changes(asked: Asked) -> list[Question]:
         "Is the sofa still where it was?",
         {"still_there": YesNo(value=True)},
         ask("find_things", label="sofa"),
-        lambda found: {"still_there": _one(found).get("still_there") in {True, "seen_again"}},
+        lambda found: {
+            "still_there": "not_seen_where_expected"
+            not in replies.row(replies.get(_one(found), "still_there"))
+        },
     )
     return [*found, sofa]
 

@@ -98,9 +98,8 @@ def _compare(
                 found.switches.append(f"{label} at {x:.1f}, {y:.1f}")
     for each, point in zip(reported, points, strict=True):
         stands = [thing.stays[-1] for thing in things]
-        if _DENIED in {each.get("still_there"), each.get("state")} and any(
-            _away(point, stay.place) <= _SAME_M for stay in stands
-        ):
+        denied = _DENIED in replies.row(each.get("still_there", {}))
+        if denied and any(_away(point, stay.place) <= _SAME_M for stay in stands):
             found.denied.append(f"{label} at {point[0]:.1f}, {point[1]:.1f}")
 
 

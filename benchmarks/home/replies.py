@@ -129,8 +129,8 @@ def things(reply: Row) -> list[Row]:
 
 
 def stays(thing: Row) -> list[Row]:
-    """Returns the places of a thing, oldest first."""
-    listed = rows(thing, "history", "places", "stays")
+    """Returns the places of a thing, oldest first; a thing that was not moved has one."""
+    listed = rows(thing, "moved") if "moved" in thing else [thing]
     return sorted(listed, key=lambda each: time(each, *SINCE))
 
 

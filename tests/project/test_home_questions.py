@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,9 +97,9 @@ def test_the_script_counts_what_is_right_and_what_no_tool_answers_yet(
     assert main(["--dir", str(tmp_path), "--json", str(told)]) == 0
     assert "| all | 60 |" in capsys.readouterr().out
     outcomes = json.loads(told.read_text(encoding="utf-8"))
-    right = {each["id"] for each in outcomes if each["result"] == "right"}
-    assert right >= {"never-seen", "last-outing", "battery-low", "since-when", "outage", "crash"}
-    assert right >= {"metres", "battery", "first-departures", "outings", "minutes-everywhere"}
+    results = Counter(each["result"] for each in outcomes)
+    assert results["right"] >= 52
+    assert not [each for each in outcomes if each["result"] == "wrong"]
 
 
 def _reported(thing: ThingTruth, **more: object) -> dict[str, object]:
@@ -108,7 +109,7 @@ def _reported(thing: ThingTruth, **more: object) -> dict[str, object]:
         for stay in thing.known()
         if stay.place is not None
     ]
-    return {"label": thing.label, **history[-1], "history": history, **more}
+    return {"label": thing.label, **history[-1], "moved": history, **more}
 
 
 class _Replies:
@@ -149,12 +150,12 @@ def test_the_truth_itself_measures_as_perfect() -> None:
 def test_what_is_wrong_with_instances_is_measured() -> None:
     things = _all_right()
     (mug,) = things["mug"]
-    history = mug["history"]
+    history = mug["moved"]
     assert isinstance(history, list)
     history[-1]["from"] += 2 * SCALE.split_s
-    things["chair"].append({"label": "chair", "x": 5.0, "y": 5.0, "history": []})
-    things["sofa"][0]["still_there"] = "not_seen_where_expected"
-    things["bed"][0]["history"] = [{"x": 1.0, "y": 1.0, "from": 0.0}]
+    things["chair"].append({"label": "chair", "x": 5.0, "y": 5.0, "moved": []})
+    things["sofa"][0]["still_there"] = {"not_seen_where_expected": 0.0}
+    things["bed"][0]["moved"] = [{"x": 1.0, "y": 1.0, "from": 0.0}]
     found = _measures(things)
     assert found.wrong_numbers == ["chair 5 for 4"]
     assert [each.split(" to ")[0] for each in found.late_moves] == ["mug"]
