@@ -72,6 +72,7 @@ from ros2_memory.insights.field_extremes import (
     TOO_MANY,
     extremes_of,
 )
+from ros2_memory.insights.pose_frames import placed, with_place
 from ros2_memory.insights.status import (
     clock_faults,
     left_open,
@@ -156,10 +157,11 @@ def position(
     *,
     topic: str | None = None,
     tolerance_s: float | None = None,
+    frame_id: str | None = None,
 ) -> results.Position:
     """Returns where the robot was: its newest pose at or before a moment, within the tolerance (s).
 
-    A topic of a satellite receiver gives degrees.
+    In the pose's own frame, or in `frame_id`. A topic of a satellite receiver gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, degrees=True)
@@ -179,6 +181,11 @@ def position(
         view.notes.add("the recorded position is not a number")
     if geodetic is None and pose.orientation is None:
         view.notes.add("the recorded orientation is not a rotation")
+    if geodetic is None:
+        recording = found.bag.recording
+        if frame_id is not None:
+            pose = placed(view, pose, found.time, recording, frame_id)
+        pose = with_place(view, pose, found.time, recording)
     notes = view.notes.sentences()
     return results.Position(name, found.time, pose, _age(found, now), geodetic, notes=notes)
 

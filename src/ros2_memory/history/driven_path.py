@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
@@ -10,6 +11,7 @@ from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.trajectory import MAX_WAYPOINTS, PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.history.bag_groups import DigestKind, Fold
 from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.trajectory import Trajectory
-    from ros2_memory.core.model import Pose, TimeWindow, Vector3
+    from ros2_memory.core.model import Pose, Vector3
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.duplicates import StoredMessage
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 
 _MOST_AT_ONCE: Final = 1024
 """Messages that are decoded together: 0.74 in place of 7.6 µs for the position of each."""
+_MOST_TRIED: Final = 1000
+"""How many of the newest poses are tried until one can be decoded."""
 _MOST_BYTES_AT_ONCE: Final = 1 << 20
 
 
@@ -192,3 +196,29 @@ def note_left_out(view: View, error: UndecodableError) -> None:
     """Notes that there are poses which cannot be decoded, and why."""
     view.notes.complete = False
     view.notes.add(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
+
+
+def pose_frame(view: View, topic: str) -> str:
+    """Returns the frame of the newest pose that can be decoded; empty without a pose.
+
+    Raises:
+        InvalidArgumentsError: the topic's messages carry no position.
+        UndecodableError: none of the newest ones can be decoded.
+    """
+    failure: UndecodableError | None = None
+    newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
+    for found in islice(newest, _MOST_TRIED):
+        try:
+            message = view.memory.reader.decode(found.record)
+        except UndecodableError as error:
+            failure = failure or error
+            continue
+        pose = view.memory.extractor.pose(message, found.record.channel.type)
+        if pose is None:
+            raise InvalidArgumentsError(describe_lack(view, "position", found))
+        if failure is not None:
+            note_left_out(view, failure)
+        return pose.frame_id
+    if failure is not None:
+        raise failure
+    return ""

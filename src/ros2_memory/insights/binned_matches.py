@@ -26,6 +26,7 @@ from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.segment_fold import SegmentFold
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.bins import BinnedWindow
+from ros2_memory.insights.scope import Scope
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import TOPIC_EVENTS, collect_events
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.segment_fold import Digested, Folded
     from ros2_memory.history.view import View
     from ros2_memory.insights.bins import By
+    from ros2_memory.insights.scope import WhileCondition
     from ros2_memory.results import Bins
 
 _TRUTHS = {"true": True, "false": False}
@@ -58,8 +60,12 @@ def count_matches(
     end_s: float | None = None,
     last_s: float | None = None,
     min_score: float | None = None,
+    where: JsonValue = None,
+    during: WhileCondition | None = None,
 ) -> Bins:
     """Returns how often and how long a condition held in each bin, and how long was recorded.
+
+    With `where` or `during` only while the robot was there, or another topic met a condition.
 
     Raises:
         InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or there
@@ -78,11 +84,12 @@ def count_matches(
     held = None
     # Events have labels without scores.
     by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
-    if len(topics) == 1 and by_events:
+    alone = where is None and during is None and len(topics) == 1
+    if alone and by_events:
         held, since = _by_events(binned, topics[0], condition, value)
         binned.note_since(since if held is not None else None)
     if held is None:
-        spans, since = read_sightings(view, topic, condition, asked)
+        spans, since = read_sightings(view, topic, condition, Scope(view, asked, where, during))
         held = Held.of([(first, last, True) for first, last in spans])
         binned.note_since(since)
     binned.add_held(held)

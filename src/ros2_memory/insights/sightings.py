@@ -32,6 +32,8 @@ from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unas
 from ros2_memory.history.silences import describe_silences
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.insights.pose_frames import placed, with_place
+from ros2_memory.insights.scope import Scope
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.history.view import View
+    from ros2_memory.insights.scope import WhileCondition
     from ros2_memory.messages.detections import Detection
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
@@ -85,6 +88,9 @@ def find_matches(
     limit: int = 5,
     oldest_first: bool = False,
     min_score: float | None = None,
+    where: JsonValue = None,
+    during: WhileCondition | None = None,
+    frame_id: str | None = None,
 ) -> Sightings:
     """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
 
@@ -92,6 +98,8 @@ def find_matches(
     searched. With `oldest_first` all of it is searched, and the oldest sightings are returned. A
     sighting has the `fields` (dot-paths) of its last message. Detections of a score below
     `min_score` do not count.
+    With `where` only messages count that were received while the robot was there, with `during`
+    while another topic met a condition. Robot positions are in the map, or in `frame_id`.
 
     Raises:
         InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or no
@@ -107,12 +115,13 @@ def find_matches(
     now = memory.now(wall, latest)
     window = clamped(view, search_window(span, now))
     collected = _Sightings(limit, oldest_first=oldest_first)
-    _collect(view, topic, condition, window, collected)
+    scope = Scope(view, window, where, during)
+    _collect(view, topic, condition, scope, collected)
     searched = window
     if collected.cut and collected.selected:
         searched = TimeWindow(collected.selected[-1].first, window.stop)
     view.notes.retract_before(searched.start)
-    found = tuple(_sighting(view, condition, matches) for matches in collected.selected)
+    found = tuple(_sighting(view, condition, matches, frame_id) for matches in collected.selected)
     if fields:
         found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)
@@ -136,9 +145,9 @@ def find_matches(
 
 
 def read_sightings(
-    view: View, pattern: str, condition: Condition, window: TimeWindow
+    view: View, pattern: str, condition: Condition, scope: Scope
 ) -> tuple[list[tuple[Ns, Ns]], Ns | None]:
-    """Returns the times (inclusive) of all sightings in a window, oldest first.
+    """Returns the times (inclusive) of all sightings in a scope, oldest first.
 
     With them since when they are known, where the call's time is over before all is searched.
 
@@ -148,7 +157,7 @@ def read_sightings(
         QueryTimeoutError: the call's time is over before the first match was found.
     """
     found = _Sightings(MAX_COUNTED, oldest_first=True)
-    _collect(view, pattern, condition, window, found)
+    _collect(view, pattern, condition, scope, found)
     if found.count > MAX_COUNTED:
         view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
     spans = [(each.first, each.newest.time) for each in found.selected]
@@ -156,7 +165,7 @@ def read_sightings(
 
 
 def _collect(
-    view: View, pattern: str, condition: Condition, window: TimeWindow, found: _Sightings
+    view: View, pattern: str, condition: Condition, scope: Scope, found: _Sightings
 ) -> None:
     """Collects the matches in a window, newest first, until there are enough.
 
@@ -165,11 +174,13 @@ def _collect(
         NoDataError: there is no such topic, or none of its messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
+    window = scope.window
     search = ReverseSearch(view, pattern, condition)
     candidates = search.candidates(window.stop)
     before = window.stop
     try:
-        for part, topics in _parts(view, search.topics, candidates.windows(), window):
+        parts = _parts(view, search.topics, candidates.windows(), window)
+        for part, topics in scope.narrowed(parts):
             found.end_silent(part.stop)
             _end_in_gap(view, found, TimeWindow(part.stop, max(before, part.stop)))
             # Only topics that can begin or end a sighting are read: there may be thousands.
@@ -178,7 +189,8 @@ def _collect(
                 before = each.time
                 found.end_silent(each.time)
                 matches = search.matches(each)
-                if matches:
+                # Where the scope does not hold, a match is like a message that is none.
+                if matches and scope.holds_at(each.time):
                     found.add(each)
                 elif matches is None:
                     found.skip(each)
@@ -203,6 +215,8 @@ def _collect(
         # Without the catalogue one message more would be read here: the reply is to be the same.
         _stop(search, found)
     else:
+        # What lies outside of a scope is not read, and may well be decodable.
+        candidates.ruled_out |= scope.is_bounded
         search.close(candidates, window, found=bool(found.count))
 
 
@@ -319,12 +333,14 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     return bool(held) and view.stream.first([topic], gap) is not None
 
 
-def _sighting(view: View, condition: Condition, matches: _Matches) -> Sighting:
+def _sighting(
+    view: View, condition: Condition, matches: _Matches, frame_id: str | None
+) -> Sighting:
     """Returns the result, with where the robot and the thing were at the newest match."""
     newest = matches.newest
     message = view.memory.reader.decode(newest.record)
     value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
-    robot = _robot(view, newest)
+    robot = _robot(view, newest, frame_id)
     thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
     return Sighting(
         topic=newest.record.channel.topic,
@@ -369,10 +385,11 @@ def _with_fields(
     return tuple(extended)
 
 
-def _robot(view: View, seen: StoredMessage) -> Pose | None:
+def _robot(view: View, seen: StoredMessage, frame_id: str | None) -> Pose | None:
     """Returns the robot's newest pose at or before a match; None where it is not known.
 
-    Where the session of the match has poses, it is one of these.
+    In the map where transforms lead there, or in `frame_id`. Where the session of the match has
+    poses, it is one of these.
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
     found = newest_in_session(view, view.memory.limits.pose_topic, window, seen.bag.recording)
@@ -380,7 +397,10 @@ def _robot(view: View, seen: StoredMessage) -> Pose | None:
     if found is None or message is None:
         return None
     pose = view.memory.extractor.pose(message, found.record.channel.type)
-    return pose if pose is not None and all(map(math.isfinite, pose.position)) else None
+    if pose is None or not all(map(math.isfinite, pose.position)):
+        return None
+    there = placed(view, pose, found.time, found.bag.recording, frame_id)
+    return with_place(view, there, found.time, found.bag.recording)
 
 
 def _spot(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import chain, islice, pairwise
+from itertools import chain, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -22,7 +22,6 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
     QueryTimeoutError,
-    UndecodableError,
 )
 from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
@@ -34,11 +33,11 @@ from ros2_memory.history.driven_path import (
     POSES,
     add_poses,
     driven_path,
-    note_left_out,
+    pose_frame,
     positions_of,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import describe_lack, resolve_pose_topic
+from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.map_placement import map_placement
@@ -65,8 +64,6 @@ _ROUNDING_M: Final = 1e-6
 """What rounding of doubles may take off a distance."""
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
-_MOST_TRIED: Final = 1000
-"""How many of the newest poses are tried until one can be decoded."""
 
 
 def visits(
@@ -101,7 +98,7 @@ def visits(
     topic = resolve_pose_topic(view)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
-    placement = map_placement(view, _pose_frame(view, topic), topic, asked)
+    placement = map_placement(view, pose_frame(view, topic), topic, asked)
     now = memory.now(wall, view.snapshot.latest)
     if place is None:
         found = place_visits(view, memory.limits.places, placement.frame_id, window)
@@ -265,32 +262,6 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
         view.notes.add("the time was over before it was known whether odometry began anew since")
         return ()
     return () if path is None else path.trajectory.totals.resets
-
-
-def _pose_frame(view: View, topic: str) -> str:
-    """Returns the frame of the newest pose that can be decoded; empty without a pose.
-
-    Raises:
-        InvalidArgumentsError: the topic's messages carry no position.
-        UndecodableError: none of the newest ones can be decoded.
-    """
-    failure: UndecodableError | None = None
-    newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
-    for found in islice(newest, _MOST_TRIED):
-        try:
-            message = view.memory.reader.decode(found.record)
-        except UndecodableError as error:
-            failure = failure or error
-            continue
-        pose = view.memory.extractor.pose(message, found.record.channel.type)
-        if pose is None:
-            raise InvalidArgumentsError(describe_lack(view, "position", found))
-        if failure is not None:
-            note_left_out(view, failure)
-        return pose.frame_id
-    if failure is not None:
-        raise failure
-    return ""
 
 
 class _VisitSearch:

@@ -18,7 +18,9 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    InstanceOf,
     JsonValue,
+    ValidationError,
     ValidationInfo,
     WithJsonSchema,
 )
@@ -27,12 +29,14 @@ from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.timebase import unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.insights.scope import WhileCondition
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""
 LONGEST_NAME: Final = 500
 """Characters: twice what DDS allows for a topic."""
 LONGEST_VALUE: Final = 2_000
+CONDITION_KEYS: Final = ("topic", "condition_type", "value", "field")
 MOST_FIELDS: Final = 100
 MOST_TIMES: Final = 20
 """Moments that one call asks about."""
@@ -94,6 +98,24 @@ def _as_region(value: object) -> object:
         return value
     parsed = _parse_json(_check_text(value, LONGEST_VALUE))
     return parsed if isinstance(parsed, dict) else value
+
+
+def _as_while(value: object) -> object:
+    """Returns the condition on another topic, which planners also send as JSON text."""
+    parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
+    if not isinstance(parsed, dict):
+        raise ValueError("is no object")  # noqa: TRY004 - pydantic reports ValueError alone
+    unknown = sorted(str(name) for name in parsed.keys() - CONDITION_KEYS)
+    if unknown:
+        raise ValueError(f"has no {unknown[0]}; it has {', '.join(CONDITION_KEYS)}")
+    try:
+        condition = ConditionArguments.model_validate(parsed)
+    except ValidationError as error:
+        names = dict.fromkeys(str(fault["loc"][0]) for fault in error.errors(include_url=False))
+        raise ValueError(f"needs another {' and '.join(names)}") from None
+    return WhileCondition(
+        condition.topic, condition.condition_type, condition.value, condition.field
+    )
 
 
 def _as_integer(value: object) -> object:
@@ -189,6 +211,7 @@ _Where: TypeAlias = Annotated[
     ),
     Field(description="A place."),
 ]
+_FrameId: TypeAlias = Annotated[_Name, Field(description="Of positions in the reply.")]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
 ]
@@ -344,6 +367,12 @@ class MotionArguments(Arguments):
     tolerance_s: _Tolerance | None = None
 
 
+class PositionArguments(MotionArguments):
+    """A pose at a moment."""
+
+    frame_id: _FrameId | None = None
+
+
 class TransformArguments(Arguments):
     """A pair of frames at a moment."""
 
@@ -435,6 +464,19 @@ class VisitsArguments(Arguments):
     limit: _Limit = 10
 
 
+_While: TypeAlias = Annotated[
+    InstanceOf[WhileCondition],
+    BeforeValidator(_as_while),
+    WithJsonSchema(
+        {
+            "type": "object",
+            "examples": [{"topic": "/is_docked", "condition_type": "equals", "value": False}],
+        }
+    ),
+    Field(description="{topic, condition_type, value, field?} of another topic."),
+]
+
+
 class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
@@ -449,6 +491,9 @@ class MatchesArguments(ConditionArguments):
     ] = False
     limit: _Limit = 5
     by: _By | None = None
+    where: _Where | None = None
+    during: _While | None = Field(default=None, alias="while")
+    frame_id: _FrameId | None = None
 
 
 class ThingsArguments(Arguments):

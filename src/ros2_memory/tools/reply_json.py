@@ -93,9 +93,11 @@ def rounded(number: float, places: int) -> float | None:
 
 
 def planar_pose(pose: Pose) -> JsonObject:
-    """Returns a position and its yaw."""
+    """Returns a position, its yaw, and the named place that it is in."""
     unit = None if pose.orientation is None else normalised(pose.orientation)
-    return {**metres(pose.position), "yaw_deg": degrees(None if unit is None else yaw(unit))}
+    place: JsonObject = {} if pose.place is None else {"in": pose.place}
+    heading = degrees(None if unit is None else yaw(unit))
+    return {**metres(pose.position), "yaw_deg": heading, **place}
 
 
 def with_notes(

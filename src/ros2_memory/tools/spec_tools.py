@@ -23,6 +23,7 @@ from ros2_memory.tools.arguments import (
     LastMatchArguments,
     MotionArguments,
     NoArguments,
+    PositionArguments,
     TopicAtArguments,
     TopicListArguments,
     TopicRangeArguments,
@@ -134,7 +135,7 @@ _DECLARATIONS = (
         "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
         "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, "
         "longitude and altitude instead of x, y, z, which are null.",
-        MotionArguments,
+        PositionArguments,
         at_each(queries.position),
     ),
     ToolDeclaration(

@@ -1,0 +1,71 @@
+"""The frame that answers give positions in: one rule for all tools, and the place they are in.
+
+Tools beyond the specification answer in `data.map_frame` where transforms lead there from the
+pose's own frame at the time in question, else in that frame; the specification's tools in the
+pose's own frame. `frame_id` asks for another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.geometry import multiply, transform_point
+from ros2_memory.core.model import Pose
+from ros2_memory.core.regions import place_at
+from ros2_memory.core.text import abbreviate
+from ros2_memory.history.transforms import transform_at
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.view import View
+
+
+def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
+    """Returns a pose of a recording in another frame at a time; None where no transform leads."""
+    if frame_id.lstrip("/") == pose.frame_id.lstrip("/"):
+        return pose
+    if not pose.frame_id:
+        return None
+    try:
+        found = transform_at(view, frame_id, pose.frame_id, time, recording).transform
+    except NoDataError:
+        return None
+    turn = pose.orientation
+    return Pose(
+        transform_point(found, pose.position),
+        None if turn is None else multiply(found.rotation, turn),
+        frame_id,
+    )
+
+
+def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None) -> Pose:
+    """Returns a pose in the map where transforms lead there, else as it is; or in `frame_id`.
+
+    Raises:
+        InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
+    """
+    target = frame_id or view.memory.limits.map_frame
+    found = None if not target else pose_in(view, pose, target, time, recording)
+    if found is None and frame_id is not None:
+        raise InvalidArgumentsError(
+            f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
+            f"{pose.frame_id or 'a pose without a frame'} at that time"
+        )
+    return pose if found is None else found
+
+
+def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
+    """Returns a pose with the name of the place that it is in, where places are named."""
+    places = view.memory.limits.places
+    for frame in dict.fromkeys(each.frame_id for each in places):
+        there = pose_in(view, pose, frame, time, recording)
+        if there is None:
+            continue
+        name = place_at(places, frame, *there.position[:2])
+        if name is not None:
+            return replace(pose, place=name)
+    return pose

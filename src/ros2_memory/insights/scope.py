@@ -1,0 +1,146 @@
+"""What bounds a search besides its window: where the robot was, and what held on another topic."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.history.driven_path import pose_frame
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.insights.map_placement import map_placement
+from ros2_memory.insights.where import parse_where, times_inside
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.view import View
+
+
+@dataclass(frozen=True, slots=True)
+class WhileCondition:
+    """A condition on another topic, which its newest message must meet."""
+
+    topic: str
+    condition_type: str
+    value: JsonValue
+    field: str | None = None
+
+
+class Scope:
+    """The times in which matches count.
+
+    Attributes:
+        window: that is searched.
+
+    Raises:
+        InvalidArgumentsError: `where` is no place, or nothing can meet the other condition.
+        NoDataError: the other topic is not recorded, or no pose is.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        window: TimeWindow,
+        where: JsonValue = None,
+        during: WhileCondition | None = None,
+    ) -> None:
+        self.window = window
+        self._inside = None if where is None else _times_inside(view, window, where)
+        self._states = None if during is None else _States(view, during)
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether messages in the window may not count."""
+        return self._inside is not None or self._states is not None
+
+    def narrowed(
+        self, parts: Iterable[tuple[TimeWindow, Sequence[str]]]
+    ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
+        """Yields the parts of a search, newest first, without those in which nothing counts."""
+        for part, topics in parts:
+            if self._inside is None:
+                yield part, topics
+                continue
+            for start, stop in reversed(self._inside):
+                cut = part.intersect(TimeWindow(start, stop + 1))
+                if not cut.empty:
+                    yield cut, topics
+
+    def holds_at(self, time: Ns) -> bool:
+        """Returns whether a match at a moment counts."""
+        if self._inside is not None:
+            number = bisect_right(self._inside, time, key=lambda each: each[0])
+            if not number or time > self._inside[number - 1][1]:
+                return False
+        return self._states is None or self._states.holds_at(time)
+
+
+def _times_inside(view: View, window: TimeWindow, value: JsonValue) -> list[tuple[Ns, Ns]]:
+    where = parse_where(view.memory.limits.places, value)
+    topic = resolve_pose_topic(view)
+    placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
+    inside = times_inside(view, where, placement.frame_id, window)
+    return [(each.start, each.stop) for each in inside]
+
+
+class _States:
+    """Whether the newest message of a topic met a condition; moments are asked newest first.
+
+    Messages are read bag by bag: those around the moment, and the newest one before.
+    """
+
+    def __init__(self, view: View, during: WhileCondition) -> None:
+        tolerance_m = view.memory.limits.position_tolerance_m
+        self._view = view
+        self._condition = parse_condition(
+            during.condition_type, during.value, tolerance_m, during.field
+        )
+        self._search = ReverseSearch(view, during.topic, self._condition)
+        latching = view.memory.limits.latching
+        self._holds_on = all(
+            latching.is_latched(view.snapshot, topic)
+            or all(
+                view.snapshot.timeline.pace(topic, recording).is_rare
+                for recording in view.snapshot.timeline.recordings(topic)
+            )
+            for topic in self._search.topics
+        )
+        self._known = TimeWindow(0, 0)
+        self._times: list[Ns] = []
+        self._values: list[bool] = []
+
+    def holds_at(self, time: Ns) -> bool:
+        """Returns whether the newest message then met the condition; False without one."""
+        if not self._known.contains(time):
+            self._read_around(time)
+        number = bisect_right(self._times, time)
+        if not number:
+            return False
+        since = time - self._times[number - 1]
+        return self._values[number - 1] and (self._holds_on or since <= SILENCE_NS)
+
+    def _read_around(self, time: Ns) -> None:
+        """Reads the messages of the bags that may hold the newest one at a moment."""
+        topics = self._search.topics
+        spans = self._view.stream.overlapping_bags(topics, TimeWindow(time, time + 1))
+        start = min((span.first for span in spans), default=time)
+        stop = max((span.last + 1 for span in spans), default=time + 1)
+        stop = max(stop, time + 1)
+        found = [*self._view.stream.messages(topics, TimeWindow(start, stop))]
+        if not found or found[0].time > start:
+            before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)
+            found = found if before is None else [before, *found]
+        self._times, self._values = [], []
+        for each in found:
+            met = self._search.matches(each)
+            if met is not None:
+                self._times.append(each.time)
+                self._values.append(met)
+        self._known = TimeWindow(start, stop)

@@ -1,0 +1,179 @@
+"""Sightings while the robot was in a place, or while another topic met a condition; their frame."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, NoDataError
+from ros2_memory.core.regions import Box, Circle, Place
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import AtTime
+from ros2_memory.insights.scope import WhileCondition
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.insights.visits import visits
+from ros2_memory.queries import position
+from tests.support.bags import Msg, boolean, odom, text, write_mcap
+from tests.support.memories import asked, memory_of, recalling
+from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.random_histories import write_history
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+CUPS = "/vision/scene/scene_objects"
+PLACES = (Place("corner", "map", Circle(4.0, 3.0, 0.5)), Place("room", "map", Box(-1, 5, -1, 4)))
+
+
+def in_places(memory: Memory) -> Memory:
+    return replace(memory, limits=replace(memory.limits, places=PLACES))
+
+
+def docking(folder: Path, *, changes: bool) -> Memory:
+    """Words each second for a minute; docked but from 20 s to 40 s."""
+    messages: list[Msg] = [odom(BEGIN, 0.0, 0.0)]
+    for second in range(60):
+        at = BEGIN + second * S
+        messages.append(text(at + S // 2, "hello"))
+        docked = not 20 <= second < 40
+        if not changes or second in {0, 20, 40}:
+            messages.append(boolean(at, docked, topic="/is_docked"))
+    by_split: dict[int, list[Msg]] = {}
+    for each in sorted(messages, key=lambda message: message.log_time):
+        by_split.setdefault((each.log_time - BEGIN) // (10 * S), []).append(each)
+    for nth, some in by_split.items():
+        write_mcap(folder / "rec" / f"rec_{nth}.mcap", some)
+    return memory_of(folder)
+
+
+@pytest.mark.parametrize("changes", [False, True], ids=["each second", "on change"])
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+def test_matches_count_while_another_topic_meets_a_condition(
+    tmp_path: Path, changes: bool, recalls: bool
+) -> None:
+    memory = docking(tmp_path, changes=changes)
+    memory = recalling(memory, tmp_path) if recalls else memory
+    undocked = WhileCondition("/is_docked", "equals", False)
+    [found] = find_matches(
+        memory, Call(), "/chatter", "contains", "hello", during=undocked
+    ).sightings
+    assert ((found.first - BEGIN) / S, (found.last - BEGIN) / S) == (20.5, 39.5)
+    docked = WhileCondition("/is_docked", "equals", True)
+    later, earlier = find_matches(
+        memory, Call(), "/chatter", "contains", "hello", during=docked
+    ).sightings
+    assert [(each.first - BEGIN) / S for each in (earlier, later)] == [0.5, 40.5]
+
+
+def test_a_topic_that_was_never_recorded_bounds_nothing(tmp_path: Path) -> None:
+    never = WhileCondition("/never", "equals", False)
+    with pytest.raises(NoDataError, match="/never"):
+        find_matches(
+            docking(tmp_path, changes=False), Call(), "/chatter", "contains", "hello", during=never
+        )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_matches_count_while_the_robot_is_in_a_place(tmp_path: Path, seed: int) -> None:
+    write_moving_map(tmp_path, seed, seconds=300)
+    memory = in_places(memory_of(tmp_path))
+    there = visits(memory, Call(), where="corner", limit=100).visits
+    found = find_matches(memory, Call(), CUPS, "contains", "cup", where="corner", limit=100)
+    assert len(found.sightings) in {len(there), len(there) - 1}  # some are shorter than a second
+    for each in found.sightings:
+        assert each.robot is not None
+        assert (each.robot.frame_id, each.robot.place) == ("map", "corner")
+        assert any(
+            (visit.arrived or 0) <= each.first and each.last <= (visit.departed or 2**62)
+            for visit in there
+        )
+    assert all(after.last < before.first for before, after in pairwise(found.sightings))
+
+
+def test_the_frame_of_the_robot_is_the_map_or_the_one_asked_for(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 1, seconds=20)
+    memory = memory_of(tmp_path)
+
+    def robot(**given: Any) -> str:
+        [found] = find_matches(memory, Call(), CUPS, "contains", "cup", limit=1, **given).sightings
+        assert found.robot is not None
+        return found.robot.frame_id
+
+    assert robot() == "map"
+    assert robot(frame_id="odom") == "odom"
+    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
+        robot(frame_id="moon")
+
+
+def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_another(
+    tmp_path: Path,
+) -> None:
+    truth = write_moving_map(tmp_path, 1, seconds=60)
+    memory = in_places(memory_of(tmp_path))
+    at, place = truth.times[150], truth.places[150]
+    own = position(memory, Call(), AtTime(at_s=at / S))
+    assert (own.pose.frame_id, own.pose.place) == ("odom", "room")
+    there = position(memory, Call(), AtTime(at_s=at / S), frame_id="map")
+    assert there.pose.frame_id == "map"
+    assert there.pose.position[:2] == pytest.approx(place, abs=0.05)
+    reply = asked(memory, tmp_path, "get_position_at", timestamp=at / S, frame_id="map")
+    assert reply["in"] == "room"
+    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
+        position(memory, Call(), AtTime(at_s=at / S), frame_id="moon")
+
+
+@pytest.mark.parametrize(
+    ("condition", "reason"),
+    [
+        ({"topic": "/is_docked"}, "needs another condition_type and value"),
+        ({"topic": "/is_docked", "condition_type": "equals", "value": 1, "x": 2}, "has no x"),
+        (5, "no object"),
+    ],
+)
+def test_what_is_no_condition_is_refused(tmp_path: Path, condition: object, reason: str) -> None:
+    given: dict[str, object] = {
+        "topic": "/chatter",
+        "condition_type": "contains",
+        "value": "hello",
+        "while": condition,
+    }
+    memory = docking(tmp_path, changes=True)
+    reply = asked(memory, tmp_path, "find_matches", **given)
+    assert reply["error"] == "invalid_arguments"
+    assert reason in reply["detail"]
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 10_000), part=st.sampled_from([0.3, 1.0]), moving=st.booleans())
+def test_scopes_are_the_same_whatever_the_catalogue_knows(
+    seed: int, part: float, moving: bool
+) -> None:
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        if moving:
+            write_moving_map(bag_dir, seed, seconds=60)
+        else:
+            write_history(bag_dir, random.Random(seed))
+        memory = in_places(memory_of(bag_dir))
+        known = recalling(memory, bag_dir, part=part)
+        topic, word = (CUPS, "cup") if moving else ("/chatter", "cup")
+        for given in (
+            {"where": "room"},
+            {"where": {"x": [-1, 1], "y": [-1, 1]}},
+            {"while": {"topic": "/bumper", "condition_type": "equals", "value": True}},
+            {"while": {"topic": "/dock", "condition_type": "contains", "value": "un"}},
+        ):
+            arguments = {"topic": topic, "condition_type": "contains", "value": word, **given}
+            try:
+                one = asked(memory, bag_dir, "find_matches", **arguments)
+            except EpisodicError as error:
+                one = str(error)
+            assert one == asked(known, bag_dir, "find_matches", **arguments)
