@@ -151,10 +151,10 @@ def _sighting(found: JsonValue, row: Sequence[Message]) -> None:
     near("how long", number(found, "duration_s"), (last.log_time - first.log_time) / 1e9, SAME_S)
     near("how long ago", number(found, "ago_s"), _ago(last.log_time), SAME_S)
     same("count", number(found, "count"), len(row))
-    here = robot.pose(last.t)
+    here = robot.pose_in_map(last.t)
     near("x", number(found, "robot", "x"), here.x, PLACE_M)
     near("y", number(found, "robot", "y"), here.y, PLACE_M)
-    same("frame", text(found, "robot", "frame_id"), "odom")
+    same("frame", text(found, "robot", "frame_id"), "map")
 
 
 def sighting_of(
