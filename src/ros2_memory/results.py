@@ -558,6 +558,64 @@ class Things(AnswerWithNotes):
 
 
 @dataclass(frozen=True, slots=True)
+class ComparedThing:
+    """What became of a thing: where it was in the earlier window, and in the later.
+
+    Attributes:
+        before: None where it was not known then; `after`: None where it was not seen then.
+        missed: when it was known not to be seen where it was expected.
+        looks: detector messages that should have had it.
+    """
+
+    label: str
+    before: ThingStay | None
+    after: ThingStay | None
+    missed: Ns | None = None
+    looks: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedThings:
+    """The things that differ between two windows; `same` counts those that do not."""
+
+    moved: tuple[ComparedThing, ...]
+    appeared: tuple[ComparedThing, ...]
+    missed: tuple[ComparedThing, ...]
+    not_looked_at: tuple[ComparedThing, ...]
+    same: int
+
+
+class Pair(NamedTuple):
+    """A number in the window that is asked about, and in that which it is compared with."""
+
+    this: float | None
+    other: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison(AnswerWithNotes):
+    """What differs between two windows.
+
+    Attributes:
+        lengths: of the windows (s), and `recorded` how much of each was recorded.
+        frame_id: of the things' places.
+        way: numbers by name: metres, m/s, seconds and counts.
+        places: minutes in each named place.
+        errors: reports of each error.
+        silences: seconds for which each topic was silent.
+    """
+
+    lengths: Pair
+    recorded: Pair
+    frame_id: str
+    things: ComparedThings
+    way: tuple[tuple[str, Pair], ...]
+    places: tuple[tuple[str, Pair], ...]
+    errors: tuple[tuple[str, Pair], ...]
+    silences: tuple[tuple[str, Pair], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class TypeFields(AnswerWithNotes):
     """The fields that replies show of a message type, and the topics recorded under it."""
 

@@ -94,7 +94,7 @@ _KINDS: Final = tuple(_PLURALS)
 
 
 @dataclass(frozen=True, slots=True)
-class _Drive:
+class Drive:
     """How the robot moved: its path, and its standstills with whether each goes on afterwards."""
 
     path: DrivenPath | None = None
@@ -154,8 +154,8 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     """
     view, window = open_span(memory, call, span)
     start, end = window.asked()
-    drive = _drive(view, window)
-    found = _found_events(view, window)
+    drive = drive_in(view, window)
+    found = found_events(view, window)
     reported, things, throughout = _topic_events(view, window, found)
     events = [*_stops(drive), *reported]
     events += [
@@ -197,7 +197,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     )
 
 
-def _drive(view: View, window: TimeWindow) -> _Drive:
+def drive_in(view: View, window: TimeWindow) -> Drive:
     """Returns how the robot moved; nothing, with a note, where that is not known."""
     try:
         topic = resolve_pose_topic(view)
@@ -206,13 +206,13 @@ def _drive(view: View, window: TimeWindow) -> _Drive:
         standstills = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"nothing is known of the way: {error}")
-        return _Drive()
+        return Drive()
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
-    return _Drive(path, standstills)
+    return Drive(path, standstills)
 
 
-def _found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | None]:
+def found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | None]:
     """Returns the events of each topic that can have some; None where it has no message."""
     timeline = view.snapshot.timeline
     return {
@@ -223,7 +223,7 @@ def _found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | Non
 
 
 def _topic_events(
-    view: View, window: TimeWindow, found_events: Mapping[str, TopicEvents | None]
+    view: View, window: TimeWindow, found_of: Mapping[str, TopicEvents | None]
 ) -> tuple[list[Event], int, set[str]]:
     """Returns events that messages report, the number of things seen, and those seen throughout.
 
@@ -236,7 +236,7 @@ def _topic_events(
     visible: list[IntervalTable] = []
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
-    for topic, found in found_events.items():
+    for topic, found in found_of.items():
         if found is None or found.is_empty:
             continue
         events += [*_flips(topic, found), *map(_error, found.errors)]
@@ -271,7 +271,7 @@ def _note_limits(view: View, topic: str, events: TopicEvents) -> None:
         )
 
 
-def _stops(drive: _Drive) -> Iterator[Event]:
+def _stops(drive: Drive) -> Iterator[Event]:
     for (start, end, box), goes_on in drive.standstills:
         x, y, _ = box.centre
         # z: a rounded -0.00 reads as 0.00.

@@ -271,10 +271,31 @@ def chance_of_missing(
     looks, and when the chance fell below 1 %; None where it did not.
     """
     looks, hits = evidence.looks, evidence.hits
-    cell, bag = evidence.cell, cells.bag[looks]
+    bag = cells.bag[looks]
     during = (bag >= stay.first_bag) & (bag <= stay.last_bag) & (cells.last[looks] <= after)
     during |= (bag >= stay.first_bag) & (bag <= stay.last_bag) & (hits > 0)
     since = (cells.first[looks] > after) & evidence.fair & ~during
+    return _missed(cells, evidence, during, since)
+
+
+def missed_in(cells: Cells, evidence: Evidence, stay: Stay, window: tuple[Ns, Ns]) -> bool:
+    """Whether a window [start, stop) has so many looks that a thing would not have been missed.
+
+    That is what was seen in a stay after the window: it was not there in the window, but for a
+    chance of 1 %.
+    """
+    bag, first = cells.bag[evidence.looks], cells.first[evidence.looks]
+    during = (bag >= stay.first_bag) & (bag <= stay.last_bag)
+    inside = (first >= window[0]) & (cells.last[evidence.looks] < window[1])
+    _, _, crossed = _missed(cells, evidence, during, inside & evidence.fair & ~during)
+    return crossed is not None
+
+
+def _missed(
+    cells: Cells, evidence: Evidence, during: Flags, since: Flags
+) -> tuple[float, int, Ns | None]:
+    """Returns `chance_of_missing` by the looks `since`, with the rates of those `during`."""
+    looks, hits, cell = evidence.looks, evidence.hits, evidence.cell
     known: dict[int, list[float]] = {}
     for each, n, hit in zip(
         cell[during].tolist(), cells.n[looks[during]].tolist(), hits[during].tolist(), strict=True

@@ -505,3 +505,13 @@ class ThingsArguments(Arguments):
     end_s: _Time | None = Field(default=None, alias="end")
     min_score: _Score | None = None
     limit: _Limit = 12
+
+
+class CompareArguments(Arguments):
+    """A window, and the one that it is compared with."""
+
+    start_s: Annotated[_Time, Field(alias="start", examples=[1784023200])]
+    end_s: Annotated[_Time, Field(alias="end", examples=[1784023260])]
+    with_start_s: Annotated[_Time, Field(alias="with_start", examples=[1783936800])]
+    with_end_s: Annotated[_Time, Field(alias="with_end", examples=[1783936860])]
+    where: _Where | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ros2_memory.insights.binned_matches import count_matches
+from ros2_memory.insights.compare import compare
 from ros2_memory.insights.recap import recap_or_before
 from ros2_memory.insights.saved_moments import list_moments, remember_moment
 from ros2_memory.insights.sightings import find_matches
@@ -11,6 +12,7 @@ from ros2_memory.insights.type_fields import describe_type
 from ros2_memory.insights.visits import visits
 from ros2_memory.things.find import find_things
 from ros2_memory.tools.arguments import (
+    CompareArguments,
     MatchesArguments,
     NoArguments,
     RecapTime,
@@ -70,6 +72,16 @@ _THINGS = ToolDeclaration(
     find_things,
     blocking=True,
 )
+_COMPARE = ToolDeclaration(
+    (ToolName("compare", "What differs"),),
+    "What differs between two times: things that moved, appeared, or were missed; way, minutes in "
+    "places, errors, silences. What is equal is left out. Reply: {{things: {{moved: [{{label, was, "
+    "is}}], appeared, not_seen_where_expected, not_looked_at}}, way: {{name: {{this, with}}}}, "
+    "minutes, errors, silent_s}}.",
+    CompareArguments,
+    compare,
+    blocking=True,
+)
 TYPE = ToolDeclaration(
     (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
@@ -91,7 +103,7 @@ _SAVE_MOMENT = ToolDeclaration(
     blocking=True,
     writes=True,
 )
-DECLARATIONS = (_SIGHTINGS, _THINGS, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
+DECLARATIONS = (_SIGHTINGS, _THINGS, _COMPARE, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
 """The tools, in the order in which clients see them."""
 READABLE = (TYPE, MOMENTS)
 """What is read as a resource, and is no tool."""

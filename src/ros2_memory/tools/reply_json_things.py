@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
+from ros2_memory.core.text import shortened
 from ros2_memory.tools.reply_json import degrees, moment, render, rounded, seconds, with_notes
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
     from ros2_memory.tools.reply_size import JsonObject
+
+_MOST_COMPARED: Final = 6
+_LONGEST_NAME: Final = 120
+"""Characters of the text of an error."""
 
 
 @render.register(results.Things)
@@ -72,3 +77,70 @@ def _stay(stay: results.ThingStay) -> JsonObject:
 
 def _place(place: Vector3) -> JsonObject:
     return {name: rounded(part, 2) for name, part in zip("xyz", place, strict=True)}
+
+
+@render.register(results.Comparison)
+def _comparison(answer: results.Comparison) -> JsonObject:
+    """Returns what differs; a part in which nothing does is left out."""
+    reply: JsonObject = {
+        "duration_s": _pair(answer.lengths, 1),
+        "recorded_s": _pair(answer.recorded, 1),
+    }
+    things = _compared_things(answer)
+    if things:
+        reply["frame_id"] = answer.frame_id or None
+    reply["things"] = things
+    reply["things_unchanged"] = answer.things.same
+    if answer.way:
+        reply["way"] = {name: _pair(pair, 2) for name, pair in answer.way}
+    for key, places, found in (
+        ("minutes", 1, answer.places),
+        ("errors", 0, answer.errors),
+        ("silent_s", 0, answer.silences),
+    ):
+        if found:
+            shown = found[:_MOST_COMPARED]
+            reply[key] = {
+                shortened(name, _LONGEST_NAME): _pair(pair, places) for name, pair in shown
+            }
+        if len(found) > _MOST_COMPARED:
+            reply[f"{key}_total"] = len(found)
+    return with_notes(reply, answer.notes)
+
+
+def _compared_things(answer: results.Comparison) -> JsonObject:
+    things = answer.things
+    reply: JsonObject = {}
+    for key, found in (
+        ("moved", things.moved),
+        ("appeared", things.appeared),
+        ("not_seen_where_expected", things.missed),
+        ("not_looked_at", things.not_looked_at),
+    ):
+        if found:
+            reply[key] = [_compared_thing(each) for each in found[:_MOST_COMPARED]]
+        if len(found) > _MOST_COMPARED:
+            reply[f"{key}_total"] = len(found)
+    return reply
+
+
+def _compared_thing(thing: results.ComparedThing) -> JsonObject:
+    reply: JsonObject = {"label": thing.label}
+    if thing.before is not None:
+        reply["was"] = {**_at(thing.before), "last_seen": moment(thing.before.end)}
+    if thing.after is not None:
+        reply["is"] = {**_at(thing.after), "first_seen": moment(thing.after.start)}
+    if thing.missed is not None:
+        reply |= {"missed_by": moment(thing.missed), "looks": thing.looks}
+    return reply
+
+
+def _at(stay: results.ThingStay) -> JsonObject:
+    x, y, _ = stay.place
+    inside: JsonObject = {} if stay.inside is None else {"in": stay.inside}
+    return {"x": rounded(x, 2), "y": rounded(y, 2), **inside}
+
+
+def _pair(pair: results.Pair, places: int) -> JsonObject:
+    this, other = (None if each is None else rounded(each, places) for each in pair)
+    return {"this": this, "with": other}

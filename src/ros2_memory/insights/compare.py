@@ -1,0 +1,214 @@
+"""What differs between two windows: things, way, time in places, errors and silences.
+
+Two numbers differ where they are apart by more than a tenth of the larger, and by more than what
+noise and the digests' rounding may make of equal ones (`_LEAST`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.coverage import note_unread, recording_gaps
+from ros2_memory.history.driven_path import length_notes
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.silences import silences_in
+from ros2_memory.history.view import clamped, open_view
+from ros2_memory.insights.map_placement import map_placement
+from ros2_memory.insights.recap import drive_in, found_events
+from ros2_memory.insights.region_visits import place_visits
+from ros2_memory.history.driven_path import pose_frame
+from ros2_memory.insights.where import parse_where, times_inside
+from ros2_memory.results import ComparedThings, Comparison, Pair
+from ros2_memory.things.compared import ThingsBetween
+from ros2_memory.things.known import known_things
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.view import View
+    from ros2_memory.insights.where import Where
+
+_SHARE: Final = 0.1
+_LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}
+_LEAST_MINUTES: Final = 0.2
+_LEAST_SILENT_S: Final = 10.0
+_LEAST_COUNT: Final = 0.5
+
+
+def compare(
+    memory: Memory,
+    call: Call,
+    *,
+    start_s: float,
+    end_s: float,
+    with_start_s: float,
+    with_end_s: float,
+    where: JsonValue = None,
+) -> Comparison:
+    """Returns what differs in a window (Unix seconds, inclusive) from another one.
+
+    `where` takes the things that are in a region in either window, and the time in that region.
+
+    Raises:
+        InvalidArgumentsError: the bounds make no window, or `where` is no region.
+        NoDataError: the memory holds nothing.
+        QueryTimeoutError: the call's time is over.
+    """
+    region = None if where is None else parse_where(memory.limits.places, where)
+    asked, other = TimeWindow.from_unix(start_s, end_s), _other(with_start_s, with_end_s)
+    reach = min(max(asked.stop, other.stop), memory.clock.now())
+    view = open_view(memory, call, reach)
+    windows = clamped(view, asked), clamped(view, other)
+    frame, things = _things(view, windows, region)
+    ways, places = [_way(view, each) for each in windows], _places(view, windows, region)
+    errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
+    for each in windows:
+        note_unread(view, each)
+    recorded = [_recorded(view, each) for each in windows]
+    _note_lengths(view, recorded)
+    return Comparison(
+        lengths=Pair(*(_length(each) for each in windows)),
+        recorded=Pair(*recorded),
+        frame_id=frame,
+        things=things,
+        way=_differing(ways[0], ways[1], _LEAST),
+        places=_differing(places[0], places[1], _LEAST_MINUTES),
+        errors=_differing(errors[0], errors[1], _LEAST_COUNT),
+        silences=_differing(silences[0], silences[1], _LEAST_SILENT_S),
+        notes=view.notes.sentences(),
+    )
+
+
+def _other(start_s: float, end_s: float) -> TimeWindow:
+    try:
+        return TimeWindow.from_unix(start_s, end_s)
+    except InvalidArgumentsError as error:
+        raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
+
+
+def _things(
+    view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
+) -> tuple[str, ComparedThings]:
+    """Returns the frame of things, and what became of them from the earlier window to the later."""
+    limits = view.memory.limits
+    known = known_things(view, limits.min_score, limits.labels)
+    first, second = sorted(windows, key=lambda each: (each.start, each.stop))
+    between = ThingsBetween(known, (first, second), where, limits.places)
+    frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
+    return frame, between.compared()
+
+
+def _way(view: View, window: TimeWindow) -> dict[str, float | None]:
+    """Returns the numbers of the way; None for what is not known."""
+    drive = drive_in(view, window)
+    known = drive.trajectory
+    if known is None or not known.is_known:
+        return dict.fromkeys(_LEAST)
+    for note in length_notes(known):
+        view.notes.add(note)
+    start, end = window.asked()
+    stood = drive.stood(end - start)
+    return {
+        "distance_m": known.totals.distance_m,
+        "max_speed": known.max_speed,
+        "stood_s": None if stood is None else unix_from_ns(stood),
+        "standstills": None if stood is None else float(len(drive.standstills)),
+    }
+
+
+def _places(
+    view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
+) -> list[dict[str, float | None]]:
+    """Returns the minutes in each named place, or in a region, of each window."""
+    places = view.memory.limits.places
+    if where is None and not places:
+        return [{}, {}]
+    try:
+        topic = resolve_pose_topic(view)
+        placement = map_placement(view, pose_frame(view, topic), topic)
+    except (InvalidArgumentsError, NoDataError, UndecodableError):
+        return [{}, {}]
+    found: list[dict[str, float | None]] = []
+    for window in windows:
+        if where is None:
+            visited = place_visits(view, places, placement.frame_id, window)
+            durations = {each.place: each.duration for each in visited}
+        else:
+            inside = times_inside(view, where, placement.frame_id, window)
+            durations = {where.name or "where": sum(each.stop - each.start for each in inside)}
+        found.append({name: unix_from_ns(each) / 60 for name, each in durations.items()})
+    return found
+
+
+def _errors(view: View, window: TimeWindow) -> dict[str, float | None]:
+    """Returns how often each error was reported."""
+    counts: dict[str, float | None] = {}
+    for found in found_events(view, window).values():
+        for error in () if found is None else found.errors:
+            counts[error.text] = (counts.get(error.text) or 0.0) + error.reports
+    return counts
+
+
+def _silent(view: View, window: TimeWindow) -> dict[str, float | None]:
+    """Returns for how many seconds each topic was silent while the robot was on."""
+    silent: dict[str, float | None] = {}
+    for each in silences_in(view, window):
+        silent[each.topic] = (silent.get(each.topic) or 0.0) + unix_from_ns(each.end - each.start)
+    return silent
+
+
+def _length(window: TimeWindow) -> float:
+    start, end = window.asked()
+    return unix_from_ns(end - start)
+
+
+def _recorded(view: View, window: TimeWindow) -> float:
+    """Returns how many seconds of a window were recorded, but for pauses of less than a split."""
+    start, end = window.asked()
+    earliest, latest = view.snapshot.earliest, view.snapshot.latest
+    if earliest is None or latest is None:
+        return 0.0
+    first, last = max(start, earliest), min(end, latest)
+    if last <= first:
+        return 0.0
+    gaps = sum(
+        max(0, min(stop, last) - max(begin, first)) for begin, stop in recording_gaps(view, window)
+    )
+    return unix_from_ns(max(0, last - first - gaps))
+
+
+def _note_lengths(view: View, recorded: list[float]) -> None:
+    if differ(recorded[0], recorded[1], 10.0):
+        view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
+
+
+def _differing(
+    this: Mapping[str, float | None],
+    other: Mapping[str, float | None],
+    least: Mapping[str, float] | float,
+) -> tuple[tuple[str, Pair], ...]:
+    """Returns the numbers that differ, those that differ most first.
+
+    A name that one side lacks is 0 there; a number that is not known on one side is listed.
+    """
+    found: list[tuple[float, str, Pair]] = []
+    for name in dict.fromkeys([*this, *other]):
+        one, two = this.get(name, 0.0), other.get(name, 0.0)
+        floor = least if isinstance(least, float) else least[name]
+        if one is None or two is None:
+            if one is not two:
+                found.append((0.0, name, Pair(one, two)))
+        elif differ(one, two, floor):
+            found.append((abs(one - two), name, Pair(one, two)))
+    found.sort(key=lambda each: (-each[0], each[1]))
+    return tuple((name, pair) for _, name, pair in found)
+
+
+def differ(one: float, two: float, least: float) -> bool:
+    """Whether two numbers differ by more than noise: by a tenth of the larger, and by `least`."""
+    return abs(one - two) > max(least, _SHARE * max(abs(one), abs(two)))
