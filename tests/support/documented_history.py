@@ -86,6 +86,12 @@ CALLS: Final[dict[str, dict[str, object]]] = {
         "seconds": 64,
     },
     "find_things": {"label": "scissors"},
+    "compare": {
+        "start": START_S + 30,
+        "end": START_S + 60,
+        "with_start": START_S,
+        "with_end": START_S + 30,
+    },
     "recap": {"last_s": 30},
     "visits": {"x": 11, "y": 2, "radius_m": 1},
     "memory_status": {},

@@ -66,6 +66,11 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
         "sightings",
     ),
     ("find_things", {"label": "cup"}, "things"),
+    (
+        "compare",
+        {"start": T0_S + 10, "end": T0_S + LENGTH_S, "with_start": T0_S, "with_end": T0_S + 10},
+        "things",
+    ),
     ("recap", {"start": T0_S, "end": T0_S + LENGTH_S}, "events"),
     ("recap", {"last_s": 5}, "stood_s"),
     ("visits", {"x": 0.0, "y": 0.0}, "there_now"),

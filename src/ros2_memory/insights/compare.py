@@ -12,14 +12,13 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, Undecoda
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import note_unread, recording_gaps
-from ros2_memory.history.driven_path import length_notes
+from ros2_memory.history.driven_path import length_notes, pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.silences import silences_in
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.map_placement import map_placement
 from ros2_memory.insights.recap import drive_in, found_events
 from ros2_memory.insights.region_visits import place_visits
-from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.insights.where import parse_where, times_inside
 from ros2_memory.results import ComparedThings, Comparison, Pair
 from ros2_memory.things.compared import ThingsBetween

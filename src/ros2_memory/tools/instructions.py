@@ -29,9 +29,9 @@ get_position_at with the timestamp it gives.
 """
 _HAPPENED: Final = """\
 - "Where is X, how many?": find_things. "When did you see X?": find_matches, with oldest_first for \
-the first time. "What happened, where did you stop?": recap; "why then?": with around. "Have you \
-been here?": visits. "How low was it?": get_topic_in_last with fields and max_samples 1. "Usually, \
-on each day?": by. "Can I trust this?": memory_status.
+the first time. "What happened?": recap; "why then?": with around. "What changed?": compare. "Have \
+you been here?": visits. "How low was it?": get_topic_in_last with fields and max_samples 1. \
+"Usually, on each day?": by. "Can I trust this?": memory_status.
 - where: a place's name, {{x, y, radius_m}} or {{"x": [from, to], "y": [from, to]}}.
 """
 _REST: Final = """\
@@ -68,6 +68,7 @@ Which question answers what, in one call each:
 get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
 - Where is X, since when, where was it before, is it still there, how many are there, what is in a \
 place: find_things.
+- What changed since yesterday, what differs between two runs: compare.
 - When did you last see X, where were you, where was it, since when: find_matches with contains \
 on the vision topics. When first, how often: with oldest_first and limit 1. When was a number \
 beyond a limit: above or below, with field.

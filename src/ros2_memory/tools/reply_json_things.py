@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
     from ros2_memory.tools.reply_size import JsonObject
 
-_MOST_COMPARED: Final = 6
-_LONGEST_NAME: Final = 120
+_MOST_MOVED: Final = 10
+_MOST_COMPARED: Final = 5
+_LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
 
 
@@ -111,15 +112,15 @@ def _comparison(answer: results.Comparison) -> JsonObject:
 def _compared_things(answer: results.Comparison) -> JsonObject:
     things = answer.things
     reply: JsonObject = {}
-    for key, found in (
-        ("moved", things.moved),
-        ("appeared", things.appeared),
-        ("not_seen_where_expected", things.missed),
-        ("not_looked_at", things.not_looked_at),
+    for key, found, most in (
+        ("moved", things.moved, _MOST_MOVED),
+        ("appeared", things.appeared, _MOST_COMPARED),
+        ("not_seen_where_expected", things.missed, _MOST_COMPARED),
+        ("not_looked_at", things.not_looked_at, _MOST_COMPARED),
     ):
         if found:
-            reply[key] = [_compared_thing(each) for each in found[:_MOST_COMPARED]]
-        if len(found) > _MOST_COMPARED:
+            reply[key] = [_compared_thing(each) for each in found[:most]]
+        if len(found) > most:
             reply[f"{key}_total"] = len(found)
     return reply
 

@@ -56,7 +56,7 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "find_things", "recap", "visits", "memory_status"]
+ADDED = ["find_matches", "find_things", "compare", "recap", "visits", "memory_status"]
 WRITING = ["remember_moment"]
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
@@ -64,6 +64,7 @@ BLOCKING = {
     "visits",
     "find_matches",
     "find_things",
+    "compare",
     "recap",
     "list_frames",
     "find_last_match",
@@ -89,6 +90,7 @@ OPTIONAL = {
         "limit",
     },
     "recap": {"start", "end", "around", "seconds_before"},
+    "compare": {"where"},
     "find_things": {"label", "where", "start", "end", "min_score", "limit"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"timestamps", "tolerance_s", "fields"},

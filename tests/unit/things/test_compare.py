@@ -1,0 +1,221 @@
+"""What differs between two times, over bags of a robot whose map moves under its odometry."""
+
+from __future__ import annotations
+
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.insights.compare import differ
+from tests.support.bags import log_entry
+from tests.support.memories import asked, memory_of, recalling, replied
+from tests.unit.things.test_find import (
+    AWAY,
+    BEGIN,
+    HERE,
+    NAMED,
+    looked,
+    random_messages,
+    scene,
+    write,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from tests.support.bags import Msg
+
+S = 10**9
+MUG = ("mug", 3.0, 0.5)
+BOOK = ("book", 3.5, -1.0)
+FAR_MUG = ("mug", -2.0, 0.5)
+EARLIER = {"with_start": BEGIN, "with_end": BEGIN + 29}
+LATER = {"start": BEGIN + 60, "end": BEGIN + 89}
+
+
+def compared(bag_dir: Path, messages: Sequence[Msg], **given: object) -> Any:
+    write(bag_dir, messages)
+    return ask(bag_dir, **{**EARLIER, **LATER, **given})
+
+
+def ask(bag_dir: Path, **given: object) -> Any:
+    return asked(memory_of(bag_dir, limits=NAMED), bag_dir, "compare", **given)
+
+
+def labels(reply: Any) -> dict[str, list[str]]:
+    return {
+        kind: [each["label"] for each in listed]
+        for kind, listed in reply["things"].items()
+        if isinstance(listed, list)
+    }
+
+
+def moved_mug() -> list[Msg]:
+    return [
+        *looked(0, 20, HERE, MUG, BOOK),
+        *looked(20, 30, AWAY),
+        *looked(60, 70, HERE, BOOK),
+        *looked(70, 90, AWAY, FAR_MUG),
+    ]
+
+
+def test_a_thing_that_moved_is_listed_with_both_places(tmp_path: Path) -> None:
+    reply = compared(tmp_path, moved_mug())
+    [mug] = reply["things"]["moved"]
+    assert mug == {
+        "label": "mug",
+        "was": {"x": 3.0, "y": 0.5, "in": "kitchen", "last_seen": BEGIN + 19},
+        "is": {"x": -2.0, "y": 0.5, "first_seen": BEGIN + 70},
+    }
+    assert labels(reply) == {"moved": ["mug"]}
+    assert reply["things_unchanged"] == 1
+    assert reply["duration_s"] == {"this": 29.0, "with": 29.0}
+
+
+def test_things_are_compared_from_the_earlier_window_to_the_later(tmp_path: Path) -> None:
+    forward = compared(tmp_path, moved_mug())
+    back = ask(
+        tmp_path,
+        start=BEGIN,
+        end=BEGIN + 29,
+        with_start=BEGIN + 60,
+        with_end=BEGIN + 89,
+    )
+    assert back["things"] == forward["things"]
+
+
+def test_nothing_differs_between_equal_times(tmp_path: Path) -> None:
+    reply = compared(tmp_path, looked(0, 90, HERE, MUG))
+    assert reply["things"] == {}
+    assert reply["things_unchanged"] == 1
+    assert not reply.keys() & {"way", "minutes", "errors", "silent_s"}
+
+
+def test_a_thing_appeared_only_where_its_place_was_looked_at_before(tmp_path: Path) -> None:
+    fresh = looked(60, 90, HERE, MUG, BOOK)
+    known = compared(tmp_path / "looked", [*looked(0, 30, HERE, BOOK), *fresh])
+    assert labels(known) == {"appeared": ["mug"]}
+    assert known["things"]["appeared"][0]["is"]["first_seen"] == BEGIN + 60
+    unknown = compared(tmp_path / "away", [*looked(0, 30, AWAY), *fresh])
+    assert labels(unknown) == {"not_looked_at": ["book", "mug"]}
+
+
+def test_a_thing_is_missed_only_where_the_robot_looked_again(tmp_path: Path) -> None:
+    seen = looked(0, 30, HERE, MUG)
+    missed = compared(tmp_path / "missed", [*seen, *looked(60, 90, HERE)])
+    [mug] = missed["things"]["not_seen_where_expected"]
+    assert (mug["was"]["x"], mug["was"]["last_seen"]) == (3.0, BEGIN + 29)
+    assert mug["missed_by"] == BEGIN + 69
+    assert mug["looks"] == 30
+    away = compared(tmp_path / "away", [*seen, *looked(60, 90, AWAY)])
+    assert labels(away) == {"not_looked_at": ["mug"]}
+    # What is missed after the later window is no difference between the two.
+    after = [*seen, *looked(60, 90, AWAY), *looked(100, 130, HERE)]
+    assert labels(compared(tmp_path / "after", after)) == {"not_looked_at": ["mug"]}
+
+
+def test_where_keeps_the_things_that_were_in_a_region_in_either_window(tmp_path: Path) -> None:
+    reply = compared(tmp_path, moved_mug(), where="kitchen")
+    assert labels(reply) == {"moved": ["mug"]}
+    there = ask(tmp_path, **EARLIER, **LATER, where={"x": -2.0, "y": 0.5, "radius_m": 0.5})
+    assert labels(there) == {"moved": ["mug"]}
+    assert there["things_unchanged"] == 0
+    elsewhere = ask(tmp_path, **EARLIER, **LATER, where={"x": 9.0, "y": 9.0, "radius_m": 0.5})
+    assert elsewhere["things"] == {}
+
+
+def test_way_minutes_and_errors_are_listed_where_they_differ(tmp_path: Path) -> None:
+    drive = [
+        message for at in range(60, 90) for message in scene(at, (1.0 + (at - 60) * 0.5, 0, 0), [])
+    ]
+    fault = log_entry((BEGIN + 70) * S, 40, "drive", "motor is hot")
+    reply = compared(tmp_path, [*looked(0, 30, HERE), *drive, fault])
+    way = reply["way"]
+    assert way["distance_m"]["with"] == 0.0
+    assert way["distance_m"]["this"] == pytest.approx(14.5, abs=0.2)
+    assert way["stood_s"]["with"] == pytest.approx(29.0, abs=0.1)
+    # The kitchen ends at x 6: it is left after 10 s.
+    assert reply["minutes"]["kitchen"]["with"] == pytest.approx(29 / 60, abs=0.1)
+    assert reply["minutes"]["kitchen"]["this"] == pytest.approx(10 / 60, abs=0.1)
+    [(text, reports)] = reply["errors"].items()
+    assert "motor is hot" in text
+    assert reports == {"this": 1, "with": 0}
+
+
+def test_a_window_that_is_none_is_refused_by_its_name(tmp_path: Path) -> None:
+    reply = compared(tmp_path, looked(0, 10, HERE), with_start=BEGIN + 9, with_end=BEGIN)
+    assert reply["error"] == "invalid_arguments"
+    assert "with_start" in reply["detail"]
+
+
+def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
+    many = [(f"thing{nth:02}", 2.5 + nth % 6, 1.2 * (nth // 6) - 2) for nth in range(24)]
+    gone = [(f"lost{nth:02}", 2.5 + nth % 6, 1.2 * (nth // 6) - 1.4) for nth in range(24)]
+    new = [(f"new{nth:02}", x, y) for nth, (_, x, y) in enumerate(gone)]
+    shifted = [(label, x - 12.0, y) for label, x, y in many]
+    messages = [
+        *looked(0, 30, HERE, *many, *gone),
+        *looked(60, 75, HERE, *new),
+        *looked(75, 90, AWAY, *shifted),
+    ]
+    messages += [
+        log_entry((BEGIN + 61 + nth) * S, 40, "drive", f"{nth} {'broken ' * 40}")
+        for nth in range(20)
+    ]
+    write(tmp_path, messages)
+    memory = memory_of(tmp_path, limits=NAMED)
+    text = replied(memory, tmp_path, "compare", {**EARLIER, **LATER}).text
+    reply = ask(tmp_path, **EARLIER, **LATER)
+    assert 4_000 < len(text) <= 6_000
+    things = reply["things"]
+    assert (len(things["moved"]), len(things["appeared"])) == (10, 5)
+    assert things["moved_total"] > 20
+    assert things["appeared_total"] > 20
+    assert reply["errors_total"] == 20
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "least", "differs"),
+    [
+        (100.0, 109.0, 0.5, False),
+        (100.0, 112.0, 0.5, True),
+        (0.2, 0.6, 0.5, False),
+        (0.0, 1.0, 0.5, True),
+    ],
+)
+def test_numbers_differ_by_a_tenth_and_by_more_than_noise(
+    one: float, two: float, least: float, *, differs: bool
+) -> None:
+    assert differ(one, two, least) is differ(two, one, least) is differs
+
+
+@settings(
+    max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    seed=st.integers(0, 2**32), split_s=st.sampled_from([3.0, 10.0, 1000.0]), part=st.floats(0, 1)
+)
+@example(seed=1, split_s=10.0, part=1.0)
+@example(seed=2, split_s=3.0, part=0.5)
+def test_answers_are_the_same_with_the_catalogue_and_without(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, split_s: float, part: float
+) -> None:
+    bag_dir = tmp_path_factory.mktemp("bags")
+    write(bag_dir, random_messages(Random(seed)), split_s)
+    plain = memory_of(bag_dir, limits=NAMED)
+    known = recalling(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
+    for where in (None, "kitchen"):
+        question = {
+            "start": BEGIN + 40,
+            "end": BEGIN + 80,
+            "with_start": BEGIN,
+            "with_end": BEGIN + 30,
+            **({} if where is None else {"where": where}),
+        }
+        assert asked(known, bag_dir, "compare", **question) == asked(
+            plain, bag_dir, "compare", **question
+        )
