@@ -16,6 +16,7 @@ _MOST_MOVED: Final = 10
 _MOST_COMPARED: Final = 5
 _LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
+_LONGEST_LABEL: Final = 40
 
 
 @render.register(results.Things)
@@ -126,7 +127,7 @@ def _compared_things(answer: results.Comparison) -> JsonObject:
 
 
 def _compared_thing(thing: results.ComparedThing) -> JsonObject:
-    reply: JsonObject = {"label": thing.label}
+    reply: JsonObject = {"label": shortened(thing.label, _LONGEST_LABEL)}
     if thing.before is not None:
         reply["was"] = {**_at(thing.before), "last_seen": moment(thing.before.end)}
     if thing.after is not None:
