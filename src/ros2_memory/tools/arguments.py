@@ -27,6 +27,7 @@ from pydantic import (
 
 from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
+from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.scope import WhileCondition
@@ -107,7 +108,7 @@ def _as_while(value: object) -> object:
         raise ValueError("is no object")  # noqa: TRY004 - pydantic reports ValueError alone
     unknown = sorted(str(name) for name in parsed.keys() - CONDITION_KEYS)
     if unknown:
-        raise ValueError(f"has no {unknown[0]}; it has {', '.join(CONDITION_KEYS)}")
+        raise ValueError(f"has no {abbreviate(unknown[0])}; it has {', '.join(CONDITION_KEYS)}")
     try:
         condition = ConditionArguments.model_validate(parsed)
     except ValidationError as error:
