@@ -97,11 +97,11 @@ def _things(
     limits = view.memory.limits
     known = known_things(view, limits.min_score, limits.labels)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))
+    frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
     if first.start == second.start:
         view.notes.add("things are not compared: the two times begin together")
-    between = ThingsBetween(known, (first, second), where, limits.places)
-    frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
-    return frame, between.compared()
+        return frame, ComparedThings((), (), (), (), 0)
+    return frame, ThingsBetween(known, (first, second), where, limits.places).compared()
 
 
 def _way(view: View, window: TimeWindow) -> dict[str, float | None]:

@@ -155,7 +155,7 @@ def test_a_window_that_is_none_is_refused_by_its_name(tmp_path: Path) -> None:
 def test_times_that_begin_together_have_no_things_to_compare(tmp_path: Path) -> None:
     reply = compared(tmp_path, moved_mug(), start=BEGIN, end=BEGIN + 89)
     assert reply["things"] == {}
-    assert reply["notes"][-1] == "things are not compared: the two times begin together"
+    assert "things are not compared: the two times begin together" in reply["notes"]
 
 
 def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
