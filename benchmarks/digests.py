@@ -13,7 +13,7 @@ from benchmarks import ours
 from benchmarks.bags import ODOM
 from benchmarks.report import Figure
 from ros2_memory.analysis.intervals import ROW
-from ros2_memory.analysis.standstills import (
+from ros2_memory.analysis.motion.standstills import (
     BLOCK_NS,
     ChainDigest,
     decode_blocks,
@@ -27,8 +27,8 @@ from ros2_memory.cli.index import fill_catalogue
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
-    from ros2_memory.analysis.odometry import Leg, PoseDigest, TimedPosition
-    from ros2_memory.analysis.standstills import StandstillDigest
+    from ros2_memory.analysis.motion.odometry import Leg, PoseDigest, TimedPosition
+    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.topic_digest import TopicDigest

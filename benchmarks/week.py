@@ -24,7 +24,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status
-from ros2_memory.insights.visits import visits
+from ros2_memory.places.visits import visits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -28,6 +28,8 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     catalogue       SQLite digests of closed bags; derived, disposable
     history         one call's view across many bags
     things          what detectors saw, as instances with places and a history
+    places          where the robot was: in the map, in regions, in named places
+    counts          how often, how long and how far in each day, hour or weekday
     insights        the tools beyond the specification
     tools           declarations, arguments, replies as JSON
     serving         dispatch, MCP, HTTP, access, limits, health

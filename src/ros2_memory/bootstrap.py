@@ -265,7 +265,7 @@ def build_digester(memory: Memory) -> Digester:
     """Returns what digests the bags of a memory."""
     from ros2_memory.catalogue.detector_sights import DetectorSights
     from ros2_memory.catalogue.digest import Digester
-    from ros2_memory.history.map_digests import map_settings
+    from ros2_memory.places.map_digests import map_settings
 
     limits = memory.limits
     return Digester(

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
-from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -30,7 +30,6 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
-from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     by_remark,
     describe_misdated,
@@ -55,7 +54,6 @@ from ros2_memory.history.no_data import (
 )
 from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
 from ros2_memory.history.robots import note_robots, note_robots_near
-from ros2_memory.history.silences import describe_silences, silences_of
 from ros2_memory.history.view import (
     AtTime,
     TimeRange,
@@ -67,12 +65,13 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.field_extremes import (
     MAX_MESSAGES,
     TOO_MANY,
     extremes_of,
 )
-from ros2_memory.insights.pose_frames import placed, with_place
+from ros2_memory.insights.silences import describe_silences, silences_of
 from ros2_memory.insights.status import (
     clock_faults,
     left_open,
@@ -80,11 +79,12 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
+from ros2_memory.places.pose_frames import placed, with_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
@@ -185,7 +185,8 @@ def position(
         recording = found.bag.recording
         if frame_id is not None:
             pose = placed(view, pose, found.time, recording, frame_id)
-        pose = with_place(view, pose, found.time, recording)
+        if memory.limits.places:
+            pose = with_place(view, pose, found.time, recording)
     notes = view.notes.sentences()
     return results.Position(name, found.time, pose, _age(found, now), geodetic, notes=notes)
 

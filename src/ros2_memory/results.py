@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.analysis.silences import Silence
-    from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.analysis.transform_tree import FrameEdge
     from ros2_memory.bag_dir.moment_file import StoredMoment
     from ros2_memory.core.errors import NoDataReason

@@ -19,10 +19,10 @@ from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.history.bag_statics import BagStatics
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.map_digests import map_settings
 from ros2_memory.history.view import View
+from ros2_memory.places.bag_statics import BagStatics
+from ros2_memory.places.map_digests import map_settings
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader

@@ -17,7 +17,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.odometry import TimedPosition
+    from ros2_memory.analysis.motion.odometry import TimedPosition
 
 SHORTEST_STEP_NS: Final[Ns] = 2 * NS_PER_S
 BESIDE_NS: Final[Ns] = NS_PER_S

@@ -15,9 +15,15 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.odometry import Leg, MotionTotals, NearbyMotion, PoseDigest, TimedPosition
-from ros2_memory.analysis.path_length import Creep, End
-from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
+from ros2_memory.analysis.motion.odometry import (
+    Leg,
+    MotionTotals,
+    NearbyMotion,
+    PoseDigest,
+    TimedPosition,
+)
+from ros2_memory.analysis.motion.path_length import Creep, End
+from ros2_memory.analysis.motion.standstills import ChainDigest, StandstillDigest
 from ros2_memory.analysis.state_changes import (
     NO_CHANGES,
     KnownLevel,
@@ -29,7 +35,7 @@ from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, 
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.odometry import Vertex
+    from ros2_memory.analysis.motion.odometry import Vertex
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import JsonValue, Vector3
 

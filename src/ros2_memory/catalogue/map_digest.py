@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlia
 import numpy as np
 
 from ros2_memory.analysis.bag_frames import BagFrames, TransformColumns, multiply
-from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.robot_track import (
+from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
     decode_track,
     encode_track,

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.odometry import PoseDigest
-    from ros2_memory.analysis.standstills import StandstillDigest
+    from ros2_memory.analysis.motion.odometry import PoseDigest
+    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.digest import Digest

@@ -7,11 +7,11 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
-from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.standstills import StandstillCollector
+from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.standstills import StandstillCollector
+from ros2_memory.analysis.motion.trajectory import PoseCollector
 from ros2_memory.analysis.state_changes import follow_numbers, levels_by_number
 from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEventsBuilder, state_of
-from ros2_memory.analysis.trajectory import PoseCollector
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
-    from ros2_memory.analysis.odometry import PoseDigest
-    from ros2_memory.analysis.standstills import StandstillDigest
+    from ros2_memory.analysis.motion.odometry import PoseDigest
+    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector

@@ -7,8 +7,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
-from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.trajectory import MAX_WAYPOINTS, PoseCollector, TrajectoryBuilder
+from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
-    from ros2_memory.analysis.odometry import PoseDigest
-    from ros2_memory.analysis.trajectory import Trajectory
+    from ros2_memory.analysis.motion.odometry import PoseDigest
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Pose, Vector3
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span

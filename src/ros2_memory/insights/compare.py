@@ -14,12 +14,12 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import note_unread, recording_gaps
 from ros2_memory.history.driven_path import length_notes, pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.silences import silences_in
 from ros2_memory.history.view import clamped, open_view
-from ros2_memory.insights.map_placement import map_placement
 from ros2_memory.insights.recap import drive_in, found_events
-from ros2_memory.insights.region_visits import place_visits
-from ros2_memory.insights.where import parse_where, times_inside
+from ros2_memory.insights.silences import silences_in
+from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.region_visits import place_visits
+from ros2_memory.places.where import parse_where, times_inside
 from ros2_memory.results import ComparedThings, Comparison, Pair
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
-    from ros2_memory.insights.where import Where
+    from ros2_memory.places.where import Where
 
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}

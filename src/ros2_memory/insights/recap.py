@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.intervals import united
-from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.standstills import (
+from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.standstills import (
     CONTEXT_NS,
     CREEP_MPS,
     SHORTEST_NS,
@@ -33,13 +33,11 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_groups import DigestKind, Fold
-from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.silences import grouped, silences_in
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
@@ -48,6 +46,8 @@ from ros2_memory.insights.changes_before import (
     changes_in,
     is_routine,
 )
+from ros2_memory.insights.clock_steps import clock_steps
+from ros2_memory.insights.silences import grouped, silences_in
 from ros2_memory.insights.topic_events import events_in, toggled
 from ros2_memory.results import Before, Event, Recap
 
@@ -55,9 +55,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.intervals import IntervalTable
-    from ros2_memory.analysis.standstills import Standstill
+    from ros2_memory.analysis.motion.standstills import Standstill
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.analysis.topic_events import ReportedError, TopicEvents
-    from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span

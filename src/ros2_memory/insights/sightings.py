@@ -29,12 +29,12 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
-from ros2_memory.history.silences import describe_silences
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.insights.pose_frames import placed, with_place
-from ros2_memory.insights.scope import Scope
+from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
+from ros2_memory.places.pose_frames import placed, with_place
+from ros2_memory.places.scope import Scope
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.history.view import View
-    from ros2_memory.insights.scope import WhileCondition
     from ros2_memory.messages.detections import Detection
+    from ros2_memory.places.scope import WhileCondition
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 """The robot may have moved since an older pose."""

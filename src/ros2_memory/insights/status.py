@@ -8,11 +8,11 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.clock_steps import clock_steps
-from ros2_memory.history.silences import silences_of
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.saved_moments import newest_moments, unlisted
+from ros2_memory.insights.silences import silences_of
 from ros2_memory.results import Budget, SilentTopic, Status, Undecodable
 
 if TYPE_CHECKING:

@@ -25,12 +25,12 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ms_from_ns, unix_from_ns
-from ros2_memory.history.bag_statics import BagStatics
 from ros2_memory.history.context import Call
-from ros2_memory.history.map_digests import MapDigests
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
+from ros2_memory.places.bag_statics import BagStatics
+from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.insights.where import Where
+    from ros2_memory.places.where import Where
     from ros2_memory.things.instances import Instance, PlacedStay
     from ros2_memory.things.known import KnownThings
 

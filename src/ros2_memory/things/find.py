@@ -13,7 +13,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.insights.where import parse_where
+from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.known import KnownThings, known_things
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.insights.where import Where
+    from ros2_memory.places.where import Where
     from ros2_memory.things.instances import Instance, Mover, PlacedStay
 
 LIMIT: Final = 12

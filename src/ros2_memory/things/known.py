@@ -19,8 +19,8 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import Deadline, Ns
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.map_digests import MapDigests
 from ros2_memory.history.transforms import sessions_of
+from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.things.instances import Estimate, estimate
 from ros2_memory.things.labels import Labels
 

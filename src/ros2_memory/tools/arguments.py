@@ -25,12 +25,12 @@ from pydantic import (
     WithJsonSchema,
 )
 
-from ros2_memory.analysis.trajectory import MAX_WAYPOINTS
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.insights.scope import WhileCondition
+from ros2_memory.places.scope import WhileCondition
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""

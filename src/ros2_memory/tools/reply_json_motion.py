@@ -23,7 +23,7 @@ from ros2_memory.tools.reply_json import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.analysis.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Geodetic
     from ros2_memory.tools.reply_size import JsonObject
 

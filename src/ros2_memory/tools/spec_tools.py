@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
+from ros2_memory.counts.numbers import count_range
+from ros2_memory.counts.path import count_path
 from ros2_memory.insights.at_each import at_each
-from ros2_memory.insights.binned_numbers import count_range
-from ros2_memory.insights.binned_path import count_path
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.clock_steps import ClockStep, holes, step_over
-from ros2_memory.analysis.odometry import TimedPosition
+from ros2_memory.analysis.motion.odometry import TimedPosition
 
 S = 10**9
 

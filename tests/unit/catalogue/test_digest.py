@@ -17,7 +17,7 @@ from ros2_memory.analysis.conditions import (
     Equals,
     parse_condition,
 )
-from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
+from ros2_memory.analysis.motion.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.analysis.zone_map import MAX_WORDS
 from ros2_memory.catalogue.codec import (
     decode_poses,

@@ -23,10 +23,10 @@ from ros2_memory.catalogue.map_digest import (
     statics_of,
 )
 from ros2_memory.core.model import StampedTransform, Transform
-from ros2_memory.history.bag_statics import BagStatics
 from ros2_memory.history.context import Call
-from ros2_memory.history.map_digests import MapDigests, map_settings
 from ros2_memory.history.view import View
+from ros2_memory.places.bag_statics import BagStatics
+from ros2_memory.places.map_digests import MapDigests, map_settings
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.memories import extractor, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map

@@ -25,7 +25,7 @@ from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.odometry import PoseDigest
+    from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.recorder.index_manager import IndexManager
 
 T0_S = 1_700_000_000

@@ -14,7 +14,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.insights.visits import visits
+from ros2_memory.places.visits import visits
 from ros2_memory.queries import (
     find_last_match,
     frames,

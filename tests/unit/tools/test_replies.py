@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import results
-from ros2_memory.analysis.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
-from ros2_memory.analysis.path_length import End
-from ros2_memory.analysis.trajectory import Trajectory, Waypoint
+from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
+from ros2_memory.analysis.motion.path_length import End
+from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
 from ros2_memory.analysis.transform_tree import FrameEdge
 from ros2_memory.core.errors import (
     BagVanishedError,

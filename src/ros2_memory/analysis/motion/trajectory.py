@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
-from ros2_memory.analysis.odometry import (
+from ros2_memory.analysis.motion.odometry import (
     Motion,
     MotionTotals,
     PoseDigest,
@@ -19,8 +19,8 @@ from ros2_memory.analysis.odometry import (
     faster,
     is_place,
 )
-from ros2_memory.analysis.path_length import SPEED_STEPS
-from ros2_memory.analysis.polyline import DrawnPath
+from ros2_memory.analysis.motion.path_length import SPEED_STEPS
+from ros2_memory.analysis.motion.polyline import DrawnPath
 from ros2_memory.core.geometry import normalised, yaw
 
 if TYPE_CHECKING:

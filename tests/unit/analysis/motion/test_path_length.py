@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.odometry import TimedPosition, link
-from ros2_memory.analysis.trajectory import (
+from ros2_memory.analysis.motion.odometry import TimedPosition, link
+from ros2_memory.analysis.motion.trajectory import (
     PoseCollector,
     Trajectory,
     TrajectoryBuilder,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.odometry import PoseDigest
+    from ros2_memory.analysis.motion.odometry import PoseDigest
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S

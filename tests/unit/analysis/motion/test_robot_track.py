@@ -8,7 +8,7 @@ from random import Random
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.robot_track import (
+from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
     RobotTrack,
     decode_track,

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.regions import Box, Circle, Place, Polygon
 from ros2_memory.history.context import Call
-from ros2_memory.insights.visits import visits
+from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
 from tests.support.memories import memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map

@@ -13,8 +13,8 @@ from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.reverse_search import ReverseSearch
-from ros2_memory.insights.map_placement import map_placement
-from ros2_memory.insights.where import parse_where, times_inside
+from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.where import parse_where, times_inside
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.conditions import Condition, NearPosition
-from ros2_memory.analysis.dwell import Approach, DwellBuilder, Unread
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.odometry import is_place
+from ros2_memory.analysis.motion.dwell import Approach, DwellBuilder, Unread
+from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -40,23 +40,23 @@ from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.view import TimeRange, open_view, search_window
-from ros2_memory.insights.map_placement import map_placement
-from ros2_memory.insights.region_visits import place_visits, region_visits, track_in, visit_of
-from ros2_memory.insights.where import Where, parse_where
+from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.region_visits import place_visits, region_visits, track_in, visit_of
+from ros2_memory.places.where import Where, parse_where
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.dwell import Dwell
-    from ros2_memory.analysis.odometry import PoseDigest
+    from ros2_memory.analysis.motion.dwell import Dwell
+    from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.core.model import JsonValue, Pose, Vector3
     from ros2_memory.core.regions import Region
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.insights.map_placement import MapPlacement
+    from ros2_memory.places.map_placement import MapPlacement
 
 _COUNTING_S: Final = 5.0
 """How long visits are counted that are not shown."""

@@ -13,18 +13,18 @@ import numpy as np
 from ros2_memory.core.regions import Circle
 from ros2_memory.core.timebase import NS_PER_MS, Ns
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.robot_tracks import RobotTracks, robot_inside
+from ros2_memory.places.robot_tracks import RobotTracks, robot_inside
 from ros2_memory.results import PlaceVisits, Visit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.robot_track import RobotTrack
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Place
-    from ros2_memory.history.robot_tracks import Inside
     from ros2_memory.history.view import View
-    from ros2_memory.insights.where import Where
+    from ros2_memory.places.robot_tracks import Inside
+    from ros2_memory.places.where import Where
 
 
 class RegionVisits(NamedTuple):

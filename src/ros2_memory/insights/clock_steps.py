@@ -13,7 +13,7 @@ from ros2_memory.analysis.clock_steps import (
     holes,
     step_over,
 )
-from ros2_memory.analysis.odometry import TimedPosition, is_place
+from ros2_memory.analysis.motion.odometry import TimedPosition, is_place
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.driven_path import add_poses

@@ -17,9 +17,9 @@ from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, NoData
 from ros2_memory.core.regions import Box, Circle, Place
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime
-from ros2_memory.insights.scope import WhileCondition
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.insights.visits import visits
+from ros2_memory.places.scope import WhileCondition
+from ros2_memory.places.visits import visits
 from ros2_memory.queries import position
 from tests.support.bags import Msg, boolean, odom, text, write_mcap
 from tests.support.memories import asked, memory_of, recalling

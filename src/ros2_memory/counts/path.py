@@ -14,30 +14,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
-from ros2_memory.analysis.odometry import Motion, MotionTotals, TimedPosition
-from ros2_memory.analysis.trajectory import PoseCollector
+from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, TimedPosition
+from ros2_memory.analysis.motion.trajectory import PoseCollector
 from ros2_memory.core.geometry import distance
+from ros2_memory.counts.bins import BinnedWindow
+from ros2_memory.counts.segment_fold import SegmentFold
 from ros2_memory.history.driven_path import POSES, add_poses
 from ros2_memory.history.no_data import no_data_between, resolve_pose_topic, undecodable, with_notes
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.segment_fold import SegmentFold
 from ros2_memory.history.view import open_span
-from ros2_memory.insights.bins import BinnedWindow
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.odometry import PoseDigest
+    from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.counts.bins import By
+    from ros2_memory.counts.segment_fold import Digested
     from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.segment_fold import Digested
     from ros2_memory.history.view import TimeRange
-    from ros2_memory.insights.bins import By
     from ros2_memory.results import Bins
 
 

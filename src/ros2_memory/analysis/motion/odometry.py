@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.path_length import FEWEST, SPEED_STEPS, End, measured
+from ros2_memory.analysis.motion.path_length import FEWEST, SPEED_STEPS, End, measured
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.history import segment_fold
+from ros2_memory.counts import segment_fold
+from ros2_memory.counts.matches import count_matches
+from ros2_memory.counts.numbers import count_range
+from ros2_memory.counts.path import count_path
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.binned_matches import count_matches
-from ros2_memory.insights.binned_numbers import count_range
-from ros2_memory.insights.binned_path import count_path
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock

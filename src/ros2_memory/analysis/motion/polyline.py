@@ -19,7 +19,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.odometry import Vertex
+    from ros2_memory.analysis.motion.odometry import Vertex
 
 PARTED: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
 """Separates two pieces of a path that are stored in one row; no pose has NaN coordinates."""

@@ -19,16 +19,16 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
-from ros2_memory.analysis.time_bins import Held
 from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
+from ros2_memory.counts.bins import BinnedWindow
+from ros2_memory.counts.segment_fold import SegmentFold
+from ros2_memory.counts.time_bins import Held
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import condition_of
-from ros2_memory.history.segment_fold import SegmentFold
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.insights.bins import BinnedWindow
-from ros2_memory.insights.scope import Scope
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import TOPIC_EVENTS, collect_events
+from ros2_memory.places.scope import Scope
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import KnownFlag
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.counts.bins import By
+    from ros2_memory.counts.segment_fold import Digested, Folded
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.segment_fold import Digested, Folded
     from ros2_memory.history.view import View
-    from ros2_memory.insights.bins import By
-    from ros2_memory.insights.scope import WhileCondition
+    from ros2_memory.places.scope import WhileCondition
     from ros2_memory.results import Bins
 
 _TRUTHS = {"true": True, "false": False}

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.standstills import (
+from ros2_memory.analysis.motion.standstills import (
     LARGEST_M,
     SHORTEST_NS,
     Standstill,

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.odometry import MotionTotals
-from ros2_memory.analysis.trajectory import (
+from ros2_memory.analysis.motion.odometry import MotionTotals
+from ros2_memory.analysis.motion.trajectory import (
     TOLERANCE_M,
     PoseCollector,
     Trajectory,

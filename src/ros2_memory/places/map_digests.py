@@ -16,7 +16,7 @@ from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, templat
 from ros2_memory.catalogue.map_digest import MapCollector, MapDigest, MapSettings
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.history.bag_statics import BagStatics
+from ros2_memory.places.bag_statics import BagStatics
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

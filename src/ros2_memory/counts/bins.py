@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps, unix_text
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.results import Bins, Usual
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.time_bins import Held, TimeBins
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.counts.time_bins import Held, TimeBins
     from ros2_memory.history.view import View
     from ros2_memory.results import BinColumn
 

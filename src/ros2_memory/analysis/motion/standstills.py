@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.odometry import TimedPosition
+from ros2_memory.analysis.motion.odometry import TimedPosition
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:

@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.counts.bins import BinnedWindow
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.view import open_span
-from ros2_memory.insights.bins import BinnedWindow
 from ros2_memory.insights.field_extremes import numbers_in
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
-    from ros2_memory.insights.bins import By
     from ros2_memory.results import Bins
 
 MOST_CELLS: Final = 124

@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.time_bins import (
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.counts.time_bins import (
     MOST_BINS,
     MOST_DAYS,
     TimeBins,
@@ -17,11 +19,9 @@ from ros2_memory.analysis.time_bins import (
     time_bins,
     usual_time,
 )
-from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.time_bins import ClockBin, Offset
+    from ros2_memory.counts.time_bins import ClockBin, Offset
 
 S = 10**9
 H = 3600

@@ -25,7 +25,7 @@ from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
-from ros2_memory.insights.visits import visits
+from ros2_memory.places.visits import visits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, tf, transform, write_mcap

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Box, Circle
 from ros2_memory.core.text import abbreviate
-from ros2_memory.history.robot_tracks import robot_inside
-from ros2_memory.insights.region_visits import track_in
+from ros2_memory.places.region_visits import track_in
+from ros2_memory.places.robot_tracks import robot_inside
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place, Region
-    from ros2_memory.history.robot_tracks import Inside
     from ros2_memory.history.view import View
+    from ros2_memory.places.robot_tracks import Inside
 
 _EXPECTED: Final = (
     "give the name of a place, "

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
-from ros2_memory.analysis.robot_track import RobotTrack, empty_track
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.regions import Steps, parts_inside
 from ros2_memory.core.timebase import Deadline, Ns
-from ros2_memory.history.map_digests import MapDigests
+from ros2_memory.places.map_digests import MapDigests
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

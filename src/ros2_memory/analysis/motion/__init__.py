@@ -1,0 +1,1 @@
+"""What poses show of motion: paths, lengths, standstills, jumps and resets."""

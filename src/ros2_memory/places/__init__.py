@@ -1,0 +1,1 @@
+"""Where the robot was: in the map, in regions, in named places."""
