@@ -51,8 +51,8 @@ class Week:
     @cached_property
     def digests(self) -> list[Digest]:
         """Of the bags of the hour, oldest first."""
-        digester = digests.digester_of(ours.memory(self.settings), self.settings)
-        return [digester.digest(copy) for copy, _, later in self.whole.files() if not later]
+        digest = digests.digesting(ours.memory(self.settings))
+        return [digest(copy) for copy, _, later in self.whole.files() if not later]
 
     @cached_property
     def filled(self) -> Settings:
