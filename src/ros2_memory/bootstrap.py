@@ -315,13 +315,13 @@ def places_of(settings: Settings) -> tuple[Place, ...]:
     Raises:
         ConfigError: their file is missing or refused.
     """
-    from ros2_memory.core.regions import Box, Circle, Place, Polygon
+    from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 
     def region(shape: PlaceShape) -> Region:
         if shape.polygon is not None:
             return Polygon(shape.polygon)
         if isinstance(shape.x, tuple) and isinstance(shape.y, tuple):
-            return Box(*shape.x, *shape.y)
+            return Rectangle(*shape.x, *shape.y)
         # The model allows no other shape.
         numbers = (shape.x, shape.y, shape.radius_m)
         x, y, radius_m = (each if isinstance(each, float) else 0.0 for each in numbers)

@@ -300,7 +300,7 @@ class MessageSchemas:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
-class Labels:
+class LabelsFile:
     """Other spellings of labels: for each name that is to be shown, what detectors write for it."""
 
     labels: Annotated[dict[Text, tuple[Text, ...]], AfterValidator(_each_spelling_once)]
@@ -451,7 +451,7 @@ def load_labels(settings: Settings) -> Mapping[str, Sequence[str]]:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
     path = settings.data.labels_file
-    return {} if path is None else _load_file(Labels, "data.labels_file", path).labels
+    return {} if path is None else _load_file(LabelsFile, "data.labels_file", path).labels
 
 
 def load_places(settings: Settings) -> Mapping[str, PlaceShape]:

@@ -9,7 +9,7 @@ import pytest
 from ros2_memory.bootstrap import places_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.regions import Box, Circle, Place, Polygon
+from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,7 +31,7 @@ def test_each_place_is_a_circle_a_rectangle_or_a_polygon(tmp_path: Path) -> None
     )
     assert found == (
         Place("dock", "map", Circle(6.0, 0.6, 0.4)),
-        Place("kitchen", "map", Box(0.0, 5.0, 5.5, 9.0)),
+        Place("kitchen", "map", Rectangle(0.0, 5.0, 5.5, 9.0)),
         Place("corner", "yard", Polygon(((0.0, 0.0), (2.0, 0.0), (0.0, 2.0)))),
     )
 

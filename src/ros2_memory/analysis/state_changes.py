@@ -55,7 +55,7 @@ _REPEATED_NS: Final = 2 * NS_PER_S
 _DIGITS: Final = re.compile(r"\d+")
 
 
-class Level(NamedTuple):
+class StateLevel(NamedTuple):
     """A level that one message states; `text` says more of it."""
 
     name: str
@@ -121,7 +121,7 @@ def has_levels(type_name: str) -> bool:
     return type_name in {DIAGNOSTICS, GOALS, BATTERY} or type_name in VELOCITIES
 
 
-def levels_of(value: JsonValue, type_name: str) -> tuple[Level, ...]:
+def levels_of(value: JsonValue, type_name: str) -> tuple[StateLevel, ...]:
     """Returns the levels in an extracted message of a type."""
     if type_name == DIAGNOSTICS:
         return tuple(_statuses(value))[: _MAX_LEVELS + 1]
@@ -142,7 +142,7 @@ def follow_numbers(type_name: str) -> bool:
 
 def levels_by_number(
     type_name: str, names: Sequence[str], rows: Iterable[Sequence[float]]
-) -> Iterator[tuple[Level, ...]]:
+) -> Iterator[tuple[StateLevel, ...]]:
     """Yields the levels of messages that differ by their floats alone.
 
     A row has the floats of one message, `names` are those of their fields.
@@ -177,7 +177,7 @@ class StateChangesBuilder:
         self._newest: dict[str, int] = {}
         self._left_out = 0
 
-    def add(self, time: Ns, levels: Sequence[Level], reports: Sequence[str]) -> None:
+    def add(self, time: Ns, levels: Sequence[StateLevel], reports: Sequence[str]) -> None:
         """Takes the next message."""
         for name, value, text in levels[:_MAX_LEVELS]:
             self._add_level(KnownLevel(name, time, value, value, text))
@@ -251,7 +251,7 @@ class StateChangesBuilder:
             self._left_out += 1
 
 
-def _statuses(value: JsonValue) -> Iterator[Level]:
+def _statuses(value: JsonValue) -> Iterator[StateLevel]:
     listed = value.get("status") if isinstance(value, dict) else None
     for each in listed if isinstance(listed, list) else ():
         if not isinstance(each, dict):
@@ -259,10 +259,12 @@ def _statuses(value: JsonValue) -> Iterator[Level]:
         name, level, message = each.get("name"), each.get("level"), each.get("message")
         if isinstance(name, str) and isinstance(level, int):
             text = message if level and isinstance(message, str) else ""
-            yield Level(STATUS + shortened(name, _MAX_CHARS), level, shortened(text, _MAX_CHARS))
+            yield StateLevel(
+                STATUS + shortened(name, _MAX_CHARS), level, shortened(text, _MAX_CHARS)
+            )
 
 
-def _goals(value: JsonValue) -> Iterator[Level]:
+def _goals(value: JsonValue) -> Iterator[StateLevel]:
     listed = value.get("status_list") if isinstance(value, dict) else None
     for each in listed if isinstance(listed, list) else ():
         status = each.get("status") if isinstance(each, dict) else None
@@ -271,7 +273,7 @@ def _goals(value: JsonValue) -> Iterator[Level]:
         uuid = goal_id.get("uuid") if isinstance(goal_id, dict) else None
         if isinstance(status, int) and isinstance(uuid, list):
             parts = (part for part in uuid if isinstance(part, int))
-            yield Level(GOAL + "".join(f"{part:02x}" for part in parts), status)
+            yield StateLevel(GOAL + "".join(f"{part:02x}" for part in parts), status)
 
 
 def charge_of(value: JsonValue) -> float | None:
@@ -290,15 +292,15 @@ def _fraction(charge: float) -> float | None:
     return charge / _PERCENT if charge > 1 else charge
 
 
-def _charge(charge: float) -> tuple[Level, ...]:
+def _charge(charge: float) -> tuple[StateLevel, ...]:
     part = _fraction(charge)
     if part is None:
         return ()
-    return (Level(CHARGE, sum(part < least for least in LOW_CHARGES)),)
+    return (StateLevel(CHARGE, sum(part < least for least in LOW_CHARGES)),)
 
 
-def _command(numbers: Iterable[float]) -> tuple[Level, ...]:
-    return (Level(COMMAND, int(not all(abs(number) < _STILL for number in numbers))),)
+def _command(numbers: Iterable[float]) -> tuple[StateLevel, ...]:
+    return (StateLevel(COMMAND, int(not all(abs(number) < _STILL for number in numbers))),)
 
 
 def _floats(value: JsonValue) -> Iterator[float]:

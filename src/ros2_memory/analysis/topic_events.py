@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.intervals import IntervalBuilder, IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.state_changes import (
     NO_CHANGES,
-    Level,
     StateChanges,
     StateChangesBuilder,
+    StateLevel,
     has_levels,
     levels_of,
     reports_of,
@@ -64,7 +64,7 @@ class State(NamedTuple):
     flags: tuple[tuple[str, bool], ...] = ()
     errors: tuple[str, ...] = ()
     beyond: int = 0
-    levels: tuple[Level, ...] = ()
+    levels: tuple[StateLevel, ...] = ()
     reports: tuple[str, ...] = ()
 
     @property

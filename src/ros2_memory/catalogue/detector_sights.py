@@ -73,7 +73,7 @@ class _Topic:
 
 
 class DetectorSights:
-    """A `SightsBuilder` of `map_digest`.
+    """A `SightsSource` of `map_digest`.
 
     Args:
         reader: decodes messages whose value is not given.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.catalogue.map_digest import MapDigest, SightsBuilder, Statics
+    from ros2_memory.catalogue.map_digest import MapDigest, SightsSource, Statics
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
@@ -60,7 +60,7 @@ class Digester:
         extractor: SchemaExtractor,
         max_plausible_speed_mps: float,
         map_settings: MapSettings = _DEFAULT_MAP,
-        sights: Callable[[], SightsBuilder] | None = None,
+        sights: Callable[[], SightsSource] | None = None,
     ) -> None:
         self._reader = reader
         self._map_settings = map_settings

@@ -83,7 +83,7 @@ class MapDigest:
         statics: the hash of the static transforms that it was made with.
         track: of the robot.
         left_out: how many poses could not be placed.
-        sights: what `SightsBuilder.digest` returned; empty without a builder.
+        sights: what `SightsSource.digest` returned; empty without a builder.
     """
 
     frame_id: str
@@ -136,7 +136,7 @@ class PlacedPoses:
         )
 
 
-class SightsBuilder(Protocol):
+class SightsSource(Protocol):
     """Collects what detectors saw in one bag, and digests it as bytes that only it can read."""
 
     def wants(self, topic: str, type_name: str) -> bool:
@@ -161,7 +161,7 @@ class MapCollector:
         sights: collects what detectors saw; None where that is not wanted.
     """
 
-    def __init__(self, settings: MapSettings, sights: SightsBuilder | None = None) -> None:
+    def __init__(self, settings: MapSettings, sights: SightsSource | None = None) -> None:
         self._settings = settings
         self.sights = sights
         self._moving = TransformColumns()

@@ -72,7 +72,7 @@ class Circle:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class Rectangle:
     """All points between two x and two y."""
 
     min_x: float
@@ -152,7 +152,7 @@ class Polygon:
         return Parts(step, table[which, step], stop)
 
 
-Region: TypeAlias = "Circle | Box | Polygon"
+Region: TypeAlias = "Circle | Rectangle | Polygon"
 
 
 def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> NDArray[np.bool_]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
     from ros2_memory.demo.published_topics import Message
-    from ros2_memory.demo.robot import Planar, Thing
+    from ros2_memory.demo.robot import Planar, SimulatedThing
 
 VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetection": (
@@ -199,7 +199,7 @@ def _battery(message: Message) -> object:
     )
 
 
-def _bounding_box(thing: Thing) -> list[int]:
+def _bounding_box(thing: SimulatedThing) -> list[int]:
     """Returns the pixels (left, top, right, bottom) in a pinhole camera, clipped to the image."""
     depth = max(thing.point[0] - robot.CAMERA[0], _THING_M)
     across = _CENTRE_PX[0] - _FOCAL_PX * thing.point[1] / depth
@@ -213,7 +213,7 @@ def _bounding_box(thing: Thing) -> list[int]:
     ]
 
 
-def _detections(message: Message, skill: str, things: Sequence[Thing]) -> object:
+def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> object:
     detections = [
         _make(
             "ros2_vision_interfaces/msg/VisionDetection",

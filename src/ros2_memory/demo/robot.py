@@ -73,7 +73,7 @@ class DriveLeg:
         return Planar(radius * math.sin(turn), radius * (1.0 - math.cos(turn)), turn)
 
 
-class Thing(NamedTuple):
+class SimulatedThing(NamedTuple):
     """An object that the camera sees, at `point` (m) in `base_link`."""
 
     label: str
@@ -158,12 +158,12 @@ def place(t: float) -> str:
     return room_at(pose_in_map(t).x)
 
 
-def seen(t: float) -> tuple[Thing, ...]:
+def seen(t: float) -> tuple[SimulatedThing, ...]:
     """Returns the objects in the camera's view, nearest first: in range, and behind no wall."""
     here = pose_in_map(t)
     camera = here.then(Planar(CAMERA[0], CAMERA[1], 0.0))
     to_base = here.inverse()
-    things: list[Thing] = []
+    things: list[SimulatedThing] = []
     for label, (x, y, z) in THINGS.items():
         bearing = math.atan2(y - camera.y, x - camera.x)
         distance = math.hypot(x - camera.x, y - camera.y)
@@ -172,7 +172,7 @@ def seen(t: float) -> tuple[Thing, ...]:
         if wall_distances(camera.x, camera.y, np.array([bearing]))[0] < distance:
             continue
         there = to_base.then(Planar(x, y, 0.0))
-        things.append(Thing(label, round(0.97 - 0.1 * distance, 2), (there.x, there.y, z)))
+        things.append(SimulatedThing(label, round(0.97 - 0.1 * distance, 2), (there.x, there.y, z)))
     return tuple(sorted(things, key=lambda thing: -thing.score))
 
 

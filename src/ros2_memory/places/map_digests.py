@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.catalogue.map_digest import SightsBuilder, Statics
+    from ros2_memory.catalogue.map_digest import SightsSource, Statics
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
@@ -94,7 +94,7 @@ class MapDigests:
         return self.statics.remembered(digests, valid)
 
     def made(
-        self, bag: BagFile, sights: SightsBuilder | None = None, *, in_map: bool = True
+        self, bag: BagFile, sights: SightsSource | None = None, *, in_map: bool = True
     ) -> MapDigest:
         """Returns the digest of a bag, read from it; with sights where a builder is given.
 
@@ -120,7 +120,7 @@ class _MapReader:
     """Makes the map digest of a bag as the catalogue's `Digester` does."""
 
     def __init__(
-        self, view: View, settings: MapSettings, sights: SightsBuilder | None = None
+        self, view: View, settings: MapSettings, sights: SightsSource | None = None
     ) -> None:
         self._view = view
         self._settings = settings

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.regions import Box, Circle
+from ros2_memory.core.regions import Circle, Rectangle
 from ros2_memory.core.text import abbreviate
 from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import robot_inside
@@ -64,7 +64,7 @@ def parse_where(
     if isinstance(x, list) or isinstance(y, list):
         if "radius_m" in value:
             raise InvalidArgumentsError(f"where has a radius_m and a range; {_EXPECTED}")
-        return Where(Box(*_bounds("x", x), *_bounds("y", y)))
+        return Where(Rectangle(*_bounds("x", x), *_bounds("y", y)))
     radius = value.get("radius_m", default_radius_m)
     numbers = [_number(each) for each in (x, y, radius)]
     if None in numbers or not (numbers[2] or 0) > 0:

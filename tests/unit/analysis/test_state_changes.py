@@ -11,11 +11,11 @@ from ros2_memory.analysis.state_changes import (
     DIAGNOSTICS,
     GOALS,
     LOG,
-    Level,
     LevelChange,
     Report,
     StateChanges,
     StateChangesBuilder,
+    StateLevel,
     charge_of,
     levels_by_number,
     levels_of,
@@ -27,7 +27,7 @@ from ros2_memory.core.timebase import NS_PER_S as S
 TWIST = "geometry_msgs/msg/Twist"
 
 
-def changes_of(*messages: tuple[float, list[Level], list[str]]) -> StateChanges:
+def changes_of(*messages: tuple[float, list[StateLevel], list[str]]) -> StateChanges:
     builder = StateChangesBuilder()
     for at, levels, reports in messages:
         builder.add(round(at * S), levels, reports)
@@ -36,7 +36,7 @@ def changes_of(*messages: tuple[float, list[Level], list[str]]) -> StateChanges:
 
 def test_a_level_that_changes_is_a_change_and_its_first_value_is_not() -> None:
     values = [0, 0, 1, 1, 0]
-    found = changes_of(*((at, [Level("m", value)], []) for at, value in enumerate(values)))
+    found = changes_of(*((at, [StateLevel("m", value)], []) for at, value in enumerate(values)))
     assert found.changes == (LevelChange("m", 2 * S, 1), LevelChange("m", 4 * S, 0))
 
 
@@ -52,7 +52,7 @@ def test_entries_alike_but_for_their_numbers_are_one_report_while_they_follow_ea
 def test_what_a_bag_has_too_many_of_is_counted() -> None:
     builder = StateChangesBuilder()
     for at in range(20):
-        builder.add(at * 10 * S, [Level("m", at % 2)], ["no way"])
+        builder.add(at * 10 * S, [StateLevel("m", at % 2)], ["no way"])
     found = builder.changes(at_most=5)
     assert (len(found.changes), len(found.reports)) == (5, 5)
     assert found.left_out == 14 + 15
@@ -68,12 +68,12 @@ def test_statuses_and_goals_have_a_level_each() -> None:
         ]
     }
     assert levels_of(status, DIAGNOSTICS) == (
-        Level("status motor", 1, "hot"),
-        Level("status camera", 0),
+        StateLevel("status motor", 1, "hot"),
+        StateLevel("status camera", 0),
     )
     goal: JsonValue = {"goal_info": {"goal_id": {"uuid": [0, 255]}}, "status": 2}
     assert levels_of({"status_list": [goal, {"status": 1}, None]}, GOALS) == (
-        Level("goal 00ff", 2),
+        StateLevel("goal 00ff", 2),
     )
     assert levels_of(None, DIAGNOSTICS) == levels_of(7, GOALS) == ()
 
@@ -85,7 +85,7 @@ def test_statuses_and_goals_have_a_level_each() -> None:
 def test_how_low_a_battery_is_counts_the_fractions_that_it_is_below(
     charge: float, level: int
 ) -> None:
-    assert levels_of({"percentage": charge}, BATTERY) == (Level("charge", level),)
+    assert levels_of({"percentage": charge}, BATTERY) == (StateLevel("charge", level),)
 
 
 @pytest.mark.parametrize("charge", [math.nan, -1.0, 101.0, math.inf, None, "full", True])

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
 from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable
-from ros2_memory.analysis.state_changes import Level
+from ros2_memory.analysis.state_changes import StateLevel
 from ros2_memory.analysis.topic_events import (
     EMPTY_STATE,
     KnownFlag,
@@ -47,7 +47,7 @@ STATES = st.builds(
     st.sampled_from([(), (("x", True),), (("x", False),), (("x", True), ("y", False))]),
     st.sampled_from([(), ("hot",), ("cold",), ("hot", "cold")]),
     st.lists(
-        st.builds(Level, st.sampled_from("mn"), st.integers(0, 2)),
+        st.builds(StateLevel, st.sampled_from("mn"), st.integers(0, 2)),
         max_size=2,
         unique_by=lambda level: level.name,
     ).map(tuple),

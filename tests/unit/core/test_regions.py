@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.regions import (
-    Box,
     Circle,
     Place,
     Polygon,
+    Rectangle,
     Region,
     Steps,
     parts_inside,
@@ -19,7 +19,7 @@ from ros2_memory.core.regions import (
 )
 
 CIRCLE = Circle(1.0, 2.0, 1.5)
-BOX = Box(-1.0, 2.0, 0.0, 3.0)
+BOX = Rectangle(-1.0, 2.0, 0.0, 3.0)
 SQUARE = Polygon(((-1.0, 0.0), (2.0, 0.0), (2.0, 3.0), (-1.0, 3.0)))
 HORSESHOE = Polygon(
     ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (3.0, 4.0), (3.0, 1.0), (1.0, 1.0), (1.0, 4.0), (0.0, 4.0))
@@ -70,9 +70,9 @@ def test_a_robot_that_stands_is_inside_or_not(region: Region) -> None:
 
 def test_of_places_within_each_other_the_smallest_is_named() -> None:
     places = (
-        Place("kitchen", "map", Box(0, 5, 0, 5)),
+        Place("kitchen", "map", Rectangle(0, 5, 0, 5)),
         Place("dock", "map", Circle(1, 1, 0.5)),
-        Place("yard", "odom", Box(0, 5, 0, 5)),
+        Place("yard", "odom", Rectangle(0, 5, 0, 5)),
     )
     assert place_at(places, "map", 1.2, 1.0) == "dock"
     assert place_at(places, "map", 3.0, 1.0) == "kitchen"

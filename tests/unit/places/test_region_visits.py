@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
-from ros2_memory.core.regions import Box, Circle, Place, Polygon
+from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),
-    Place("start", "map", Box(-0.6, 0.6, -0.6, 0.6)),
+    Place("start", "map", Rectangle(-0.6, 0.6, -0.6, 0.6)),
     Place("far side", "map", Polygon(((3.0, -1.0), (5.0, -1.0), (5.0, 4.0), (3.0, 4.0)))),
-    Place("garden", "map", Box(50.0, 60.0, 0.0, 9.0)),
-    Place("yard", "elsewhere", Box(-9.0, 9.0, -9.0, 9.0)),
+    Place("garden", "map", Rectangle(50.0, 60.0, 0.0, 9.0)),
+    Place("yard", "elsewhere", Rectangle(-9.0, 9.0, -9.0, 9.0)),
 )
 
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, NoDataError
-from ros2_memory.core.regions import Box, Circle, Place
+from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime
 from ros2_memory.insights.sightings import find_matches
@@ -30,7 +30,10 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
 
 CUPS = "/vision/scene/scene_objects"
-PLACES = (Place("corner", "map", Circle(4.0, 3.0, 0.5)), Place("room", "map", Box(-1, 5, -1, 4)))
+PLACES = (
+    Place("corner", "map", Circle(4.0, 3.0, 0.5)),
+    Place("room", "map", Rectangle(-1, 5, -1, 4)),
+)
 
 
 def in_places(memory: Memory) -> Memory:

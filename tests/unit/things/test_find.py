@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.regions import Box, Place
+from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import Msg, detections, header, make, odom, point, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of, recalling
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 S = 10**9
 BEGIN = 1_784_000_000
 TYPE = "ros2_vision_interfaces/msg/VisionDetectionArray"
-KITCHEN = Place("kitchen", "map", Box(0, 6, -2, 2))
+KITCHEN = Place("kitchen", "map", Rectangle(0, 6, -2, 2))
 NAMED = QuerySettings(places=(KITCHEN,), labels={"mug": ["coffee mug"]})
 OFF = (3.0, -2.0, 0.5)
 """Where odom begins in the map, and its yaw."""
