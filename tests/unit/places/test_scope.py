@@ -137,7 +137,7 @@ def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_anot
     ("condition", "reason"),
     [
         ({"topic": "/is_docked"}, "needs another condition_type and value"),
-        ({"topic": "/is_docked", "condition_type": "equals", "value": 1, "x": 2}, "has no x"),
+        ({"topic": "/is_docked", "condition_type": "equals", "value": 1, "x": 2}, 'has no "x"'),
         (5, "no object"),
     ],
 )
