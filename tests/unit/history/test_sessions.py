@@ -272,7 +272,8 @@ def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
     assert found.thing.frame_id == "map"
     assert found.thing.position[0] == pytest.approx(103.0)
     assert found.robot is not None
-    assert found.robot.position[0] == pytest.approx(2.0)
+    assert found.robot.frame_id == "map"
+    assert found.robot.position[0] == pytest.approx(102.0)
 
 
 def boolean(at: int, *, on: bool) -> Msg:
