@@ -177,9 +177,14 @@ class DigestCache:
         with self._lock:
             known = self._segments.get(segment)
         if known is None or not (known.as_of == as_of or known.is_complete):
-            known = SegmentDigests(self, segment, as_of)
-            with self._lock:
-                self._segments[segment] = known
+            known = self.looked_up_again(segment, as_of)
+        return known
+
+    def looked_up_again(self, segment: Segment, as_of: int) -> SegmentDigests:
+        """Returns what is known of a segment now, where another program replaced its entries."""
+        known = SegmentDigests(self, segment, as_of)
+        with self._lock:
+            self._segments[segment] = known
         return known
 
     def complete_digests(self, segment: Segment) -> SegmentDigests | None:

@@ -114,6 +114,11 @@ class Backfill:
             for segment in timeline.segments:
                 digests = self._digests.digests_for(segment, newest)
                 valid = maps.valid_in(digests, segment)
+                if not digests.numbers.keys() <= valid.keys():
+                    # Another server may have digested the same bag meanwhile: its entry replaced
+                    # ours, and digesting the bag again would replace that one.
+                    digests = self._digests.looked_up_again(segment, newest)
+                    valid = maps.valid_in(digests, segment)
                 known = (bag for bag in segment.bags if bag.file in digests.numbers)
                 stale += [bag for bag in known if bag.file not in valid]
             self._stale = timeline, newest, stale

@@ -74,6 +74,18 @@ def test_when_all_is_digested_nothing_waits(tmp_path: Path) -> None:
     assert fill_catalogue(backfill_of(recalling(tmp_path), tmp_path)) == Progress(3, 0, 0)
 
 
+def test_what_another_server_digested_as_well_does_not_wait(tmp_path: Path) -> None:
+    for number in range(3):
+        bag(tmp_path, number)
+    one, other = (backfill_of(recalling(tmp_path), tmp_path) for _ in range(2))
+    both = other.waiting()
+    assert fill_catalogue(one) == Progress(3, 0, 0)
+    for each in both:
+        assert other.digest(each)
+    assert one.waiting() == []
+    assert other.waiting() == []
+
+
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     bag(tmp_path, 1, finish=False)
