@@ -331,7 +331,9 @@ def before(memory: Memory, call: Call, at_s: float, length_s: float) -> Before:
     changes = changes_in(view, window, {})
     found = changes.before(at, length, slack=SLACK_NS)
     robot, speed_mps = _robot(view, at)
-    if not changes.recorded:
+    if not view.snapshot.timeline.overlapping(window):
+        view.notes.add(f"nothing was recorded in the {length_s:g} s before")
+    elif not changes.recorded:
         view.notes.add("no topic that would show a change is recorded at this time")
     elif not found:
         view.notes.add(f"nothing changed on the recorded topics in the {length_s:g} s before")

@@ -143,6 +143,9 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
     assert reply["before"] == []
     assert reply["recorded"] == ["/bumper", "/diagnostics", "/rosout"]
     assert reply["notes"] == ["nothing changed on the recorded topics in the 10 s before"]
+    later = before(tmp_path, 500.0, recalls=recalls)["notes"]
+    assert "nothing was recorded in the 10 s before" in later
+    assert not [each for each in later if "nothing changed" in each]
 
 
 def test_that_no_such_topic_is_recorded_is_another_answer(tmp_path: Path) -> None:
