@@ -46,6 +46,7 @@ from ros2_memory.config_sources import (
     parse_overrides,
 )
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.things.labels import plain, singular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -89,18 +90,19 @@ def _dot_path(path: str) -> str:
 
 
 def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Checks that no spelling leads to two names; case and spacing distinguish none."""
-    names: dict[str, str] = {}
+    """Checks that no spelling leads to two names; case, spacing and a plural distinguish none."""
+    known: dict[str, tuple[str, str]] = {}
     for name, spellings in labels.items():
         for each in (name, *spellings):
-            plain = " ".join(re.split(r"[\s_-]+", each.casefold().strip()))
-            if not plain.strip():
+            key = singular(plain(each))
+            if not key:
                 raise ValueError(f"must not hold an empty spelling, as under {name!r}")
-            other = names.setdefault(plain, name)
+            first, other = known.setdefault(key, (each, name))
             if other != name:
+                also = "" if first == each else f" (as {first!r})"
                 raise ValueError(
-                    f"must hold each spelling under one label: {each!r} is under {other!r} and "
-                    f"{name!r}"
+                    f"must hold each spelling under one label: {each!r} is under {other!r}{also} "
+                    f"and {name!r}; case, spacing and a plural distinguish none"
                 )
     return labels
 
