@@ -16,6 +16,7 @@ from coverage import Coverage
 from hypothesis import settings
 from xdist.remote import Producer
 
+from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
 
 if TYPE_CHECKING:

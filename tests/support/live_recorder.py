@@ -36,6 +36,7 @@ from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_server_process import Served, serving
 from tests.support.processes import PATIENCE_S, until
+from tests.support.real_recorder import env_without_ros
 from tests.support.robot_run import ask
 from tests.support.ros_processes import wait_for
 
@@ -53,7 +54,7 @@ RECORDED_TOPICS: Final = (
 )
 NS_PER_S: Final = 10**9
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION")
-_OF_THE_ROBOT: Final = ("AMENT_PREFIX_PATH", "ROS_DISTRO", "ROS_VERSION")
+_OF_THE_MACHINE: Final = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOG_DIR")
 
 
 class Child(NamedTuple):
@@ -236,11 +237,9 @@ class Machine:
     def plain_env(self) -> dict[str, str]:
         """An environment without ROS, but with its domain."""
         kept = {
-            name: text
-            for name, text in self.env.items()
-            if not name.startswith(_OURS) and name not in _OF_THE_ROBOT
+            name: text for name, text in env_without_ros().items() if not name.startswith(_OURS)
         }
-        return {**kept, "PATH": os.environ["PATH"]}
+        return {**kept, **{name: self.env[name] for name in _OF_THE_MACHINE}}
 
 
 @contextmanager

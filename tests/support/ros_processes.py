@@ -2,13 +2,15 @@
 
 `ros_environment` is a context manager; what it yields is the whole environment for subprocesses:
 
-- `ros2` on PATH is the test double (`tests/ros2_double`).
+- `ros2` on PATH is the test double (`tests/ros2_double`), or the real one
+  (`tests/support/real_recorder.py`).
 - A `ROS_DOMAIN_ID` that no other test on this machine has, and discovery on this machine alone.
 - `ROS2_LIVE_SETUP` names a `setup.bash` that makes the same of an environment that knows no ROS,
   as a distribution's does.
 
 ROS's Python packages are in an environment of their own, as a distribution's are: the double and
-the publishers run in it, the tests do not.
+the publishers run in it, the tests do not. Beside the real recorder the publishers run in the
+environment of that one.
 """
 
 from __future__ import annotations
@@ -29,18 +31,25 @@ import pytest
 
 from tests.support.bags import VISION_DEFINITIONS
 from tests.support.processes import PATIENCE_S
+from tests.support.real_recorder import env_without_ros, require_real_recorder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from tests.support.real_recorder import RealRecorder
+
 ROOT: Final = Path(__file__).resolve().parents[2]
 SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108
 ROS: Final = ROOT / "build" / "ros"
-needs_ros = pytest.mark.skipif(
-    not any(ROS.glob("lib/*/site-packages/rclpy")),
-    reason="build/ros has no rclpy (wheels: Linux, Python 3.11); to make it: "
-    "UV_PROJECT_ENVIRONMENT=build/ros uv sync --locked --inexact --no-default-groups --group ros",
+RECORDERS: Final = ("real", "double")
+"""What a test of recording is run with, by the names of parameters."""
+
+_HAS_ROS: Final = any(ROS.glob("lib/*/site-packages/rclpy"))
+_NO_ROS: Final = (
+    "build/ros has no rclpy (wheels: Linux, Python 3.11); to make it: "
+    "UV_PROJECT_ENVIRONMENT=build/ros uv sync --locked --inexact --no-default-groups --group ros"
 )
+needs_ros = pytest.mark.skipif(not _HAS_ROS, reason=_NO_ROS)
 
 _DOMAINS: Final = range(1, 102)  # those whose ports lie below the ephemeral ones (ROS_DOMAIN_ID)
 _DEFINITIONS: Final = {
@@ -59,6 +68,18 @@ export PATH='{folder}/bin':"$PATH"
 export AMENT_PREFIX_PATH='{folder}'
 export ROS_DISTRO='{distro}' ROS_VERSION=2
 """
+
+
+def installation(request: pytest.FixtureRequest) -> RealRecorder | None:
+    """What a fixture with `params=RECORDERS` is run with, for `ros_environment`; None: the double.
+
+    Skips where that one is not there; `require_real_recorder` says when it fails instead.
+    """
+    if request.param == "real":
+        return require_real_recorder()
+    if not _HAS_ROS:
+        pytest.skip(_NO_ROS)
+    return None
 
 
 def write_workspace(folder: Path, distro: str = "jazzy") -> Path:
@@ -89,35 +110,56 @@ def write_workspace(folder: Path, distro: str = "jazzy") -> Path:
 
 
 @contextmanager
-def ros_environment(folder: Path, distro: str = "jazzy") -> Iterator[dict[str, str]]:
+def ros_environment(
+    folder: Path, distro: str = "jazzy", *, real: RealRecorder | None = None
+) -> Iterator[dict[str, str]]:
     """An environment for subprocesses, see above; `folder` gets the workspace and the logs.
 
     At the end, files that Fast DDS left in shared memory since the start are removed, where no
     process has them open.
+
+    Args:
+        folder: a folder of the test's own.
+        distro: which one the double is.
+        real: the installation whose `ros2` it is; None: the double.
     """
     before = _shared_memory()
-    workspace = folder / "ros"
-    setup = write_workspace(workspace, distro)
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("ROS", "RMW", "RCUTILS", "FASTDDS", "FASTRTPS", "AMENT"))
-    }
+    known = _of_double(folder / "ros", distro) if real is None else _of_real(real)
     with _domain() as domain:
         try:
             yield {
-                **kept,
-                "PATH": f"{workspace / 'bin'}{os.pathsep}{kept['PATH']}",
-                "AMENT_PREFIX_PATH": str(workspace),
-                "ROS_DISTRO": distro,
-                "ROS_VERSION": "2",
+                **known,
                 "ROS_DOMAIN_ID": str(domain),
                 "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
                 "ROS_LOG_DIR": str(folder / "ros_log"),
-                "ROS2_LIVE_SETUP": str(setup),
             }
         finally:
             _remove_unused(_shared_memory() - before)
+
+
+def _of_double(workspace: Path, distro: str) -> dict[str, str]:
+    setup = write_workspace(workspace, distro)
+    kept = env_without_ros()
+    return {
+        **kept,
+        "PATH": f"{workspace / 'bin'}{os.pathsep}{kept['PATH']}",
+        "AMENT_PREFIX_PATH": str(workspace),
+        "ROS_DISTRO": distro,
+        "ROS_VERSION": "2",
+        "ROS2_LIVE_SETUP": str(setup),
+        "ROS2_LIVE_PYTHON": str(ROS / "bin" / "python"),
+        "ROS2_LIVE_PYTHONPATH": str(ROOT),
+    }
+
+
+def _of_real(real: RealRecorder) -> dict[str, str]:
+    return {
+        **real.env,
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",  # that of `tests/support/ros_types.py`
+        "ROS2_LIVE_SETUP": str(real.setup),
+        "ROS2_LIVE_PYTHON": real.python,
+        "ROS2_LIVE_PYTHONPATH": f"{ROOT}{os.pathsep}{real.python_path}",
+    }
 
 
 @dataclass(frozen=True)
@@ -178,11 +220,12 @@ def publishing_robot(
         through: a program that becomes the robot, given as the end of its arguments.
     """
     assert not truth.exists(), f"{truth} is the truth of another drive"
-    argv = [*through, str(ROS / "bin" / "python"), "-P", "-m", "tests.support.robot_publishers"]
+    argv = [*through, env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.robot_publishers"]
     argv += ["--truth", str(truth), *options]
     if duration_s is not None:
         argv += ["--duration", str(duration_s)]
-    process = subprocess.Popen(argv, env={**env, "PYTHONPATH": str(ROOT)}, stdin=subprocess.DEVNULL)
+    known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
+    process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
     try:
         yield Robot(process, truth)
     finally:
