@@ -79,7 +79,7 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
-from ros2_memory.places.pose_frames import placed, with_place
+from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -407,11 +407,12 @@ def trajectory_summary(
     span: TimeRange,
     *,
     topic: str | None = None,
+    frame_id: str | None = None,
     max_waypoints: int = MAX_WAYPOINTS,
 ) -> results.TrajectorySummary:
     """Returns the driven path in a window, from one pose topic in log-time order.
 
-    Of its waypoints 0 is none, and 1 the last.
+    Of its waypoints, which are in the poses' own frame or in `frame_id`, 0 is none, and 1 the last.
     """
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)
@@ -423,12 +424,16 @@ def trajectory_summary(
     note_robots(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
+    drawn = _with_few_waypoints(path.trajectory, max_waypoints)
+    if frame_id is not None:
+        moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
+        drawn = replace(drawn, waypoints=moved)
     return results.TrajectorySummary(
         name,
-        path.frames[0],
+        frame_id or path.frames[0],
         path.first,
         path.last,
-        _with_few_waypoints(path.trajectory, max_waypoints),
+        drawn,
         notes=view.notes.sentences(),
     )
 

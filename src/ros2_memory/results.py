@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import ClockStep
-    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
     from ros2_memory.analysis.silences import Silence
     from ros2_memory.analysis.transform_tree import FrameEdge
     from ros2_memory.bag_dir.moment_file import StoredMoment
@@ -224,6 +224,34 @@ class TrajectorySummary(AnswerWithNotes):
     start: Ns
     end: Ns
     trajectory: Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class DrivenInside(AnswerWithNotes):
+    """What was driven inside of a region in a window.
+
+    Attributes:
+        topic: of the poses.
+        frame_id: of the waypoints.
+        where: the region's name.
+        visits: how often the robot was inside; `duration` is how long in all.
+        start: log time at which the first visit began; None where there was none.
+        end: at which the last one ended.
+        distance_m: metres driven inside.
+        max_speed: over a second (m/s).
+        waypoints: of the drawn way; `jump` marks the first of a visit.
+    """
+
+    topic: str
+    frame_id: str
+    where: str
+    visits: int
+    duration: Ns
+    start: Ns | None
+    end: Ns | None
+    distance_m: float
+    max_speed: float
+    waypoints: tuple[Waypoint, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -98,7 +98,7 @@ def test_the_script_counts_what_is_right_and_what_no_tool_answers_yet(
     assert "| all | 60 |" in capsys.readouterr().out
     outcomes = json.loads(told.read_text(encoding="utf-8"))
     results = Counter(each["result"] for each in outcomes)
-    assert results["right"] >= 52
+    assert results["right"] == 60
     assert not [each for each in outcomes if each["result"] == "wrong"]
 
 

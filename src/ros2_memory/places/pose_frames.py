@@ -7,19 +7,22 @@ pose's own frame. `frame_id` asks for another.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
-from ros2_memory.core.geometry import multiply, transform_point
-from ros2_memory.core.model import Pose
+from ros2_memory.core.geometry import multiply, transform_point, yaw
+from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import place_at
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.history.transforms import transform_at
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
 
@@ -51,11 +54,43 @@ def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | No
     target = frame_id or view.memory.limits.map_frame
     found = None if not target else pose_in(view, pose, target, time, recording)
     if found is None and frame_id is not None:
-        raise InvalidArgumentsError(
-            f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
-            f"{pose.frame_id or 'a pose without a frame'} at that time"
-        )
+        raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
     return pose if found is None else found
+
+
+def placed_waypoints(
+    view: View, topic: str, waypoints: Sequence[Waypoint], own_frame: str, frame_id: str
+) -> tuple[Waypoint, ...]:
+    """Returns waypoints of a topic's poses in another frame, each by the transforms of its time.
+
+    Those that no transform places are left out, with a note.
+
+    Raises:
+        InvalidArgumentsError: no transform places any of them.
+    """
+    found: list[Waypoint] = []
+    for each in waypoints:
+        bags = view.stream.overlapping_bags([topic], TimeWindow(each.time, each.time + 1))
+        half = math.nan if each.yaw_rad is None else each.yaw_rad / 2
+        pose = Pose(each.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
+        there = pose_in(view, pose, frame_id, each.time, bags[0].bag.recording) if bags else None
+        if there is None or there.orientation is None:
+            continue
+        turn = None if each.yaw_rad is None else yaw(there.orientation)
+        found.append(replace(each, position=there.position, yaw_rad=turn))
+    if waypoints and not found:
+        raise InvalidArgumentsError(_unreachable(frame_id, own_frame))
+    if len(found) < len(waypoints):
+        left_out = counted(len(waypoints) - len(found), "waypoint")
+        view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
+    return tuple(found)
+
+
+def _unreachable(frame_id: str, own_frame: str) -> str:
+    return (
+        f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
+        f"{own_frame or 'a pose without a frame'} at that time"
+    )
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
+    from ros2_memory.places.robot_tracks import Inside
+    from ros2_memory.places.where import Where
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,11 @@ class Scope:
         during: WhileCondition | None = None,
     ) -> None:
         self.window = window
-        self._inside = None if where is None else _times_inside(view, window, where)
+        self._inside: list[tuple[Ns, Ns]] | None = None
+        if where is not None:
+            region = parse_where(view.memory.limits.places, where)
+            inside = times_in_region(view, region, window)
+            self._inside = [(each.start, each.stop) for each in inside]
         self._states = None if during is None else _States(view, during)
 
     @property
@@ -82,12 +88,17 @@ class Scope:
         return self._states is None or self._states.holds_at(time)
 
 
-def _times_inside(view: View, window: TimeWindow, value: JsonValue) -> list[tuple[Ns, Ns]]:
-    where = parse_where(view.memory.limits.places, value)
+def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside]:
+    """Returns when the robot was in a region, in order: one in the map, unless it names a frame.
+
+    Raises:
+        InvalidArgumentsError: no pose is in the region's frame, and none can be placed there.
+        NoDataError: no pose is recorded.
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
     topic = resolve_pose_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
-    inside = times_inside(view, where, placement.frame_id, window)
-    return [(each.start, each.stop) for each in inside]
+    return times_inside(view, where, placement.frame_id, window)
 
 
 class _States:

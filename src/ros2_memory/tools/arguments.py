@@ -44,6 +44,8 @@ MOST_TIMES: Final = 20
 MOST_WAYPOINTS: Final = 200
 TIME_KINDS: Final = ("number", "string")
 """The JSON types of a time: Unix seconds, or ISO 8601 text."""
+REGION_KINDS: Final = ("string", "object")
+"""The JSON types of a place: its name, or its bounds."""
 LONGEST_BEFORE_S: Final = 3600.0
 LONGEST_AFTER_S: Final = 600.0
 """Of a moment that is to be saved."""
@@ -206,13 +208,13 @@ _Where: TypeAlias = Annotated[
     BeforeValidator(_as_region),
     WithJsonSchema(
         {
-            "anyOf": [{"type": kind} for kind in ("string", "object")],
+            "anyOf": [{"type": kind} for kind in REGION_KINDS],
             "examples": ["kitchen"],
         }
     ),
     Field(description="A place."),
 ]
-_FrameId: TypeAlias = Annotated[_Name, Field(description="Of positions in the reply.")]
+_FrameId: TypeAlias = Annotated[_Name, Field(description="Of the reply.")]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
 ]
@@ -419,6 +421,8 @@ class TrajectoryArguments(Arguments):
 
     span: TimeRange
     topic: _PoseTopic | None = None
+    where: _Where | None = None
+    frame_id: _FrameId | None = None
     max_waypoints: Annotated[
         Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)], BeforeValidator(_as_integer)
     ] = MAX_WAYPOINTS

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 Question: TypeAlias = "Callable[[Memory, Call], Answer]"
 """A query with its arguments bound."""
-SHOWN_ALONE: Final = frozenset({"limit", "oldest_first", "max_samples", "max_waypoints"})
+SHOWN_ALONE: Final = frozenset(
+    {"frame_id", "limit", "max_samples", "max_waypoints", "oldest_first"}
+)
 """Arguments that bound what is shown, and change no count."""
 Query: TypeAlias = "Callable[..., Answer]"  # type: ignore[explicit-any]
 """A function of a memory, a call, and the fields of its arguments as keywords, as a test holds."""
@@ -104,7 +106,7 @@ class ToolDeclaration:
     def _describe(
         self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
     ) -> tuple[str, JsonObject]:
-        """Returns the full description for the first name, and a reference to it for the others."""
+        """Returns what planners read: in full for the first name; the others refer to it."""
         first, when = self.names[0], name.when
         if name is first or when is None:
             text = self.description.format(when=when.text if when else "", **defaults)
@@ -115,7 +117,14 @@ class ToolDeclaration:
             text = f"Blocking. {text}"
         if self.shows_example and name is first:
             text = f"{text} Example: {to_json_text(signature.example)}"
-        return text, signature.json_schema()
+        schema = signature.json_schema()
+        properties = schema["properties"]
+        if name is not first and isinstance(properties, dict):
+            shared = Signature(self.arguments).json_schema()["properties"]
+            for argument, each in properties.items():
+                if isinstance(each, dict) and isinstance(shared, dict) and argument in shared:
+                    each.pop("description", None)
+        return text, schema
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))

@@ -21,10 +21,10 @@ from ros2_memory.tools.reply_json import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import Geodetic
+    from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
+    from ros2_memory.core.model import Geodetic, JsonValue
     from ros2_memory.tools.reply_size import JsonObject
 
 FINE_PATH_M: Final = 0.05 + 1e-9
@@ -101,15 +101,7 @@ def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
         "avg_speed": rounded(path.avg_speed, 4) if known else None,
         "max_speed": rounded(path.max_speed, 4) if known else None,
         "duration_s": rounded(path.totals.duration_s, 3) if known else None,
-        "waypoints": [
-            {
-                "timestamp": unix_rounded_up(point.time),
-                **metres(point.position),
-                "yaw_deg": degrees(point.yaw_rad),
-                **({"jump": True} if point.jump else {}),
-            }
-            for point in path.waypoints
-        ],
+        "waypoints": _waypoints(path.waypoints, "jump"),
         "topic": answer.topic,
         "frame_id": answer.frame_id or None,
         "start": unix_rounded_up(answer.start),
@@ -120,6 +112,39 @@ def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
         **({"gap_m": rounded(path.totals.gap_m, 4)} if path.totals.gaps else {}),
     }
     return with_notes(reply, (*answer.notes, *_path_notes(path)))
+
+
+@render.register(results.DrivenInside)
+def _driven_inside(answer: results.DrivenInside) -> JsonObject:
+    lasted = seconds(answer.duration)
+    reply: JsonObject = {
+        "where": answer.where,
+        "distance_m": rounded(answer.distance_m, 4),
+        "avg_speed": rounded(answer.distance_m / lasted if lasted else 0.0, 4),
+        "max_speed": rounded(answer.max_speed, 4),
+        "duration_s": lasted,
+        "visits": answer.visits,
+        "start": moment(answer.start),
+        "end": moment(answer.end),
+        **LocalTimes(answer.start, answer.end).of(answer.start, answer.end),
+        "waypoints": _waypoints(answer.waypoints, "entered"),
+        "topic": answer.topic,
+        "frame_id": answer.frame_id or None,
+    }
+    return with_notes(reply, answer.notes)
+
+
+def _waypoints(waypoints: Sequence[Waypoint], mark: str) -> list[JsonValue]:
+    """Returns waypoints; `mark` is the key of those that no drawn way leads to."""
+    return [
+        {
+            "timestamp": unix_rounded_up(point.time),
+            **metres(point.position),
+            "yaw_deg": degrees(point.yaw_rad),
+            **({mark: True} if point.jump else {}),
+        }
+        for point in waypoints
+    ]
 
 
 def _path_notes(path: Trajectory) -> Iterator[str]:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.tools.arguments import TIME_KINDS
+from ros2_memory.tools.arguments import REGION_KINDS, TIME_KINDS
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ _TIME: Final = "Unix seconds or ISO 8601 text"
 class Signature:
     """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
 
-    `plain_times`: the schema shows times as numbers alone, since some clients refuse an argument of
-    two types. Texts are read all the same.
+    `plain_times`: the schema shows times as numbers, and places as names, alone, since some clients
+    refuse an argument of two types. The other type is read all the same.
     """
 
     def __init__(
@@ -177,6 +177,9 @@ def _flat(schema: JsonObject) -> JsonObject:
 
 def _with_plain_times(schema: JsonObject) -> JsonObject:
     plain = dict(schema)
+    if plain.get("anyOf") == [{"type": kind} for kind in REGION_KINDS]:
+        del plain["anyOf"]
+        plain["type"] = REGION_KINDS[0]
     if plain.get("type") == [*TIME_KINDS]:
         plain["type"] = TIME_KINDS[0]
     items = plain.get("items")

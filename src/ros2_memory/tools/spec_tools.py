@@ -6,6 +6,7 @@ A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declar
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from ros2_memory import queries, results
@@ -14,6 +15,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.insights.at_each import at_each
+from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
@@ -34,7 +36,9 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
+    from ros2_memory.history.view import TimeRange
     from ros2_memory.tools.declaration import Tool
 
 
@@ -83,6 +87,21 @@ def _list_topics(
             "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
         )
     return named
+
+
+def _trajectory(
+    memory: Memory,
+    call: Call,
+    span: TimeRange,
+    *,
+    topic: str | None,
+    where: JsonValue,
+    frame_id: str | None,
+    max_waypoints: int,
+) -> results.TrajectorySummary | results.DrivenInside:
+    """Returns the whole way, or what was driven inside of a region."""
+    query = queries.trajectory_summary if where is None else partial(driven_inside, where=where)
+    return query(memory, call, span, topic=topic, frame_id=frame_id, max_waypoints=max_waypoints)
 
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
@@ -188,9 +207,9 @@ _DECLARATIONS = (
         ),
         "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, "
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
-        "...}}.",
+        "...}}; with where only what it drove there, and visits.",
         TrajectoryArguments,
-        queries.trajectory_summary,
+        _trajectory,
         blocking=True,
         count=count_path,
     ),

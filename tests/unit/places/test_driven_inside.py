@@ -1,0 +1,150 @@
+"""What the robot drove while it was in a place, and waypoints in another frame."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.regions import Place, Rectangle
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import TimeRange
+from ros2_memory.places.driven_inside import driven_inside
+from ros2_memory.queries import trajectory_summary
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import asked, memory_of, recalling
+from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.random_histories import write_history
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+    from tests.support.moving_map import MovingMap
+
+LEFT = {"x": [-1, 2], "y": [-1, 4]}
+ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
+
+
+def in_places(memory: Memory) -> Memory:
+    places = (Place("left half", "map", Rectangle(-1, 2, -1, 4)),)
+    return replace(memory, limits=replace(memory.limits, places=places))
+
+
+def driven(truth: MovingMap, low: float, high: float) -> float:
+    """Metres that were driven in the map between two x."""
+    return sum(
+        math.dist(before, after)
+        for before, after in pairwise(truth.places)
+        if low <= (before[0] + after[0]) / 2 <= high
+    )
+
+
+@pytest.mark.parametrize("split_s", [3.7, 10.0, 300.0])
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+def test_metres_count_while_the_robot_is_in_a_place_and_corrections_of_the_map_add_none(
+    tmp_path: Path, split_s: float, recalls: bool
+) -> None:
+    truth = write_moving_map(tmp_path, 3, seconds=200, split_s=split_s)
+    memory = in_places(memory_of(tmp_path))
+    memory = recalling(memory, tmp_path) if recalls else memory
+    found = driven_inside(memory, Call(), ALL, where="left half")
+    # In odom the drift of the map, which corrects it, is driven too.
+    assert found.distance_m == pytest.approx(driven(truth, -1, 2), rel=0.1, abs=0.5)
+    assert found.max_speed == pytest.approx(0.4, abs=0.1)
+    assert (found.where, found.frame_id) == ("left half", "odom")
+    whole = trajectory_summary(memory, Call(), ALL).trajectory.totals.distance_m
+    right = driven_inside(memory, Call(), ALL, where={"x": [2, 6], "y": [-1, 4]})
+    assert found.distance_m + right.distance_m == pytest.approx(whole, rel=0.02)
+
+
+def test_a_reply_has_the_visits_and_where_each_was_entered(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 3, seconds=200)
+    memory = in_places(memory_of(tmp_path))
+    span = {"start": BEGIN / S, "end": BEGIN / S + 1000}
+    reply = asked(memory, tmp_path, "trajectory_summary", where="Left half", **span)
+    there = asked(memory, tmp_path, "visits", where="left half", limit=100, **span)
+    assert reply["where"] == "left half"
+    assert reply["visits"] == there["total"] > 2
+    assert reply["duration_s"] / 60 == pytest.approx(there["minutes"], abs=0.01)
+    assert reply["avg_speed"] == pytest.approx(reply["distance_m"] / reply["duration_s"], abs=1e-3)
+    assert sum(point.get("entered", False) for point in reply["waypoints"]) == there["total"]
+    none = asked(memory, tmp_path, "trajectory_summary", where=LEFT, max_waypoints=0, **span)
+    assert none["waypoints"] == []
+    assert none["distance_m"] == reply["distance_m"]
+    never = {"x": 90, "y": 90, "radius_m": 1}
+    nowhere = asked(memory, tmp_path, "trajectory_summary", where=never, **span)
+    assert (nowhere["visits"], nowhere["distance_m"], nowhere["start"]) == (0, 0, None)
+    by = asked(memory, tmp_path, "trajectory_summary", where=never, by="day", **span)
+    assert by["error"] == "invalid_arguments"
+
+
+def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 3, seconds=60)
+    memory = memory_of(tmp_path)
+    span = {"start": BEGIN / S, "end": BEGIN / S + 1000}
+    own = asked(memory, tmp_path, "trajectory_summary", **span)
+    moved = asked(memory, tmp_path, "trajectory_summary", frame_id="map", **span)
+    inside = asked(memory, tmp_path, "trajectory_summary", where=LEFT, frame_id="map", **span)
+    assert own["frame_id"] == "odom"
+    assert moved["frame_id"] == inside["frame_id"] == "map"
+    assert moved["distance_m"] == own["distance_m"]
+    # Before the first correction no transform leads to the map.
+    times = [each["timestamp"] for each in own["waypoints"]]
+    assert [each["timestamp"] for each in moved["waypoints"]] == times[1:]
+    assert "1 waypoint left out: no transform leads to map at that time" in moved["notes"]
+    for each in moved["waypoints"][::4]:
+        there = asked(
+            memory, tmp_path, "get_position_at", timestamp=each["timestamp"], frame_id="map"
+        )
+        for name in ("x", "y", "yaw_deg"):
+            assert each[name] == pytest.approx(there[name], abs=0.01)
+    assert all(-1.1 <= each["x"] <= 2.1 for each in inside["waypoints"])
+    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
+        trajectory_summary(memory, Call(), ALL, frame_id="moon")
+
+
+def test_the_metres_of_a_stop_are_none_and_speeds_are_those_inside(tmp_path: Path) -> None:
+    """Drives 1 m/s to x = 10, stands there for 10 s, and drives on at 0.2 m/s."""
+    messages = []
+    for step in range(300):
+        seconds = step / 10
+        x = min(seconds, 10.0) + max(0.0, seconds - 20.0) * 0.2
+        messages.append(odom(BEGIN + step * S // 10, x, 0.0))
+    write_mcap(tmp_path / "bag.mcap", messages)
+    memory = memory_of(tmp_path)
+
+    def between(low: float, high: float) -> tuple[float, float]:
+        found = driven_inside(memory, Call(), ALL, where={"x": [low, high], "y": [-1, 1]})
+        return found.distance_m, found.max_speed
+
+    assert between(2, 6) == pytest.approx((4.0, 1.0), abs=0.02)
+    assert between(10, 11) == pytest.approx((1.0, 0.2), abs=0.05)
+    assert between(9, 12) == pytest.approx((2.98, 1.0), abs=0.05)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 10_000), part=st.sampled_from([0.3, 1.0]), moving=st.booleans())
+def test_what_was_driven_inside_is_the_same_whatever_the_catalogue_knows(
+    seed: int, part: float, moving: bool
+) -> None:
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        if moving:
+            write_moving_map(bag_dir, seed, seconds=60)
+        else:
+            write_history(bag_dir, random.Random(seed))
+        memory = in_places(memory_of(bag_dir))
+        known = recalling(memory, bag_dir, part=part)
+        for frame in ({}, {"frame_id": "map"}):
+            arguments = {"start": 0, "end": 4e9, "where": {"x": [-1, 1], "y": [-1, 1]}, **frame}
+            assert asked(memory, bag_dir, "trajectory_summary", **arguments) == asked(
+                known, bag_dir, "trajectory_summary", **arguments
+            )
