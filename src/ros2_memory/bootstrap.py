@@ -35,7 +35,7 @@ from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.retention.repair import Repairer
-    from ros2_memory.serving.backfill import Backfill
+    from ros2_memory.serving.backfill import Backfill, Progress
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
 
@@ -360,9 +360,12 @@ def build_dispatcher(
 
 
 def build_server(
-    settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
+    settings: Settings,
+    memory: Memory,
+    telemetry: Telemetry = SILENT,
+    catalogue: Callable[[], Progress] | None = None,
 ) -> EpisodicServer:
-    """Returns the MCP server that answers from a memory."""
+    """Returns the MCP server that answers from a memory; `catalogue`: how far that is filled."""
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.tools.instructions import instructions
 
@@ -372,6 +375,7 @@ def build_server(
         name=server.name,
         version=package_version(),
         instructions=instructions(memory.limits, additions=server.tools == "all"),
+        catalogue=catalogue,
     )
 
 

@@ -676,6 +676,14 @@ class MomentList:
     now: Ns
 
 
+@dataclass(frozen=True, slots=True)
+class ShownMoment:
+    """One saved moment; `now` is what "ago" counts from."""
+
+    stored: StoredMoment
+    now: Ns
+
+
 BinColumn: TypeAlias = Literal["count", "duration", "metres", "number", "time"]
 """What the values of a column are: whole numbers, nanoseconds, metres, plain numbers, log times."""
 
@@ -719,4 +727,6 @@ class Bins(AnswerWithNotes):
     usual: Usual | None = None
 
 
-Answer: TypeAlias = AnswerWithNotes | tuple[TopicRow, ...] | RememberedMoment | MomentList
+Answer: TypeAlias = (
+    AnswerWithNotes | tuple[TopicRow, ...] | RememberedMoment | MomentList | ShownMoment
+)

@@ -94,8 +94,8 @@ def _run(overrides: Sequence[str]) -> None:
             token = take_token(os.environ, host=at.host, loopback=address.is_loopback)
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
-        server = build_server(settings, memory, telemetry)
     backfill = build_backfill(settings, memory)
+    server = build_server(settings, memory, telemetry, backfill.progress)
     health = Health(memory, package_version(), backfill)
     background = partial(
         _in_background, memory, backfill, settings.reader.index_refresh_s, overrides

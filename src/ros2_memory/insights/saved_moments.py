@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import time
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.request_queue import PendingRequest
-from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
+from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
 from ros2_memory.history.view import View
-from ros2_memory.results import MomentList, RememberedMoment
+from ros2_memory.results import MomentList, RememberedMoment, ShownMoment
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.request_queue import Outcome
@@ -74,6 +76,24 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
         return newest_moments(memory, _now(memory, call), MAX_LISTED)
     except OSError as error:
         raise RefusedError(unlisted(error)) from error
+
+
+def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
+    """Returns a saved moment by the name of its folder.
+
+    Raises:
+        InvalidArgumentsError: there is none of this name.
+        RefusedError: they cannot be listed.
+    """
+    try:
+        stored = {each.folder.name: each for each in stored_moments_in(memory.index.bag_dir)}
+    except OSError as error:
+        raise RefusedError(unlisted(error)) from error
+    if name not in stored:
+        near = get_close_matches(name, stored, n=3, cutoff=0.3)
+        hint = f"do you mean {' or '.join(near)}?" if near else f"{len(stored)} are kept"
+        raise InvalidArgumentsError(f"no moment {abbreviate(name)} is kept; {hint}")
+    return ShownMoment(stored[name], _now(memory, call))
 
 
 def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import itertools
+import json
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import unquote
 
+import anyio
+import anyio.to_thread
+from mcp.server.caching import CacheHint
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
 from mcp.server.mcpserver.exceptions import ResourceNotFoundError
@@ -12,11 +19,16 @@ from mcp.shared.exceptions import MCPError
 from mcp.types import (
     INVALID_PARAMS,
     CallToolResult,
+    Completion,
+    CompletionArgument,
+    CompletionContext,
     GetPromptResult,
     Prompt,
     PromptMessage,
+    PromptReference,
     Resource,
     ResourceTemplate,
+    ResourceTemplateReference,
     TextContent,
     ToolAnnotations,
 )
@@ -26,9 +38,12 @@ from starlette.requests import Request
 from ros2_memory.tools.instructions import PROMPT
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping
+
+    from mcp.server.caching import CacheableMethod
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
 
@@ -67,6 +82,20 @@ TOOLS_OF_RESOURCES: Final = {
     MOMENTS.uri: "list_moments",
 }
 """The tools whose replies are the text of the resources."""
+_Report: TypeAlias = "Callable[[float, float | None, str | None], Awaitable[None]]"
+
+LISTS_CACHED: Final = CacheHint(ttl_ms=3_600_000, scope="public")
+"""Lists are the same for every client, and change with the configuration alone."""
+_LISTS: Final[tuple[CacheableMethod, ...]] = (
+    "server/discover",
+    "tools/list",
+    "prompts/list",
+    "resources/list",
+    "resources/templates/list",
+)
+_MAX_COMPLETED: Final = 100
+PROGRESS_EVERY_S: Final = 1.0
+
 _SCHEMA_PREFIX: Final = "episodic://schema/"
 SCHEMA: Final = ResourceTemplate(
     uri_template=f"{_SCHEMA_PREFIX}{{type}}",
@@ -75,6 +104,23 @@ SCHEMA: Final = ResourceTemplate(
     "nav_msgs/msg/Odometry.",
     mime_type=_JSON,
 )
+_MOMENT_PREFIX: Final = "episodic://moments/"
+MOMENT: Final = ResourceTemplate(
+    uri_template=f"{_MOMENT_PREFIX}{{id}}",
+    name="moment",
+    description="One moment that remember_moment kept, by its name in episodic://moments.",
+    mime_type=_JSON,
+)
+_TEMPLATES: Final = {
+    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type"),
+    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment"),
+}
+"""By prefix: the template, the tool whose reply is the text, and its argument."""
+_VALUES: Final = {
+    SCHEMA.uri_template: ("list_recorded_topics", "type"),
+    MOMENT.uri_template: ("list_moments", "moment"),
+}
+"""The values that a template's parameter can have: the tool whose rows have them, and their key."""
 
 
 class EpisodicServer(MCPServer[object]):
@@ -85,14 +131,30 @@ class EpisodicServer(MCPServer[object]):
     """
 
     def __init__(
-        self, dispatcher: Dispatcher, *, name: str, version: str, instructions: str
+        self,
+        dispatcher: Dispatcher,
+        *,
+        name: str,
+        version: str,
+        instructions: str,
+        catalogue: Callable[[], Progress] | None = None,
     ) -> None:
-        super().__init__(name, version=version, instructions=instructions)
+        """Makes the server; `catalogue` says how far the catalogue is filled."""
+        super().__init__(
+            name,
+            version=version,
+            instructions=instructions,
+            # No list changes while the server runs, and nobody is notified of anything.
+            subscriptions=False,
+            cache_hints=dict.fromkeys(_LISTS, LISTS_CACHED),
+        )
+        self.completion()(self._complete)  # type: ignore[no-untyped-call]  # of the SDK
+        self._catalogue = catalogue
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
         self._resources = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
-        self._templates = [SCHEMA] if has_status else []
+        self._templates = [each[0] for each in _TEMPLATES.values()] if has_status else []
         self._prompt = f"{instructions}\n{PROMPT}"
 
     async def list_tools(self) -> list[ListedTool]:
@@ -102,18 +164,36 @@ class EpisodicServer(MCPServer[object]):
     async def call_tool(
         self, name: str, arguments: Mapping[str, object], context: object | None = None
     ) -> CallToolResult:
-        """Returns a call's reply as one text block. Raises nothing but cancellation."""
-        reply = await self.dispatcher.answer(name, arguments, _client(context))
+        """Returns a call's reply as one text block. Raises nothing but cancellation.
+
+        A client that asks for progress receives it every `PROGRESS_EVERY_S` until then.
+        """
+        async with anyio.create_task_group() as tasks:
+            if isinstance(context, Context) and "progress_token" in (
+                context.request_context.meta or {}
+            ):
+                tasks.start_soon(self._report_progress, context.report_progress)
+            reply = await self.dispatcher.answer(name, arguments, _client(context))
+            tasks.cancel_scope.cancel()
         return CallToolResult(
             content=[TextContent(type="text", text=reply.text)], is_error=reply.is_error
         )
+
+    async def _report_progress(self, report: _Report) -> None:
+        """Reports the seconds of a call, and how far the catalogue is filled, until cancelled."""
+        filling = Filling(self._catalogue)
+        for elapsed_s in itertools.count(1):
+            await anyio.sleep(PROGRESS_EVERY_S)
+            message = await anyio.to_thread.run_sync(filling.sentence, abandon_on_cancel=True)
+            with suppress(anyio.ClosedResourceError, anyio.BrokenResourceError):
+                await report(elapsed_s, None, message)
 
     async def list_resources(self) -> list[Resource]:
         """Returns the resources that have no parameter."""
         return self._resources
 
     async def list_resource_templates(self) -> list[ResourceTemplate]:
-        """Returns the template of the resources of message types."""
+        """Returns the templates of the resources of message types and of saved moments."""
         return self._templates
 
     async def read_resource(
@@ -132,14 +212,36 @@ class EpisodicServer(MCPServer[object]):
 
     def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
         """Returns the tool of a resource, and its arguments."""
-        if self._templates and uri.startswith(_SCHEMA_PREFIX) and uri != _SCHEMA_PREFIX:
-            return "describe_type", {"type": unquote(uri.removeprefix(_SCHEMA_PREFIX))}
+        for prefix, (template, tool, argument) in _TEMPLATES.items():
+            if template in self._templates and uri.startswith(prefix) and uri != prefix:
+                return tool, {argument: unquote(uri.removeprefix(prefix))}
         offered = [each.uri for each in self._resources]
         if uri in offered:
             return TOOLS_OF_RESOURCES[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
         known = ", ".join([*offered, *(each.uri_template for each in self._templates)])
         raise ResourceNotFoundError(f"there is no resource {shown}; what can be read: {known}")
+
+    async def _complete(
+        self,
+        reference: PromptReference | ResourceTemplateReference,
+        argument: CompletionArgument,
+        _context: CompletionContext | None,
+    ) -> Completion | None:
+        """Returns what a template's parameter can be, as far as it has been typed."""
+        of = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
+        if of not in _VALUES:
+            return None
+        tool, key = _VALUES[of]
+        reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
+        rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
+        typed = argument.value.casefold()
+        values = sorted({str(row[key]) for row in rows if typed in str(row[key]).casefold()})
+        return Completion(
+            values=values[:_MAX_COMPLETED],
+            total=len(values),
+            has_more=len(values) > _MAX_COMPLETED,
+        )
 
     async def list_prompts(self) -> list[Prompt]:
         """Returns the one prompt."""
@@ -163,6 +265,31 @@ class EpisodicServer(MCPServer[object]):
         return GetPromptResult(
             description=_PROMPT_DESCRIPTION, messages=[PromptMessage(role="user", content=text)]
         )
+
+
+class Filling:
+    """How far the catalogue is filled, and at what rate it was during one call."""
+
+    def __init__(
+        self,
+        catalogue: Callable[[], Progress] | None,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._catalogue = catalogue
+        self._monotonic = monotonic
+        self._first: tuple[float, int] | None = None
+
+    def sentence(self) -> str | None:
+        """Returns e.g. `catalogue 40 %, about 20 s`; None where nothing is missing of it."""
+        now = None if self._catalogue is None else self._catalogue()
+        if now is None or not now.waiting:
+            return None
+        at_s = self._monotonic()
+        begun_s, waited = self._first = self._first or (at_s, now.waiting)
+        done = f"catalogue {100 * (now.closed - now.waiting) // max(now.closed, 1)} %"
+        if now.waiting >= waited:
+            return done
+        return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s"
 
 
 def _client(context: object) -> Hashable:

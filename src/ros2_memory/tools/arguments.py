@@ -453,6 +453,12 @@ class TypeArguments(Arguments):
     type_name: Annotated[_Name, Field(alias="type", examples=["nav_msgs/msg/Odometry"])]
 
 
+class MomentArguments(Arguments):
+    """A saved moment."""
+
+    name: Annotated[_Name, Field(alias="moment")]
+
+
 class VisitsArguments(Arguments):
     """A place in the plane."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.insights.compare import compare
 from ros2_memory.insights.recap import recap_or_before
-from ros2_memory.insights.saved_moments import list_moments, remember_moment
+from ros2_memory.insights.saved_moments import list_moments, remember_moment, show_moment
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status
 from ros2_memory.insights.type_fields import describe_type
@@ -14,6 +14,7 @@ from ros2_memory.things.find import find_things
 from ros2_memory.tools.arguments import (
     CompareArguments,
     MatchesArguments,
+    MomentArguments,
     NoArguments,
     RecapTime,
     SaveMomentArguments,
@@ -94,6 +95,12 @@ MOMENTS = ToolDeclaration(
     NoArguments,
     list_moments,
 )
+MOMENT = ToolDeclaration(
+    (ToolName("show_moment", "A kept moment"),),
+    "One moment kept by remember_moment.",
+    MomentArguments,
+    show_moment,
+)
 _SAVE_MOMENT = ToolDeclaration(
     (ToolName("remember_moment", "Keep a moment"),),
     "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
@@ -105,5 +112,5 @@ _SAVE_MOMENT = ToolDeclaration(
 )
 DECLARATIONS = (_SIGHTINGS, _THINGS, _COMPARE, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
 """The tools, in the order in which clients see them."""
-READABLE = (TYPE, MOMENTS)
+READABLE = (TYPE, MOMENTS, MOMENT)
 """What is read as a resource, and is no tool."""

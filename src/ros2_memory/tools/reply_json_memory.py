@@ -196,6 +196,12 @@ def _stored_moments(answer: results.MomentList) -> JsonObject:
     return reply
 
 
+@render.register(results.ShownMoment)
+def _shown_moment(answer: results.ShownMoment) -> JsonObject:
+    begun = answer.stored.moment.request.start
+    return _stored(answer.stored, answer.now, LocalTimes(begun, answer.now))
+
+
 def _stored(stored: StoredMoment, now: Ns, local: LocalTimes) -> JsonObject:
     saved = stored.moment
     reply: JsonObject = {

@@ -5,24 +5,47 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
+import anyio
 import pytest
 from mcp import Client
 from mcp.shared.exceptions import MCPError
-from mcp.types import INVALID_PARAMS, TextContent, TextResourceContents
+from mcp.types import (
+    INVALID_PARAMS,
+    PromptReference,
+    ResourceTemplateReference,
+    TextContent,
+    TextResourceContents,
+)
 
+from ros2_memory.bag_dir.moment_file import (
+    SavedMoment,
+    SaveRequest,
+    make_moment_folder,
+    write_saved_moment,
+)
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.serving.backfill import Progress
+from ros2_memory.serving.mcp_server import Filling
 from tests.support.robot_run import write_run
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.config import Settings
     from ros2_memory.serving.mcp_server import EpisodicServer
+
+T0 = 1_795_161_600 * NS_PER_S
+
+
+def settings_of(bag_dir: Path, *overrides: str) -> Settings:
+    given = (f"recording.bag_dir={bag_dir}", "recorder=none", "data.now=latest", *overrides)
+    return load_settings(given, {})
 
 
 def server(bag_dir: Path, *overrides: str) -> EpisodicServer:
-    given = (f"recording.bag_dir={bag_dir}", "recorder=none", "data.now=latest", *overrides)
-    settings = load_settings(given, {})
+    settings = settings_of(bag_dir, *overrides)
     return build_server(settings, build_memory(settings))
 
 
@@ -60,8 +83,11 @@ async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
 async def test_the_fields_of_a_type_are_a_resource(tmp_path: Path) -> None:
     write_run(tmp_path)
     async with Client(server(tmp_path)) as client:
-        [template] = (await client.list_resource_templates()).resource_templates
-        assert template.uri_template == "episodic://schema/{type}"
+        templates = (await client.list_resource_templates()).resource_templates
+        assert [each.uri_template for each in templates] == [
+            "episodic://schema/{type}",
+            "episodic://moments/{id}",
+        ]
         reply = await read(client, "episodic://schema/nav_msgs/msg/Odometry")
         assert reply["topics"] == ["/odom"]
         assert reply["fields"]["position.x"] == "number"
@@ -143,3 +169,108 @@ async def test_with_the_specifications_tools_alone_nothing_speaks_of_the_others(
         ]
         assert (await client.list_resource_templates()).resource_templates == []
         assert "find_matches" not in (client.instructions or "")
+
+
+async def test_nothing_is_declared_that_never_comes(tmp_path: Path) -> None:
+    async with Client(server(tmp_path)) as client:
+        declared = client.server_capabilities
+    assert declared.resources is not None
+    assert declared.tools is not None
+    assert declared.prompts is not None
+    assert not declared.resources.subscribe
+    assert not declared.resources.list_changed
+    assert not declared.tools.list_changed
+    assert not declared.prompts.list_changed
+
+
+async def test_lists_may_be_cached_and_shared_and_what_is_read_may_not(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    async with Client(server(tmp_path)) as client:
+        lists: list[Any] = [
+            await client.list_tools(),
+            await client.list_prompts(),
+            await client.list_resources(),
+            await client.list_resource_templates(),
+        ]
+        status = await client.read_resource("episodic://status")
+    assert {(each.cache_scope, each.ttl_ms) for each in lists} == {("public", 3_600_000)}
+    assert (status.cache_scope, status.ttl_ms) == ("private", 0)
+
+
+def keep(bag_dir: Path, label: str) -> str:
+    request = SaveRequest("0" * 32, label, T0, T0 + NS_PER_S, T0 + NS_PER_S)
+    folder = make_moment_folder(bag_dir, request)
+    write_saved_moment(folder, SavedMoment(request, pending=False))
+    return folder.name
+
+
+async def test_one_moment_is_a_resource(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    name = keep(tmp_path, "spilled coffee")
+    async with Client(server(tmp_path)) as client:
+        shown = await read(client, f"episodic://moments/{name}")
+        [listed] = (await read(client, "episodic://moments"))["moments"]
+        assert shown == listed
+        assert (shown["moment"], shown["label"]) == (name, "spilled coffee")
+        refused = await read(client, "episodic://moments/spilt-coffee")
+    assert refused["error"] == "invalid_arguments"
+    assert name in refused["detail"]
+
+
+async def test_parameters_of_templates_are_completed(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    name = keep(tmp_path, "spilled coffee")
+    schema = ResourceTemplateReference(uri="episodic://schema/{type}")
+    moment = ResourceTemplateReference(uri="episodic://moments/{id}")
+    other = PromptReference(name="use_memory")
+    async with Client(server(tmp_path)) as client:
+        typed = await client.complete(schema, {"name": "type", "value": "odom"})
+        assert typed.completion.values == ["nav_msgs/msg/Odometry"]
+        assert (typed.completion.total, typed.completion.has_more) == (1, False)
+        kept = await client.complete(moment, {"name": "id", "value": ""})
+        assert kept.completion.values == [name]
+        assert (await client.complete(other, {"name": "x", "value": ""})).completion.values == []
+
+
+async def test_a_client_that_asks_for_progress_receives_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The call waits for a first report, so it cannot be faster than one."""
+    write_run(tmp_path)
+    monkeypatch.setattr("ros2_memory.serving.mcp_server.PROGRESS_EVERY_S", 0.001)
+    states = iter([Progress(10, 6, 0), *[Progress(10, 4, 0)] * 100_000])
+    asked = build_server(
+        settings_of(tmp_path), build_memory(settings_of(tmp_path)), catalogue=lambda: next(states)
+    )
+    reported: list[tuple[float, float | None, str | None]] = []
+    was_reported = anyio.Event()
+    answer = asked.dispatcher.answer
+
+    async def late(*args: Any, **options: Any) -> Any:
+        await was_reported.wait()
+        return await answer(*args, **options)
+
+    async def note(progress: float, total: float | None, message: str | None) -> None:
+        reported.append((progress, total, message))
+        if len(reported) == 2:
+            was_reported.set()
+
+    monkeypatch.setattr(asked.dispatcher, "answer", late)
+    async with Client(asked) as client:
+        with anyio.fail_after(60):
+            await client.call_tool(
+                "list_frames", {}, progress_callback=note, meta={"progress_token": 0}
+            )
+    assert [each[0] for each in reported[:2]] == [1, 2]
+    assert reported[0][2] == "catalogue 40 %"
+    assert str(reported[1][2]).startswith("catalogue 60 %, about ")
+
+
+def test_how_long_the_catalogue_takes_is_told_from_its_rate() -> None:
+    states = iter([Progress(100, 60, 0), Progress(100, 40, 0), Progress(100, 0, 0)])
+    times = iter([10.0, 12.0])
+    filling = Filling(lambda: next(states), lambda: next(times))
+    assert filling.sentence() == "catalogue 40 %"
+    assert filling.sentence() == "catalogue 60 %, about 4 s"
+    assert filling.sentence() is None
+    assert Filling(None).sentence() is None
