@@ -13,7 +13,14 @@ import pytest
 
 from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.mcp_server import MOMENTS, SCHEMA, STATUS, TOOLS_OF_RESOURCES, TOPICS
+from ros2_memory.serving.mcp_server import (
+    MOMENT,
+    MOMENTS,
+    SCHEMA,
+    STATUS,
+    TOOLS_OF_RESOURCES,
+    TOPICS,
+)
 from ros2_memory.tools.spec_tools import build_tools
 from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
@@ -90,7 +97,8 @@ def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
     documented = dict(
         re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE)
     )
-    assert set(documented) == {TOPICS.uri, STATUS.uri, MOMENTS.uri, SCHEMA.uri_template}
+    templates = {MOMENT.uri_template, SCHEMA.uri_template}
+    assert set(documented) == {TOPICS.uri, STATUS.uri, MOMENTS.uri} | templates
     assert set(TOOLS_OF_RESOURCES) == {TOPICS.uri, STATUS.uri, MOMENTS.uri}
     for uri, tool in TOOLS_OF_RESOURCES.items():
         if uri != MOMENTS.uri:
