@@ -482,10 +482,14 @@ class Visit:
 
 @dataclass(frozen=True, slots=True)
 class PlaceVisits:
-    """How often and how long the robot was in a named place: entries, the first and the last."""
+    """How long the robot was in a named place, and how often it was seen to enter and to leave.
+
+    `first` is the first entry, `last` the last exit; None without one.
+    """
 
     place: str
     entries: int
+    exits: int
     duration: Ns
     first: Ns | None
     last: Ns | None
@@ -500,6 +504,8 @@ class Visits(AnswerWithNotes):
         x: of a circle, with y and radius_m; None of another region.
         total: how many were found; a note says so where there may be more.
         duration: of all of these.
+        entries: in how many of them the robot was seen to enter; None where that is not known.
+        exits: likewise, to leave.
         places: of every named place, where none was asked for; then there are no visits.
     """
 
@@ -512,6 +518,8 @@ class Visits(AnswerWithNotes):
     total: int
     now: Ns
     duration: Ns = 0
+    entries: int | None = None
+    exits: int | None = None
     where: str | None = None
     places: tuple[PlaceVisits, ...] | None = None
 
@@ -684,8 +692,9 @@ class ShownMoment:
     now: Ns
 
 
-BinColumn: TypeAlias = Literal["count", "duration", "metres", "number", "time"]
-"""What the values of a column are: whole numbers, nanoseconds, metres, plain numbers, log times."""
+BinColumn: TypeAlias = Literal["count", "duration", "minutes", "metres", "number", "time"]
+"""What the values of a column are: whole numbers, nanoseconds (shown in seconds, or in minutes),
+metres, plain numbers, log times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -715,6 +724,7 @@ class Bins(AnswerWithNotes):
         rows: for each bin its name and its values; None where there is none.
         all: the values of all bins together.
         usual: the usual time of the first beginning in a day, where beginnings are counted.
+        usual_exit: of the first exit in a day, where visits are counted.
     """
 
     by: str
@@ -725,6 +735,7 @@ class Bins(AnswerWithNotes):
     rows: tuple[tuple[str, tuple[float | None, ...]], ...]
     all: tuple[float | None, ...]
     usual: Usual | None = None
+    usual_exit: Usual | None = None
 
 
 Answer: TypeAlias = (

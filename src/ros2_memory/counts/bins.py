@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
 
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps, unix_text
 from ros2_memory.history.no_data import no_data_between
@@ -15,23 +16,34 @@ from ros2_memory.results import Bins, Usual
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.time_bins import Held, TimeBins
     from ros2_memory.history.view import View
     from ros2_memory.results import BinColumn
 
-By: TypeAlias = Literal["day", "hour", "weekday"]
+By: TypeAlias = Literal["day", "hour", "weekday", "place"]
 Values: TypeAlias = "Sequence[float | None]"
+
+
+MOST_CELLS: Final = 124
+"""Fields, or places, of all bins together that one reply has room for."""
 
 
 class BinnedWindow:
     """A window of the memory, cut into bins, to which columns of values are added.
 
+    Attributes:
+        window: the part of it that the memory reaches.
+        bins: its bins.
+        gaps: when nothing was recorded in it.
+        usual: when something usually began first in a day, if that is counted.
+        usual_exit: when the robot usually left first in a day, likewise.
+
     Raises:
-        InvalidArgumentsError: there are too many bins.
-        NoDataError: nothing of the window was recorded.
+        InvalidArgumentsError: there are too many bins, or there is no named place.
+        NoDataError: nothing of the window was recorded, or no poses for bins of places.
     """
 
     def __init__(self, view: View, asked: TimeWindow, by: By, topics: Sequence[str]) -> None:
@@ -47,16 +59,21 @@ class BinnedWindow:
             raise no_data_between(view, self._topics, asked)
         # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
         self.window = TimeWindow(start, max(end, start + 1))
-        self.bins: TimeBins = time_bins(self.window, by)
+        self.bins: TimeBins = (
+            place_bins(view, self.window) if by == "place" else time_bins(self.window, by)
+        )
         self._columns: list[tuple[str, BinColumn]] = []
         self._values: list[Values] = []
         self._all: list[float | None] = []
-        self._usual: Usual | None = None
+        self.usual: Usual | None = None
+        self.usual_exit: Usual | None = None
         self.gaps = list(recording_gaps(view, self.window))
-        self._recorded = self._lengths([(self.window.start, self.window.stop)]) - self._lengths(
-            self.gaps
+        whole = [(self.window.start, self.window.stop)]
+        recorded = self._lengths(whole) - self._lengths(self.gaps)
+        total = sum(stop - start for start, stop in whole) - sum(
+            stop - start for start, stop in self.gaps
         )
-        self.add("recorded_s", "duration", self._recorded.tolist(), int(self._recorded.sum()))
+        self.add("recorded_s", "duration", recorded.tolist(), total)
 
     def add(self, name: str, kind: BinColumn, values: Values, whole: float | None) -> None:
         """Adds a column, and its value for all bins together."""
@@ -77,38 +94,55 @@ class BinnedWindow:
                 heard[-1] = (heard[-1][0], max(heard[-1][1], last))
             else:
                 heard.append((first, last))
-        lengths = self._lengths(heard)
-        self.add(column, "duration", lengths.tolist(), int(lengths.sum()))
+        self.add_lengths(column, "duration", heard)
+
+    def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[tuple[Ns, Ns]]) -> None:
+        """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""
+        start, stop = self._ends
+        inside = [(max(begin, start), min(end, stop)) for begin, end in spans]
+        total = sum(max(end - begin, 0) for begin, end in inside)
+        self.add(column, kind, self._lengths(spans).tolist(), total)
+
+    def add_counts(self, column: str, times: ArrayLike) -> None:
+        """Adds how many of these times each bin has."""
+        counts = self.bins.among(times).sum(axis=0)
+        self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
     def add_held(self, held: Held) -> None:
         """Adds how often something began, how long it held, and its first and last time."""
-        starts, stops = (np.clip(each, *self._ends) for each in (held.starts, held.stops))
-        size = len(self.bins.names)
+        starts, stops = held.starts.clip(*self._ends), held.stops.clip(*self._ends)
         begins = starts[held.begun]
-        counts = np.bincount(self.bins.bins(begins), minlength=size) if len(begins) else [0] * size
-        self.add("count", "count", [int(each) for each in counts], len(begins))
-        lengths = self._lengths(list(zip(starts.tolist(), stops.tolist(), strict=True)))
-        self.add("seconds", "duration", lengths.tolist(), int(lengths.sum()))
-        first = _least(self.bins.bins(begins), begins, size)
-        self.add("first", "time", first, min(begins.tolist(), default=None))
+        self.add_counts("count", begins)
+        self.add_lengths(
+            "seconds", "duration", list(zip(starts.tolist(), stops.tolist(), strict=True))
+        )
+        self.add_first("first", begins)
         last = self._last_held(starts, stops)
         self.add("last", "time", last, max(stops.tolist(), default=None))
-        self._usual = self._usual_first(begins)
+        self.usual = self.usual_of(begins)
+
+    def add_first(self, column: str, times: NDArray[np.int64]) -> None:
+        """Adds the first of these times in each bin."""
+        among = self.bins.among(times)
+        first = [int(times[each].min()) if each.any() else None for each in among.T]
+        self.add(column, "time", first, min(times.tolist(), default=None))
 
     def _last_held(self, starts: NDArray[np.int64], stops: NDArray[np.int64]) -> Values:
         """Returns for each bin when something held there for the last time."""
         found: list[float | None] = [None] * len(self.bins.names)
+        members = [np.flatnonzero(each).tolist() for each in self.bins.member]
         begin, end = self.bins.pieces(starts), self.bins.pieces(stops)
         for at, (first, last) in enumerate(zip(begin.tolist(), end.tolist(), strict=True)):
             for piece in range(first, last + 1):
                 until = min(int(stops[at]), int(self.bins.edges[piece + 1]) - 1)
-                number = int(self.bins.bin_of[piece])
-                known = found[number]
-                found[number] = until if known is None else max(known, until)
+                for number in members[piece]:
+                    known = found[number]
+                    found[number] = until if known is None else max(known, until)
         return found
 
-    def _usual_first(self, begins: NDArray[np.int64]) -> Usual | None:
-        usual = usual_time(first_of_days(self.bins, begins)) if len(begins) else None
+    def usual_of(self, times: NDArray[np.int64]) -> Usual | None:
+        """Returns the usual time of day of the first of these times in each day."""
+        usual = usual_time(first_of_days(self.bins, times)) if len(times) else None
         if usual is None:
             return None
         recorded = self._days_recorded()
@@ -116,6 +150,8 @@ class BinnedWindow:
 
     def _days_recorded(self) -> int:
         """Returns how many local days have something recorded."""
+        if self.bins.day_of is None:
+            return 0
         edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
         found = set()
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
@@ -157,19 +193,11 @@ class BinnedWindow:
                 (name, tuple(values)) for name, values in zip(self.bins.names, rows, strict=True)
             ),
             all=tuple(self._all),
-            usual=self._usual,
+            usual=self.usual,
+            usual_exit=self.usual_exit,
             notes=self.view.notes.sentences(),
         )
 
 
 def _split_ns(view: View) -> Ns:
     return round(view.memory.limits.split_duration_s * 1e9)
-
-
-def _least(bins: NDArray[np.intp], times: NDArray[np.int64], size: int) -> list[float | None]:
-    """Returns the least time in each bin; None where there is none."""
-    found: list[float | None] = [None] * size
-    for number, at in zip(bins.tolist(), times.tolist(), strict=True):
-        known = found[number]
-        found[number] = at if known is None else min(known, at)
-    return found

@@ -8,23 +8,27 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.counts.bins import BinnedWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.field_extremes import numbers_in
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
+    from typing import TypeAlias
+
+    from numpy.typing import NDArray
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
-    from ros2_memory.results import Bins
+    from ros2_memory.results import BinColumn, Bins
 
-MOST_CELLS: Final = 124
-"""Fields of all bins together that one reply has room for."""
+    Times: TypeAlias = NDArray[np.int64]
+
 MOST_READ: Final = 4_000
 """Messages that are read; where there are more, as many evenly spaced ones."""
 
@@ -76,55 +80,55 @@ def count_range(
             "name fewer fields, or ask about a shorter window"
         )
     counts, first, last = _counted(view, name, binned)
-    if not any(counts):
+    if not counts.any():
         raise no_data_between(view, (name,), asked)
-    binned.add("count", "count", counts, sum(counts))
-    binned.add("first", "time", first, min(each for each in first if each is not None))
-    binned.add("last", "time", last, max(each for each in last if each is not None))
+    member = binned.bins.member
+    binned.add("count", "count", (counts @ member).tolist(), int(counts.sum()))
+    held = [counts.astype(bool) & each for each in member.T]
+    binned.add("first", "time", [_extreme(first[each], min) for each in held], first.min())
+    binned.add("last", "time", [_extreme(last[each], max) for each in held], last.max())
     if names:
         _add_numbers(view, name, binned, names)
     return binned.answer()
 
 
-def _counted(
-    view: View, topic: str, binned: BinnedWindow
-) -> tuple[list[int], list[float | None], list[float | None]]:
-    """Returns for each bin how many messages it holds, and when the first and the last came.
+def _extreme(times: Times, which: Callable[[Iterable[Ns]], Ns]) -> Ns | None:
+    return which(times.tolist()) if len(times) else None
+
+
+def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times, Times]:
+    """Returns for each piece how many messages it holds, and when the first and the last came.
 
     Messages are read where recordings overlap; the times of messages where a bag lies in several
-    bins.
+    pieces.
     """
-    size = len(binned.bins.names)
-    counts = [0] * size
-    first: list[float | None] = [None] * size
-    last: list[float | None] = [None] * size
+    size = len(binned.bins.member)
+    counts = np.zeros(size, np.int64)
+    first, last = np.full(size, MAX_NS), np.full(size, MIN_NS)
 
-    def add(number: int, count: int, begin: Ns, end: Ns) -> None:
-        counts[number] += count
-        known = first[number], last[number]
-        first[number] = begin if known[0] is None else min(known[0], begin)
-        last[number] = end if known[1] is None else max(known[1], end)
+    def add(piece: int, count: int, begin: Ns, end: Ns) -> None:
+        counts[piece] += count
+        first[piece] = min(first[piece], begin)
+        last[piece] = max(last[piece], end)
 
     for group in groups_of(view.stream, topic, binned.asked):
-        begin, end = (
-            min(each.first for each in group.bags),
-            max(each.last for each in group.bags),
-        )
+        begin = min(each.first for each in group.bags)
+        end = max(each.last for each in group.bags)
         pieces = binned.bins.pieces([begin, end])
         if group.is_inside and pieces[0] == pieces[1]:
-            add(int(binned.bins.bin_of[pieces[0]]), group.count(), begin, end)
+            add(int(pieces[0]), group.count(), begin, end)
             continue
         times = np.array(group.times(), np.int64)
-        for number in np.unique(found := binned.bins.bins(times)).tolist():
-            here = times[found == number]
-            add(number, len(here), int(here.min()), int(here.max()))
+        where = binned.bins.pieces(times)
+        for piece in np.unique(where).tolist():
+            here = times[where == piece]
+            add(piece, len(here), int(here.min()), int(here.max()))
     return counts, first, last
 
 
 def _add_numbers(view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]) -> None:
-    cells = {
-        (field, number): _Numbers() for field in fields for number in range(len(binned.bins.names))
-    }
+    bins = range(len(binned.bins.names))
+    cells = {field: [_Numbers() for _ in (*bins, "all")] for field in fields}
     total, chosen = view.pick(topic, binned.asked, MOST_READ)
     if len(chosen) < total:
         view.notes.add(
@@ -135,35 +139,29 @@ def _add_numbers(view: View, topic: str, binned: BinnedWindow, fields: Sequence[
         message = view.bags.decode(each)
         if message is None:
             continue
-        number = int(binned.bins.bins([each.time])[0])
+        [among] = binned.bins.among([each.time])
         for field in fields:
             value = view.memory.extractor.exact_at(message, each.record.channel.type, field)
             numbers = [*numbers_in(value)]
             if numbers:
-                cells[field, number].add(each.time, numbers)
+                for number in (*np.flatnonzero(among).tolist(), -1):
+                    cells[field][number].add(each.time, numbers)
     for field in fields:
-        _add_columns(
-            binned, field, [cells[field, number] for number in range(len(binned.bins.names))]
-        )
+        _add_columns(binned, field, cells[field])
 
 
 def _add_columns(binned: BinnedWindow, field: str, cells: Sequence[_Numbers]) -> None:
-    some = [each for each in cells if each.count]
-    if not some:
+    """Adds the columns of a field; the last cell is that of all bins together."""
+    if not cells[-1].count:
         binned.view.notes.add(f"{field} holds no number in the window")
         return
-    least, most = min(each.least for each in some), max(each.most for each in some)
-    mean = math.fsum(part for each in some for part in each.sums) / sum(each.count for each in some)
-
-    def column(value: int, kind: str) -> list[float | None]:
-        return [
-            None if not each.count else (each.least if kind == "min" else each.most)[value]
-            for each in cells
-        ]
-
-    binned.add(f"{field}.min", "number", column(0, "min"), least[0])
-    binned.add(f"{field}.min_at", "time", column(1, "min"), least[1])
-    binned.add(f"{field}.max", "number", column(0, "max"), most[0])
-    binned.add(f"{field}.max_at", "time", column(1, "max"), most[1])
-    means = [math.fsum(each.sums) / each.count if each.count else None for each in cells]
-    binned.add(f"{field}.mean", "number", means, mean)
+    columns: tuple[tuple[str, BinColumn, Callable[[_Numbers], float]], ...] = (
+        ("min", "number", lambda cell: cell.least[0]),
+        ("min_at", "time", lambda cell: cell.least[1]),
+        ("max", "number", lambda cell: cell.most[0]),
+        ("max_at", "time", lambda cell: cell.most[1]),
+        ("mean", "number", lambda cell: math.fsum(cell.sums) / cell.count),
+    )
+    for name, kind, of in columns:
+        *each, whole = [of(cell) if cell.count else None for cell in cells]
+        binned.add(f"{field}.{name}", kind, each, whole)

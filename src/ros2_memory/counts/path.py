@@ -7,6 +7,7 @@ window.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -93,8 +94,7 @@ def count_path(
             f"poses left out, since they cannot be decoded: {len(failures)} ({failures[0].reason})"
         )
     metres = _joined(folded.parts, binned.bins.edges, fastest)
-    totals = np.zeros(len(binned.bins.names))
-    np.add.at(totals, binned.bins.bin_of, metres)
+    totals = metres @ binned.bins.member
     binned.add("metres", "metres", totals.tolist(), float(metres.sum()))
     binned.note_since(folded.since)
     note_robots(view, name, asked)
@@ -107,8 +107,8 @@ def _driven(
     """Joins the digests of poses, and shares out what each of them adds."""
     motion = Motion(fastest_mps)
     first = found[0].first
-    inner = [edge for edge in edges if edge > first]
-    metres = [0.0] * (sum(edge <= found[-1].last for edge in inner) + 1)
+    inner = edges[bisect_right(edges, first) : bisect_right(edges, found[-1].last)]
+    metres = [0.0] * (len(inner) + 1)
     before = 0.0
     for digest, _, last in found:
         if digest.totals.head is not None:
@@ -116,8 +116,8 @@ def _driven(
         elif digest.vertices:
             motion.add([TimedPosition(each[0], each[1]) for each in digest.vertices])
         after = motion.totals.distance_m
-        piece = sum(edge <= _first_time(digest, last) for edge in inner)
-        cuts = [edge for edge in inner[piece:] if edge <= last]
+        piece = bisect_right(inner, _first_time(digest, last))
+        cuts = inner[piece : bisect_right(inner, last)]
         for at, share in enumerate(_shares(digest, cuts), piece):
             metres[min(at, len(metres) - 1)] += (after - before) * share
         before = after

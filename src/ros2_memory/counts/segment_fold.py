@@ -7,6 +7,7 @@ and reported.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
@@ -170,7 +171,7 @@ class SegmentFold(Generic[T, R]):
         return last - first > _SHORT_NS and self._piece(first) != self._piece(last)
 
     def _piece(self, at: Ns) -> int:
-        return sum(edge <= at for edge in self.edges)
+        return bisect_right(self.edges, at)
 
 
 class _Reading:

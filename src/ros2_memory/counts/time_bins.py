@@ -1,4 +1,4 @@
-"""Bins of local time: days, hours of the day and weekdays, and what of a span falls into each.
+"""Bins of time: days, hours of the day and weekdays in local time; what of a span falls into each.
 
 A window is cut where local days (or hours) begin; each piece belongs to one bin. Where clocks are
 changed, a day has 23 or 25 hours, the hour that is skipped has no piece, and the one that occurs
@@ -58,45 +58,51 @@ def local_offset(at_s: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class TimeBins:
-    """A window cut into pieces, each of which belongs to a bin.
+    """A window cut into pieces, each of which belongs to a bin, or to several.
 
     Attributes:
         names: of the bins, in order.
         edges: where pieces begin, and where the last one ends; they ascend.
-        bin_of: for each piece, the index of its bin.
-        day_of: for each piece, the number of its local day since the epoch.
+        member: for each piece and each bin, whether the piece belongs to the bin.
+        day_of: for each piece, the number of its local day since the epoch; None where pieces may
+            lie in several days.
     """
 
     names: tuple[str, ...]
     edges: NDArray[np.int64]
-    bin_of: NDArray[np.intp]
-    day_of: NDArray[np.int64]
+    member: NDArray[np.bool_]
+    day_of: NDArray[np.int64] | None
 
     def pieces(self, times: ArrayLike) -> NDArray[np.intp]:
         """Returns the piece of each time; times outside of the window count to its ends."""
         found = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
-        return np.clip(found, 0, len(self.bin_of) - 1)
+        return np.clip(found, 0, len(self.member) - 1)
 
-    def bins(self, times: ArrayLike) -> NDArray[np.intp]:
-        """Returns the bin of each time; times outside of the window count to its ends."""
-        return self.bin_of[self.pieces(times)]
+    def among(self, times: ArrayLike) -> NDArray[np.bool_]:
+        """Returns for each time and each bin whether it is in the bin; as `pieces` for others."""
+        return self.member[self.pieces(times)]
 
     def lengths(self, starts: ArrayLike, stops: ArrayLike) -> NDArray[np.int64]:
         """Returns how much (ns) of half-open spans falls into each bin, all spans together.
 
         What lies outside of the window does not count.
         """
-        begin, end = np.asarray(starts, np.int64), np.asarray(stops, np.int64)
-        piece_lengths = np.array(
-            [
-                np.maximum(np.minimum(end, stop) - np.maximum(begin, start), 0).sum()
-                for start, stop in zip(self.edges[:-1], self.edges[1:], strict=True)
-            ],
-            np.int64,
+        begin = np.asarray(starts, np.int64)
+        until = _passed(self.edges, begin) - _passed(
+            self.edges, np.maximum(begin, np.asarray(stops, np.int64))
         )
-        totals = np.zeros(len(self.names), np.int64)
-        np.add.at(totals, self.bin_of, piece_lengths)
-        return totals
+        return np.diff(until) @ self.member.astype(np.int64)
+
+
+def _passed(edges: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns for each edge how long ago the times before it were, added up.
+
+    Sums may wrap around; so do their differences, which are what is wanted.
+    """
+    ordered = np.sort(times)
+    before = np.searchsorted(ordered, edges)
+    sums = np.concatenate((np.zeros(1, np.int64), np.cumsum(ordered)))
+    return before.astype(np.int64) * edges - sums[before]
 
 
 def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -> TimeBins:
@@ -127,7 +133,7 @@ def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -
     return TimeBins(
         tuple(_name(key, by) for key in known),
         np.array([*starts, window.stop], np.int64),
-        np.searchsorted(np.array(known), np.array(keys)),
+        np.array(keys)[:, None] == np.array(known),
         np.array(days, np.int64),
     )
 
@@ -210,7 +216,12 @@ class UsualTime:
 
 
 def first_of_days(bins: TimeBins, times: ArrayLike) -> list[Ns]:
-    """Returns the first of these times in each local day that has one, in order."""
+    """Returns the first of these times in each local day that has one, in order.
+
+    None of bins whose pieces may lie in several days.
+    """
+    if bins.day_of is None:
+        return []
     ordered = np.sort(np.asarray(times, np.int64))
     days = bins.day_of[bins.pieces(ordered)]
     _, first = np.unique(days, return_index=True)

@@ -99,6 +99,20 @@ def _closest(track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]
     return float(min(off[where], circle.radius_m)), at
 
 
+def places_in(view: View, places: Sequence[Place], frame_id: str) -> list[Place]:
+    """Returns the places of a frame; notes name the others."""
+    found: list[Place] = []
+    for place in places:
+        if place.frame_id == frame_id:
+            found.append(place)
+        else:
+            view.notes.add(
+                f"{place.name} is left out: it is in {place.frame_id}, and these places are in "
+                f"{frame_id}"
+            )
+    return found
+
+
 def place_visits(
     view: View, places: Sequence[Place], frame_id: str, window: TimeWindow
 ) -> tuple[PlaceVisits, ...]:
@@ -108,21 +122,18 @@ def place_visits(
     """
     track = track_in(view, frame_id, window)
     found: list[PlaceVisits] = []
-    for place in places:
-        if place.frame_id != frame_id:
-            view.notes.add(
-                f"{place.name} is left out: it is in {place.frame_id}, and these places are in "
-                f"{frame_id}"
-            )
-            continue
+    for place in places_in(view, places, frame_id):
         inside = robot_inside(track, place.region, window)
+        entries = [each.start for each in inside if each.entered]
+        exits = [each.stop for each in inside if each.left]
         found.append(
             PlaceVisits(
                 place=place.name,
-                entries=len(inside),
+                entries=len(entries),
+                exits=len(exits),
                 duration=sum(each.stop - each.start for each in inside),
-                first=inside[0].start if inside else None,
-                last=inside[-1].stop if inside else None,
+                first=entries[0] if entries else None,
+                last=exits[-1] if exits else None,
             )
         )
     return tuple(sorted(found, key=lambda each: (-each.duration, each.place)))

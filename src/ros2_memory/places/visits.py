@@ -91,7 +91,7 @@ def visits(
         NoDataError: the memory holds nothing, or no poses.
         QueryTimeoutError: the call's time is over before anything is known.
     """
-    place = _place(memory.limits, (x, y), radius_m, where)
+    place = asked_place(memory.limits, (x, y), radius_m, where)
     wall = memory.clock.now()
     view = open_view(memory, call, wall)
     window = search_window(TimeRange(start_s, end_s), wall)
@@ -102,7 +102,7 @@ def visits(
     now = memory.now(wall, view.snapshot.latest)
     if place is None:
         found = place_visits(view, memory.limits.places, placement.frame_id, window)
-        note_unread(view, window, nothing=not any(each.entries for each in found))
+        note_unread(view, window, nothing=not any(each.duration for each in found))
         return Visits(
             frame_id=placement.frame_id,
             x=None,
@@ -135,6 +135,8 @@ def visits(
         total=known.total,
         now=now,
         duration=known.duration,
+        entries=known.entries,
+        exits=known.exits,
         where=place.name,
         notes=view.notes.sentences(),
     )
@@ -147,9 +149,11 @@ class _Known(NamedTuple):
     total: int
     duration: Ns
     newest: Ns | None
+    entries: int | None = None
+    exits: int | None = None
 
 
-def _place(
+def asked_place(
     limits: QuerySettings,
     point: tuple[float | None, float | None],
     radius_m: float | None,
@@ -190,7 +194,8 @@ def _by_track(
     newest = search.newest_time
     current = newest if _is_current(view, newest, now) else None
     shown = tuple(visit_of(found, each, place, current) for each in found.all[:limit])
-    return _Known(shown, len(found.all), found.duration, newest)
+    entries, exits = sum(each.entered for each in found.all), sum(each.left for each in found.all)
+    return _Known(shown, len(found.all), found.duration, newest, entries, exits)
 
 
 def _by_poses(view: View, search: _VisitSearch, now: Ns, limit: int) -> _Known:

@@ -237,8 +237,8 @@ _SearchField: TypeAlias = Annotated[
 
 
 _By: TypeAlias = Annotated[
-    Literal["day", "hour", "weekday"],
-    Field(description="Counts for each in local time: {columns, rows, all}."),
+    Literal["day", "hour", "weekday", "place"],
+    Field(description="Counts for each, local time: {columns, rows}."),
 ]
 
 
@@ -473,6 +473,7 @@ class VisitsArguments(Arguments):
     ) = None
     radius_m: Annotated[_Positive, Field(description="How near is there, m.")] | None = None
     limit: _Limit = 10
+    by: _By | None = None
 
 
 _While: TypeAlias = Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ros2_memory.counts.matches import count_matches
+from ros2_memory.counts.stays import count_visits
 from ros2_memory.insights.compare import compare
 from ros2_memory.insights.recap import recap_or_before
 from ros2_memory.insights.saved_moments import list_moments, remember_moment, show_moment
@@ -63,6 +64,7 @@ _VISITS = ToolDeclaration(
     VisitsArguments,
     visits,
     blocking=True,
+    count=count_visits,
 )
 _THINGS = ToolDeclaration(
     (ToolName("find_things", "Things"),),

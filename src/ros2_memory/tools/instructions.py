@@ -31,7 +31,7 @@ _HAPPENED: Final = """\
 - "Where is X, how many?": find_things. "When did you see X?": find_matches, with oldest_first for \
 the first time. "What happened?": recap; "why then?": with around. "What changed?": compare. "Have \
 you been here?": visits. "How low was it?": get_topic_in_last with fields and max_samples 1. \
-"Usually, on each day?": by. "Can I trust this?": memory_status.
+"Usually? Each day or room?": by. "Can I trust this?": memory_status.
 - where: a place's name, {{x, y, radius_m}} or {{"x": [from, to], "y": [from, to]}}.
 """
 _REST: Final = """\
@@ -80,8 +80,8 @@ that x and y are of.
 - What did a topic say: get_topic_seconds_ago, get_topic_in_last. How low or high was a \
 number: the extremes there, with fields and max_samples 1. What did it say when something \
 else held: get_value_when.
-- When do you usually, how often, how far, how low on each day, weekday or hour: by, of \
-find_matches, trajectory_summary and get_topic_in_range.
+- When do you usually, how often, how far, how low on each day, weekday or hour, or in each named \
+place: by, of find_matches, visits, trajectory_summary and get_topic_in_range.
 - What do you remember at all, and how well: data_time_range, memory_status, list_recorded_topics.
 Answer with the figures of the reply as they stand: ages, durations and distances are in it.
 """

@@ -33,15 +33,15 @@ def _bins(answer: results.Bins) -> JsonObject:
         "start": moment(answer.start),
         "end": moment(answer.end),
     }
-    if answer.usual is not None:
-        usual = answer.usual
-        reply["usual_first"] = {
-            "median": _clock(usual.median_s),
-            "earliest": _clock(usual.earliest_s),
-            "latest": _clock(usual.latest_s),
-            "days": usual.days,
-            "of_days": usual.of_days,
-        }
+    for key, usual in (("usual_first", answer.usual), ("usual_exit", answer.usual_exit)):
+        if usual is not None:
+            reply[key] = {
+                "median": _clock(usual.median_s),
+                "earliest": _clock(usual.earliest_s),
+                "latest": _clock(usual.latest_s),
+                "days": usual.days,
+                "of_days": usual.of_days,
+            }
     return with_notes(reply, answer.notes)
 
 
@@ -51,8 +51,9 @@ def _cell(value: float | None, kind: BinColumn) -> JsonValue:
     match kind:
         case "count":
             return int(value)
-        case "duration":
-            return round(unix_from_ns(int(value)), 1)
+        case "duration" | "minutes":
+            seconds = unix_from_ns(int(value))
+            return round(seconds, 1) if kind == "duration" else round(seconds / _MINUTE_S, 2)
         case "metres":
             return rounded(value, 2)
         case "number":

@@ -182,18 +182,20 @@ def _visits(answer: results.Visits) -> JsonObject:
         "there_now": any(each.departed is None for each in answer.visits),
         "visits": [_visit(each, answer.now, local) for each in answer.visits],
         "total": answer.total,
+        **({} if answer.entries is None else {"entries": answer.entries, "exits": answer.exits}),
         "minutes": _minutes(answer.duration),
     }
     return with_notes(reply, answer.notes, more=answer.more)
 
 
 def _place_visits(place: results.PlaceVisits) -> JsonObject:
-    seen: JsonObject = {"first_entry": moment(place.first), "last_exit": moment(place.last)}
+    seen = {"first_entry": moment(place.first), "last_exit": moment(place.last)}
     return {
         "place": place.place,
         "minutes": _minutes(place.duration),
         "entries": place.entries,
-        **(seen if place.entries else {}),
+        "exits": place.exits,
+        **{name: at for name, at in seen.items() if at is not None},
     }
 
 

@@ -74,7 +74,7 @@ BLOCKING = {
 }
 OPTIONAL = {
     "remember_moment": {"seconds_before", "seconds_after"},
-    "visits": {"x", "y", "where", "start", "end", "frame_id", "radius_m", "limit"},
+    "visits": {"x", "y", "where", "start", "end", "frame_id", "radius_m", "limit", "by"},
     "find_matches": {
         "where",
         "while",

@@ -1,0 +1,75 @@
+"""Bins of where the robot was: the named places, elsewhere, and where that is not known.
+
+A place that lies in another one counts to both, so the bins may add up to more than the window.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.counts.time_bins import TimeBins
+from ros2_memory.history.driven_path import pose_frame
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.region_visits import places_in, track_in
+from ros2_memory.places.robot_tracks import robot_inside
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.view import View
+
+ELSEWHERE: Final = "(elsewhere)"
+UNKNOWN: Final = "(unknown)"
+
+
+def place_bins(view: View, window: TimeWindow) -> TimeBins:
+    """Returns the named places as bins: when the robot was in each; notes say what is not known.
+
+    Raises:
+        InvalidArgumentsError: no place is named in the frame of places.
+        NoDataError: there are no poses.
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    topic = resolve_pose_topic(view)
+    frame_id = map_placement(view, pose_frame(view, topic), topic, None).frame_id
+    places = places_in(view, view.memory.limits.places, frame_id)
+    if not places:
+        raise InvalidArgumentsError(
+            f"by place needs named places in {frame_id}, and data.places_file has none"
+        )
+    track = track_in(view, frame_id, window)
+    inside = [
+        [(each.start, each.stop + 1) for each in robot_inside(track, place.region, window)]
+        for place in places
+    ]
+    begins = np.flatnonzero(track.begins)
+    ends = np.append(begins[1:], len(track.times))[: len(begins)] - 1
+    known = list(zip(track.times[begins].tolist(), (track.times[ends] + 1).tolist(), strict=True))
+    cuts = {at for spans in (*inside, known) for span in spans for at in span}
+    within = sorted(at for at in cuts if window.start < at < window.stop)
+    edges = np.array([window.start, *within, window.stop], np.int64)
+    in_places = np.array([_covered(edges, spans) for spans in inside]).T
+    if (np.diff(edges)[in_places.sum(axis=1) > 1] > NS_PER_S).any():
+        view.notes.add("places overlap: what is in two of them counts to both")
+    in_none = ~in_places.any(axis=1)
+    placed = _covered(edges, known)
+    member = np.column_stack((in_places, in_none & placed, in_none & ~placed))
+    names = (*(each.name for each in places), ELSEWHERE, UNKNOWN)
+    return TimeBins(names, edges, member, None)
+
+
+def _covered(edges: NDArray[np.int64], spans: Sequence[tuple[Ns, Ns]]) -> NDArray[np.bool_]:
+    """Returns for each piece between two edges whether it lies in one of some half-open spans."""
+    starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
+    begun = np.searchsorted(starts, edges[:-1], side="right")
+    ended = np.searchsorted(stops, edges[:-1], side="right")
+    return begun > ended

@@ -1,0 +1,116 @@
+"""How often the robot entered and left a place, and for how long it was there, in each bin."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
+from ros2_memory.history.driven_path import pose_frame
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.region_visits import places_in, track_in
+from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.visits import asked_place
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.counts.bins import By
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.places.robot_tracks import Inside
+    from ros2_memory.results import Bins
+
+
+def count_visits(
+    memory: Memory,
+    call: Call,
+    x: float | None = None,
+    y: float | None = None,
+    *,
+    by: By,
+    where: JsonValue = None,
+    frame_id: str | None = None,
+    radius_m: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+) -> Bins:
+    """Returns entries, exits and minutes in a place for each bin; of no place, of all named ones.
+
+    `placed_s` is for how long it was known where the robot was.
+
+    Raises:
+        InvalidArgumentsError: the place is none, the frame is another one, there are too many
+            bins, or a place is given besides `by` place.
+        NoDataError: the memory holds nothing in the window, or no poses.
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    place = asked_place(memory.limits, (x, y), radius_m, where)
+    if by == "place" and place is not None:
+        raise InvalidArgumentsError("by place counts all named places: give no other one")
+    wall = memory.clock.now()
+    view = open_view(memory, call, wall)
+    asked = clamped(view, search_window(TimeRange(start_s, end_s), wall))
+    topic = resolve_pose_topic(view)
+    named_frame = None if place is None else place.frame_id
+    asked_frame = frame_id if named_frame is None else named_frame
+    frame = map_placement(view, pose_frame(view, topic), topic, asked_frame).frame_id
+    binned = BinnedWindow(view, asked, by, (topic,))
+    track = track_in(view, frame, binned.window)
+    begins = np.flatnonzero(track.begins)
+    ends = np.append(begins[1:], len(track.times))[: len(begins)] - 1
+    known = list(zip(track.times[begins].tolist(), track.times[ends].tolist(), strict=True))
+    binned.add_lengths("placed_s", "duration", known)
+    if place is not None:
+        _add_visits(binned, robot_inside(track, place.region, binned.window))
+        return binned.answer()
+    places = places_in(view, memory.limits.places, frame)
+    inside = [robot_inside(track, each.region, binned.window) for each in places]
+    if by == "place":
+        _add_each_place(binned, inside)
+        return binned.answer()
+    if len(places) * len(binned.bins.names) > MOST_CELLS:
+        raise InvalidArgumentsError(
+            f"{len(places)} places by {by} in {len(binned.bins.names)} bins are too many for one "
+            "reply: name one in where, or ask about a shorter window"
+        )
+    for each, stays in zip(places, inside, strict=True):
+        binned.add_counts(f"{each.name}.entries", _entries(stays))
+        binned.add_lengths(f"{each.name}.minutes", "minutes", _spans(stays))
+    return binned.answer()
+
+
+def _add_visits(binned: BinnedWindow, inside: Sequence[Inside]) -> None:
+    """Adds the visits to one place."""
+    entries = _entries(inside)
+    exits = np.array([each.stop for each in inside if each.left], np.int64)
+    binned.add_counts("entries", entries)
+    binned.add_counts("exits", exits)
+    binned.add_lengths("minutes", "minutes", _spans(inside))
+    binned.add_first("first_entry", entries)
+    binned.add_first("first_exit", exits)
+    binned.usual = binned.usual_of(entries)
+    binned.usual_exit = binned.usual_of(exits)
+
+
+def _add_each_place(binned: BinnedWindow, inside: Sequence[Sequence[Inside]]) -> None:
+    """Adds the visits to each named place in the bin of that place."""
+    rest: list[None] = [None] * (len(binned.bins.names) - len(inside))
+    entries = [sum(each.entered for each in stays) for stays in inside]
+    exits = [sum(each.left for each in stays) for stays in inside]
+    lengths = [sum(stop - start for start, stop in _spans(stays)) for stays in inside]
+    binned.add("entries", "count", [*entries, *rest], sum(entries))
+    binned.add("exits", "count", [*exits, *rest], sum(exits))
+    binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))
+
+
+def _entries(inside: Sequence[Inside]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return np.array([each.start for each in inside if each.entered], np.int64)
+
+
+def _spans(inside: Sequence[Inside]) -> list[tuple[int, int]]:
+    return [(each.start, each.stop) for each in inside]

@@ -1,0 +1,169 @@
+"""Counting in named places, and of visits in days and hours."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.history.context import Call
+from ros2_memory.places.visits import visits
+from tests.support.memories import asked, memory_of, recalling
+from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.random_histories import write_history
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+WEST = Place("west", "map", Rectangle(-3.0, 2.0, -3.0, 6.0))
+EAST = Place("east", "map", Rectangle(2.0, 8.0, -3.0, 6.0))
+START = Place("start", "map", Circle(0.0, 0.0, 0.6))
+DOOR = {"start": BEGIN / S, "end": BEGIN / S + 300}
+OBJECTS = "/vision/scene/scene_objects"
+CUP = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
+
+
+def in_places(memory: Memory, *places: Place) -> Memory:
+    return replace(memory, limits=replace(memory.limits, places=places))
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("world")
+    write_moving_map(folder, 1, seconds=300)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def memory(world: Path) -> Memory:
+    return in_places(recalling(memory_of(world), world), WEST, EAST, START)
+
+
+def table(reply: Any) -> dict[str, dict[str, Any]]:
+    names = reply["columns"][1:]
+    rows = {row[0]: dict(zip(names, row[1:], strict=True)) for row in reply["rows"]}
+    return {**rows, "all": dict(zip(names, reply["all"], strict=True))}
+
+
+def test_visits_are_counted_in_each_hour_with_entries_exits_and_minutes(
+    memory: Memory, world: Path
+) -> None:
+    rows = table(asked(memory, world, "visits", where="start", by="hour"))
+    alone = visits(memory, Call(), where="start", limit=100)
+    whole = rows.pop("all")
+    assert (whole["entries"], whole["exits"]) == (4, 4) == (alone.entries, alone.exits)
+    assert whole["minutes"] == pytest.approx(alone.duration / S / 60, abs=0.01)
+    assert whole["placed_s"] == pytest.approx(299.8, abs=0.5)
+    for name in ("entries", "exits", "minutes", "recorded_s"):
+        assert sum(row[name] for row in rows.values()) == pytest.approx(whole[name], abs=0.02)
+
+
+def test_all_named_places_are_counted_at_once(memory: Memory, world: Path) -> None:
+    places = visits(memory, Call()).places or ()
+    by_place = table(asked(memory, world, "visits", by="place"))
+    by_day = table(asked(memory, world, "visits", by="day"))["all"]
+    for each in places:
+        row = by_place[each.place]
+        assert (row["entries"], row["exits"]) == (each.entries, each.exits)
+        assert row["minutes"] == pytest.approx(each.duration / S / 60, abs=0.006)
+        assert row["recorded_s"] == pytest.approx(each.duration / S, abs=0.06)
+        assert by_day[f"{each.place}.minutes"] == row["minutes"]
+        assert by_day[f"{each.place}.entries"] == each.entries
+    assert by_place["(unknown)"]["recorded_s"] < 0.5
+
+
+def test_what_is_counted_by_place_is_where_the_robot_was(world: Path) -> None:
+    memory = in_places(recalling(memory_of(world), world), WEST, EAST)
+    truth = write_moving_map(world, 1, seconds=300)
+    west = sum(x <= 2.0 for x, _ in truth.places)
+    rows = table(asked(memory, world, "get_topic_in_range", topic="/odom", by="place", **DOOR))
+    assert rows["west"]["count"] + rows["east"]["count"] == rows["all"]["count"] == 1500
+    assert rows["west"]["count"] == pytest.approx(west, abs=25)
+    assert rows["(elsewhere)"]["count"] == rows["(unknown)"]["count"] == 0
+    steps = [
+        (abs(b[0] - a[0]) ** 2 + abs(b[1] - a[1]) ** 2) ** 0.5
+        for a, b in pairwise(truth.places)
+        if b[0] <= 2.0
+    ]
+    driven = table(asked(memory, world, "trajectory_summary", by="place", **DOOR))
+    whole = sum(driven[name]["metres"] or 0 for name in driven if name != "all")
+    assert whole == pytest.approx(driven["all"]["metres"], abs=0.05)
+    # Corrections of the map move odometry too, which is what is measured.
+    assert driven["west"]["metres"] == pytest.approx(sum(steps), rel=0.35)
+    seen = table(asked(memory, world, "find_matches", by="place", **CUP))
+    assert seen["west"]["seconds"] + seen["east"]["seconds"] == pytest.approx(
+        seen["all"]["seconds"], abs=0.2
+    )
+    assert seen["all"]["count"] == 1
+
+
+def test_numbers_in_a_place_are_those_of_its_messages(memory: Memory, world: Path) -> None:
+    question = {"topic": "/odom", "fields": ["linear_velocity.x"], "by": "place", **DOOR}
+    rows = table(asked(memory, world, "get_topic_in_range", **question))
+    for name in ("west", "east", "start", "all"):
+        assert (rows[name]["linear_velocity.x.min"], rows[name]["linear_velocity.x.max"]) == (
+            0,
+            0.4,
+        )
+    whole = rows["west"]["count"] + rows["east"]["count"]
+    mean = sum(
+        rows[name]["count"] * rows[name]["linear_velocity.x.mean"] for name in ("west", "east")
+    )
+    assert mean / whole == pytest.approx(rows["all"]["linear_velocity.x.mean"], abs=1e-5)
+
+
+def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(
+    memory: Memory, world: Path
+) -> None:
+    reply = asked(memory, world, "get_topic_in_range", topic="/odom", by="place", **DOOR)
+    rows = table(reply)
+    assert sum(row["count"] for name, row in rows.items() if name != "all") > 1500
+    assert rows["all"]["count"] == 1500
+    assert "places overlap: what is in two of them counts to both" in reply["notes"]
+
+
+def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path) -> None:
+    unnamed = asked(in_places(memory), world, "trajectory_summary", by="place", **DOOR)
+    assert "needs named places" in unnamed["detail"]
+    two = asked(memory, world, "visits", by="place", where="start")
+    assert "give no other one" in two["detail"]
+    none = asked(in_places(memory), world, "visits", by="day")
+    assert "no place is named" in none["detail"]
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 10_000),
+    part=st.sampled_from([0.4, 1.0]),
+    split_s=st.sampled_from([3.0, 25.0]),
+    moving=st.booleans(),
+)
+def test_counts_by_place_are_the_same_whatever_the_catalogue_knows(
+    seed: int, part: float, split_s: float, moving: bool
+) -> None:
+    with TemporaryDirectory() as folder:
+        bags = Path(folder)
+        if moving:
+            write_moving_map(bags, seed, seconds=40, split_s=split_s)
+        else:
+            write_history(bags, random.Random(seed))
+        memory = in_places(memory_of(bags), WEST, EAST, START)
+        known = recalling(memory, bags, part=part)
+        everything = {"start": 0, "end": 4e9, "by": "place"}
+        for name, question in (
+            ("visits", {"by": "place"}),
+            ("visits", {"by": "hour", "where": "start"}),
+            ("find_matches", {**CUP, "by": "place"}),
+            ("trajectory_summary", everything),
+            ("get_topic_in_range", {**everything, "topic": "/odom", "fields": ["position.x"]}),
+        ):
+            plain = asked(memory, bags, name, **question)
+            assert asked(known, bags, name, **question) == plain, (name, question)
