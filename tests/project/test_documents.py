@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 DOCUMENTS: Final = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS: Final = Path(sys.executable).parent
 ELSEWHERE: Final = {
-    "README.md/From the command line": "tests/project/test_readme_commands.py",
+    "commands.md/From the command line": "tests/project/test_commands_page.py",
     "tools.md": "tests/project/test_reference.py",
     "errors.md": "tests/project/test_reference.py",
     "files.md": "tests/project/test_reference.py",
@@ -46,7 +46,9 @@ ELSEWHERE: Final = {
 NOT_RUN: Final = {
     r"sudo |journalctl ": "changes the machine: systemd, for root",
     r"docker |.* docker compose ": "needs Docker",
-    r"pip install |python3 -m venv |\. ~/ros2-memory/bin/activate": "installs from the network",
+    r"pip install |python3 -m venv |~/uv/bin/uv |\. ~/ros2-memory/bin/activate": (
+        "installs from the network"
+    ),
     r"curl ": "asks a server on another machine, or one that a service manager started",
     r"ros2-memory demo": "tests/integration/test_demo.py runs it",
     r"ros2-memory --install-completion": "writes into the user's shell configuration",

@@ -115,7 +115,9 @@ class TestGates:
         assert [gate for gate in GATES if gate not in script] == []
 
     def test_readme_the_script_and_the_workflow_test_with_one_command(self) -> None:
-        (command,) = re.findall(r"\npip install uv && (.+)\n", (ROOT / "README.md").read_text())
+        (command,) = re.findall(
+            r"\.venv/bin/pip install uv && \.venv/bin/(.+)\n", (ROOT / "README.md").read_text()
+        )
         assert command in GATES
         assert f"\ngate pytest {command}\n" in (ROOT / ".ci/run").read_text()
         steps = read_yaml(".github/workflows/ci.yml")["jobs"]["gates"]["steps"]

@@ -1,4 +1,4 @@
-"""The commands of README's "From the command line" run."""
+"""The commands of "From the command line" run."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tests.support.memories import ROOT
 if TYPE_CHECKING:
     from pathlib import Path
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-SECTION = README.partition("## From the command line\n")[2].partition("\n## ")[0]
+PAGE = (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8")
+SECTION = PAGE.partition("## From the command line\n")[2].partition("\n## ")[0]
 T0 = 1_795_161_600 * NS_PER_S
 NOT_RUN = {"--install-completion": "it writes into the user's shell configuration"}
 CODES = {"doctor": {2}}
@@ -33,7 +33,7 @@ COMMANDS = [shlex.split(line, comments=True) for line in SHELL[1].splitlines()]
 
 @pytest.fixture(autouse=True)
 def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A robot's bag, of which the clock and the words fit what README asks."""
+    """A robot's bag, of which the clock and the words fit what the page asks."""
     messages = [odom(T0 + n * NS_PER_S // 10, n / 10, 0.0) for n in range(101)]
     messages.append(text(T0 + NS_PER_S, "scissors", "/vision/scene/scene_objects"))
     write_mcap(tmp_path / "bags" / "rec_0" / "rec_0.mcap", messages)
@@ -57,5 +57,9 @@ def test_every_command_runs(words: list[str], capsys: pytest.CaptureFixture[str]
     assert shown.out or shown.err
 
 
-def test_every_command_that_there_is_stands_in_readme() -> None:
-    assert {name for name in app.COMMANDS if f"ros2-memory {name}" not in README} == set()
+def test_every_command_that_there_is_stands_there() -> None:
+    assert {
+        name
+        for name in app.COMMANDS
+        if f"ros2-memory {name}" not in PAGE and f"| `{name}` |" not in PAGE
+    } == set()
