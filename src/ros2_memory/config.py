@@ -134,6 +134,7 @@ class RecordingSettings:
     bag_dir: AnyPath
     split_duration_s: Count
     session_duration_s: Positive
+    queue_mb: Mebibytes
     use_sim_time: Flag
     clear_on_startup: Flag
     topics_file: ConfigFile
@@ -280,6 +281,7 @@ class Ros2BagNode(AdapterNode):
     split_duration_s: Count
     session_duration_s: Positive
     use_sim_time: Flag
+    queue_mb: Mebibytes
     min_free_gb: Tolerance
     setup_files: tuple[AnyPath, ...]
     latched_topics: tuple[Text, ...]

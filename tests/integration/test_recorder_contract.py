@@ -33,6 +33,7 @@ def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:
         split_duration_s=10,
         session_duration_s=600,
         use_sim_time=False,
+        queue_mb=64,
         min_free_gb=0.0,
         setup_files=(),
         latched_topics=("/tf_static",),

@@ -3,7 +3,7 @@
     bag_dir/
       recorder.json                heartbeat (see `heartbeat`)
       recorder.lock                who records here (see `lock`)
-      recorder.qos.yaml            how latched topics are subscribed to
+      recorder.qos.yaml            how topics are subscribed to: QoS and depth
       recorder.storage.yaml        how MCAP files are written
       .ros_log/                    logs of `ros2`: the newest few runs
       rec_20261120T043000Z/        one recording: what one `ros2 bag record` wrote

@@ -21,12 +21,12 @@ from ros2_memory.recorder.process.child import Child, run_bounded
 from ros2_memory.recorder.process.command import (
     HELP_ARGV,
     options_in_help,
-    qos_overrides,
     record_argv,
     storage_config,
 )
 from ros2_memory.recorder.process.environment import find_ros2, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.recorder.reception.reception import Reception, newest_split
 from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
@@ -53,10 +53,11 @@ class Ros2BagRecorder(Recorder):
         split_duration_s: length of one bag file, whole seconds.
         session_duration_s: how long one recording lasts before the next takes over.
         use_sim_time: whether log times come from `/clock`.
+        queue_mb: what the queues of all topics together may take, in MiB.
         min_free_gb: what must be free on the disk for recording to continue, in 10^9 bytes.
         setup_files: bash files that make the ROS environment.
-        latched_topics: topics whose publishers are transient local; of those that `topics_file`
-            names, all messages are recorded, however many there are.
+        latched_topics: topics whose publishers are transient local; all of their messages are
+            recorded, however many there are.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that. Their log times may lie long before the split.
         chunk_bytes: size of an MCAP chunk before compression.
@@ -74,6 +75,7 @@ class Ros2BagRecorder(Recorder):
         split_duration_s: int,
         session_duration_s: float,
         use_sim_time: bool,
+        queue_mb: int,
         min_free_gb: float,
         setup_files: Sequence[Path],
         latched_topics: Sequence[str],
@@ -88,7 +90,6 @@ class Ros2BagRecorder(Recorder):
         self._split_duration_s = split_duration_s
         self._use_sim_time = use_sim_time
         self._setup_files = tuple(setup_files)
-        self._latched_topics = tuple(latched_topics)
         self._repeat_latched = tuple(repeat_latched)
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
@@ -98,12 +99,15 @@ class Ros2BagRecorder(Recorder):
         self._env: dict[str, str] = {}
         self._ros2 = "ros2"
         self._options: frozenset[str] = frozenset()
+        self._queue_bytes = queue_mb * 2**20
+        self._min_free_bytes = round(min_free_gb * GB)
+        self._reception = Reception(reader, self._queue_bytes, latched=latched_topics)
         self._supervisor = Supervisor(
             Orders(
                 bag_dir=self._bag_dir,
                 split_duration_s=split_duration_s,
                 session_duration_s=session_duration_s,
-                min_free_bytes=round(min_free_gb * GB),
+                min_free_bytes=self._min_free_bytes,
                 simulated=use_sim_time,
             ),
             self._start_child,
@@ -112,6 +116,7 @@ class Ros2BagRecorder(Recorder):
             WallClock(),
             expected=lambda: self._topics.exact,
             own=self._own,
+            reception=self._reception,
         )
 
     def check(self) -> None:
@@ -129,6 +134,9 @@ class Ros2BagRecorder(Recorder):
         if not self._checked:
             self.check()
         self._checked = False
+        newest = newest_split(self._bag_dir)
+        if newest is not None:
+            self._reception.recall(newest)
         self._supervisor.start()
 
     def tick(self) -> None:
@@ -160,9 +168,8 @@ class Ros2BagRecorder(Recorder):
 
     def _start_child(self, name: str, directory: Path) -> Child:
         qos_file, storage_file = self._bag_dir / QOS_FILE, self._bag_dir / STORAGE_FILE
-        latched = [topic for topic in self._topics.exact if topic in self._latched_topics]
         try:
-            write_durably(qos_file, qos_overrides(latched))
+            write_durably(qos_file, self._reception.overrides(name))
             write_durably(storage_file, storage_config(self._chunk_bytes))
         except OSError as error:
             raise RecorderError(
@@ -178,6 +185,9 @@ class Ros2BagRecorder(Recorder):
             qos_file=qos_file,
             storage_file=storage_file,
             node_name=node_name(name),
+            cache_bytes=self._queue_bytes,
+            # Below where recording pauses: it ends by itself only if nobody pauses it.
+            min_free_bytes=self._min_free_bytes // 2,
             use_sim_time=self._use_sim_time,
             repeat_latched=self._repeat_latched,
             bag_dir_id=self._own.bag_dir_id,

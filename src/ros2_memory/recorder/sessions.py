@@ -21,6 +21,7 @@ from ros2_memory.recorder.handover.plan import (
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.policies import describe_silent_topics
 from ros2_memory.recorder.process.child import end_all
+from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.session import SplitChanges
     from ros2_memory.storage.base import BagReader
 
@@ -65,6 +67,7 @@ class RecordingSessions:
         reader: reads splits that are closed.
         events: where everything is reported.
         own: the list of recordings that were made here.
+        reception: measures closed splits, and is told of publishers that were refused.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
@@ -82,12 +85,14 @@ class RecordingSessions:
         events: EventLog,
         *,
         own: OwnRecordings,
+        reception: Reception,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
         self._start_child = start_child
         self._announce = announce
         self._own = own
+        self._reception = reception
         self._reader = reader
         self._events = events
         self.current: RecordingSession | None = None
@@ -241,10 +246,11 @@ class RecordingSessions:
             self._events.resolve("recording_not_listed", session.name)
 
     def _observe(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
-        self._events.report_output(session.name, session.new_lines())
+        self._report_output(session)
         changes = session.splits.observe(now.monotonic_s)
         for name in changes.closed:
             self._events.info("split_closed", recording=session.name, file=name)
+            self._reception.learn(session.name, session.splits.directory / name)
         if changes.closed:
             self._flush(session, session.splits.directory, changes.closed)
         for name in changes.empty:
@@ -254,6 +260,13 @@ class RecordingSessions:
         for fault in changes.faults:
             self._events.fail_once("unreadable", session.name, fault, recording=session.name)
         return changes
+
+    def _report_output(self, session: RecordingSession) -> None:
+        lines = session.new_lines()
+        self._events.report_output(session.name, lines)
+        for line in lines:
+            if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
+                self._reception.refused(session.name, line.topic)
 
     def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
         for fault in flush_bags(directory, names):
@@ -298,7 +311,7 @@ class RecordingSessions:
             self._replace_current()
 
     def _report_death(self, session: RecordingSession, now: ClockReading) -> float:
-        self._events.report_output(session.name, session.new_lines())
+        self._report_output(session)
         lived_s = session.age_s(now)
         status = session.child.exit_status()
         sentence = f"ros2 bag record ended by itself with status {status}: {session.last_output}"

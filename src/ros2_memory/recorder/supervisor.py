@@ -23,6 +23,7 @@ from ros2_memory.recorder.policies import (
     resume_bytes,
     space_action,
 )
+from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import RecordingSessions
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
@@ -65,6 +66,7 @@ class Supervisor:
         device: gives the device that a directory lies on.
         expected: gives the topics that are to be recorded by name.
         own: the list of recordings that were made here.
+        reception: plans how topics are subscribed.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -83,6 +85,7 @@ class Supervisor:
         device: Callable[[Path], int] = device_of,
         expected: Callable[[], Sequence[str]] = tuple,
         own: OwnRecordings | None = None,
+        reception: Reception | None = None,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
@@ -100,6 +103,7 @@ class Supervisor:
             age_held=housekeeper.age_held,
             expected=expected,
         )
+        self._reception = reception or Reception(reader)
         self._sessions = RecordingSessions(
             orders,
             start_child,
@@ -107,6 +111,7 @@ class Supervisor:
             reader,
             self._events,
             own=own or OwnRecordings(orders.bag_dir),
+            reception=self._reception,
         )
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
@@ -291,7 +296,8 @@ class Supervisor:
         # Every split repeats the list of all splits before it, so a recording that is never
         # rotated grows with the square of its age.
         over = current.age_s(now) >= self._orders.session_duration_s
-        wanted = self._rotate_now or silent or over
+        resubscribe = self._reception.rotation_due(current.name, now.monotonic_s)
+        wanted = self._rotate_now or silent or over or resubscribe is not None
         ready = current.is_recording and current.splits.exists and self._sessions.handover is None
         if not (wanted and ready and self._is_due("rotate", 0.0, now)):
             return
@@ -308,6 +314,11 @@ class Supervisor:
         except RecorderError as error:
             self._events.fail("rotation_failed", str(error), recording=current.name)
             self._postpone("rotate", self._rotation_backoff.failed(0.0), now)
+            return
+        if resubscribe is not None:
+            self._reception.rotation_begun(resubscribe, now.monotonic_s)
+            report = self._events.warn if resubscribe.is_fault else self._events.note
+            report(resubscribe.event, resubscribe.sentence, recording=current.name)
 
     def _check_restart(self, now: ClockReading) -> None:
         if self._sessions.current is not None or self._paused or self._disk.away:

@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.own_recordings import BAG_DIR_ID, PROGRAM, RECORDED_BY
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from ros2_memory.recorder.process.topics import TopicSelection
@@ -25,6 +25,8 @@ KEYBOARD: Final = "--disable-keyboard-controls"
 NODE_NAME: Final = "--node-name"
 REPEAT: Final = "--repeat-transient-local"
 CUSTOM_DATA: Final = "--custom-data"
+CACHE: Final = "--max-cache-size"
+MIN_FREE: Final = "--min-free-space"
 
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 _STORAGES = re.compile(r"-s \{([^}]*)\}|--storage \{([^}]*)\}")
@@ -39,6 +41,8 @@ def record_argv(
     qos_file: Path,
     storage_file: Path,
     node_name: str,
+    cache_bytes: int,
+    min_free_bytes: int = 0,
     use_sim_time: bool = False,
     repeat_latched: Sequence[str] = (),
     bag_dir_id: str | None = None,
@@ -51,9 +55,13 @@ def record_argv(
         directory: where to record, absolute; it must not exist yet.
         topics: what is recorded.
         split_duration_s: length of one bag file in whole seconds.
-        qos_file: QoS overrides, see `qos_overrides`.
+        qos_file: QoS overrides, see `reception.profiles`.
         storage_file: how MCAP is written, see `storage_config`.
         node_name: the name of the recorder's node, if the distribution can set it.
+        cache_bytes: size of each of the two buffers in which messages wait for the disk. rosbag2's
+            own 100 MiB are more than a machine may spare beside two recorders' queues.
+        min_free_bytes: where the recorder ends by itself, if the distribution can do that; 0 for
+            nowhere.
         use_sim_time: whether log times come from `/clock`, before which nothing is recorded.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that.
@@ -64,6 +72,10 @@ def record_argv(
     argv += ["-e", topics.regex]
     argv += ["--qos-profile-overrides-path", str(qos_file)]
     argv += ["--storage-config-file", str(storage_file)]
+    if CACHE in known_options:
+        argv += [CACHE, str(cache_bytes)]
+    if MIN_FREE in known_options and min_free_bytes:
+        argv += [MIN_FREE, str(min_free_bytes)]
     if topics.hidden:
         argv.append("--include-hidden-topics")
     if use_sim_time:
@@ -96,16 +108,6 @@ def options_in_help(text: str) -> frozenset[str]:
             "install the package ros-$ROS_DISTRO-rosbag2-storage-mcap"
         )
     return frozenset(_OPTION.findall(usage))
-
-
-def qos_overrides(latched: Iterable[str]) -> str:
-    """Returns YAML for `--qos-profile-overrides-path`, to record all messages of these topics.
-
-    The recorder's default depth of 10 loses messages where many broadcasters publish at once. For
-    a topic whose publishers are not latched this would record nothing.
-    """
-    profile = {"history": "keep_all", "reliability": "reliable", "durability": "transient_local"}
-    return yaml.safe_dump({topic: dict(profile) for topic in latched}, sort_keys=True)
 
 
 def storage_config(chunk_bytes: int) -> str:

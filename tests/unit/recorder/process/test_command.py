@@ -11,7 +11,6 @@ import yaml
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.command import (
     options_in_help,
-    qos_overrides,
     record_argv,
     storage_config,
 )
@@ -84,6 +83,8 @@ def argv_for(
         qos_file=Path("/bags/q.yaml"),
         storage_file=Path("/bags/s.yaml"),
         node_name="ros2_memory_rec_1",
+        cache_bytes=64 * 2**20,
+        min_free_bytes=10**9,
         use_sim_time=use_sim_time,
         repeat_latched=repeat_latched,
         known_options=known,
@@ -186,15 +187,15 @@ def test_an_installation_without_mcap_is_refused() -> None:
     assert options_in_help("usage: x [-s {mcap,sqlite3}] [--node-name N]") == {"--node-name"}
 
 
-def test_latched_topics_are_subscribed_to_with_all_their_messages() -> None:
-    assert yaml.safe_load(qos_overrides(["/tf_static"])) == {
-        "/tf_static": {
-            "history": "keep_all",
-            "reliability": "reliable",
-            "durability": "transient_local",
-        }
-    }
-    assert yaml.safe_load(qos_overrides([])) == {}
+def test_what_waits_for_the_disk_is_bounded() -> None:
+    argv = argv_for(frozenset({"--max-cache-size"}))
+    assert argv[argv.index("--max-cache-size") + 1] == "67108864"
+
+
+def test_it_ends_by_itself_on_a_full_disk_where_it_can() -> None:
+    assert "--min-free-space" not in argv_for()
+    argv = argv_for(frozenset({"--min-free-space"}))
+    assert argv[argv.index("--min-free-space") + 1] == "1000000000"
 
 
 def test_chunks_are_small_and_compressed() -> None:

@@ -1,0 +1,213 @@
+"""Follows how topics arrive, plans their QoS, and says when only a new recording can mend it.
+
+`ros2 bag record` never changes a subscription. So a deeper queue, or a weaker QoS for a publisher
+that came later, takes a rotation. What the splits show is measured beside the recorder's loop.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import structlog
+
+from ros2_memory.bag_dir.layout import has_own_name
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.text import listed
+from ros2_memory.recorder.reception.measure import measure_flows
+from ros2_memory.recorder.reception.profiles import (
+    QueuePlan,
+    TopicFlow,
+    lacking_depth,
+    plan_queues,
+    qos_overrides,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping
+    from pathlib import Path
+
+    from ros2_memory.storage.base import BagReader
+
+DEEPEN_EVERY_S: Final = 60.0
+"""At most so often a recording is rotated for deeper queues: a robot's nodes start one by one."""
+ASK_AGAIN_S: Final = 300.0
+"""At most so often a recording is rotated for the QoS of the same topic."""
+QUEUE_BYTES: Final = 64 * 2**20
+_PLANS_KEPT: Final = 8
+_LOOKED_AT: Final = 3
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+class Rotation(NamedTuple):
+    """Why a new recording is needed: a log event, a sentence, and the topics it is for."""
+
+    event: str
+    sentence: str
+    topics: frozenset[str]
+    is_fault: bool = False
+
+
+@dataclass(slots=True)
+class _Recording:
+    plan: QueuePlan
+    refused: set[str]
+    """Topics with a publisher that this recording's subscription does not fit."""
+
+
+class Reception:
+    """How the topics of one bag directory arrive, across its recordings.
+
+    Args:
+        reader: reads splits that are closed.
+        queue_bytes: what the queues of all topics together may take.
+        latched: topics that count as latched, see `qos_overrides`.
+        run: runs a task that takes a while; in a thread of its own where None.
+    """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        queue_bytes: int = QUEUE_BYTES,
+        *,
+        latched: Collection[str] = (),
+        run: Callable[[Callable[[], None]], None] | None = None,
+    ) -> None:
+        self._reader = reader
+        self._queue_bytes = queue_bytes
+        self._latched = tuple(latched)
+        self._run = run or _in_thread
+        self._lock = threading.Lock()
+        self._flows: dict[str, TopicFlow] = {}
+        self._asked_anew: set[str] = set()
+        self._recordings: dict[str, _Recording] = {}
+        self._deepened_s: float | None = None
+        self._asked_s: dict[str, float] = {}
+
+    @property
+    def cut_short(self) -> frozenset[str]:
+        """The topics whose queues hold less than two seconds, for want of memory."""
+        with self._lock:
+            return plan_queues(self._planned_for(), self._queue_bytes).cut_short
+
+    def overrides(self, recording: str) -> str:
+        """Returns the QoS overrides for a recording that is about to be begun."""
+        with self._lock:
+            plan = plan_queues(self._planned_for(), self._queue_bytes)
+            self._recordings[recording] = _Recording(plan, set())
+            for name in [*self._recordings][:-_PLANS_KEPT]:
+                del self._recordings[name]
+            latched = [topic for topic in self._latched if topic not in self._asked_anew]
+            return qos_overrides(self._flows, plan, latched=latched)
+
+    def recall(self, path: Path) -> None:
+        """Measures a closed split of an earlier run at once. Raises nothing."""
+        self._measure("", path)
+
+    def learn(self, recording: str, path: Path) -> None:
+        """Measures a closed split of a recording, later."""
+        self._run(lambda: self._measure(recording, path))
+
+    def refused(self, recording: str, topic: str) -> None:
+        """Notes that a publisher does not fit how a recording subscribed to the topic.
+
+        What was known of the topic is forgotten: the next recording adapts to its publishers anew.
+        """
+        with self._lock:
+            known = self._recordings.get(recording)
+            if known is not None:
+                known.refused.add(topic)
+            self._flows.pop(topic, None)
+            self._asked_anew.add(topic)
+
+    def rotation_due(self, recording: str, now_s: float) -> Rotation | None:
+        """Returns why a recording should be rotated now; None where it need not be."""
+        with self._lock:
+            known = self._recordings.get(recording)
+            if known is None:
+                return None
+            again = frozenset(
+                topic
+                for topic in known.refused
+                if now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
+            )
+            if again:
+                return Rotation("asking_again", _asking_again(again), again, is_fault=True)
+            if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
+                return None
+            flows = self._planned_for()
+            plan = plan_queues(flows, self._queue_bytes)
+            shallow = lacking_depth(flows, plan, known.plan)
+            return Rotation("queues_deepened", _deeper(shallow), shallow) if shallow else None
+
+    def rotation_begun(self, rotation: Rotation, now_s: float) -> None:
+        """Notes that a rotation was begun for this reason."""
+        with self._lock:
+            if rotation.event == "asking_again":
+                self._asked_s |= dict.fromkeys(rotation.topics, now_s)
+            else:
+                self._deepened_s = now_s
+
+    def _planned_for(self) -> Mapping[str, TopicFlow]:
+        """Returns the topics with a queue of a planned depth."""
+        return {
+            topic: flow
+            for topic, flow in self._flows.items()
+            if not (topic in self._latched and flow.offered.latched)
+        }
+
+    def _measure(self, recording: str, path: Path) -> None:
+        try:
+            flows = measure_flows(self._reader, path)
+        except (EpisodicError, OSError) as error:
+            # The file is reported where it matters; its successor shows the same topics.
+            _log.debug("split_not_measured", file=str(path), reason=str(error))
+            return
+        with self._lock:
+            before = plan_queues(self._planned_for(), self._queue_bytes).cut_short
+            known = self._recordings.get(recording)
+            for topic, flow in flows.items():
+                # A recording that refused a publisher does not state what that one offers.
+                if known is None or topic not in known.refused:
+                    old = self._flows.get(topic)
+                    self._flows[topic] = flow if old is None else old.joined(flow)
+                    self._asked_anew.discard(topic)
+            short = plan_queues(self._planned_for(), self._queue_bytes).cut_short
+        for topic in sorted(short - before):
+            _log.warning(
+                "queue_cut_short",
+                topic=topic,
+                reason=f"{topic}: its queue holds less than 2 s of its messages; raise "
+                "recording.queue_mb, or record less",
+            )
+
+
+def newest_split(bag_dir: Path) -> Path | None:
+    """Returns the newest closed split in a bag directory, by the names of its recordings."""
+    try:
+        folders = sorted(each for each in bag_dir.iterdir() if has_own_name(each.name))
+        for folder in reversed(folders[-_LOOKED_AT:]):
+            splits = sorted(folder.glob("*.mcap"), key=lambda split: split.stat().st_mtime_ns)
+            for split in reversed(splits[-_LOOKED_AT:]):
+                if split.stat().st_size:
+                    return split
+    except OSError:
+        return None
+    return None
+
+
+def _in_thread(task: Callable[[], None]) -> None:
+    threading.Thread(target=task, name="reception", daemon=True).start()
+
+
+def _asking_again(topics: Collection[str]) -> str:
+    return (
+        f"a publisher offers weaker QoS than was asked for on {listed(sorted(topics))}: a new "
+        "recording subscribes anew; what that publisher sent meanwhile is not recorded"
+    )
+
+
+def _deeper(topics: Collection[str]) -> str:
+    return f"a new recording is begun, to subscribe with deeper queues: {listed(sorted(topics))}"

@@ -1,0 +1,123 @@
+"""Queues deep enough for a stall, and publishers that come with weaker QoS: the real recorder."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from tests.support.live_recorder import LiveRecorder, Machine, machine
+from tests.support.processes import PATIENCE_S
+from tests.support.real_recorder import RealRecorder
+from tests.support.ros_processes import end, ros_environment, wait_for
+
+TOPICS = ("/odom", "/scan", "/watched")
+STALLS_S = (0.2, 0.3, 0.5, 1.0)
+
+
+@pytest.fixture
+def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
+    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
+        yield found
+
+
+@contextmanager
+def publishing(env: Mapping[str, str], *topics: str) -> Iterator[subprocess.Popen[bytes]]:
+    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.counting_publishers", *topics]
+    known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
+    process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        end(process)
+
+
+def numbers(bag_dir: Path, recordings: str = "rec_*") -> dict[str, list[int]]:
+    """The numbers of the messages of each topic that any closed split has, ascending."""
+    found: dict[str, set[int]] = {}
+    for split in bag_dir.glob(f"{recordings}/*.mcap"):
+        with suppress(Exception), split.open("rb") as stream:  # what is still being written
+            for _, channel, message in make_reader(stream).iter_messages():
+                frame = struct.unpack_from("<I", message.data, 12)[0]
+                at = 4 + (12 + frame + 7) // 8 * 8
+                found.setdefault(channel.topic, set()).add(
+                    int(struct.unpack_from("<d", message.data, at)[0])
+                )
+    return {topic: sorted(each) for topic, each in found.items()}
+
+
+def stall(recorder: LiveRecorder, seconds: float) -> None:
+    """Stops its recorder's process for so long."""
+    pid = recorder.children()[-1].pid
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(seconds)  # what is injected, not waited for
+    os.kill(pid, signal.SIGCONT)
+
+
+def overrides(recorder: LiveRecorder) -> dict[str, dict[str, object]]:
+    found: dict[str, dict[str, object]] = yaml.safe_load(
+        (recorder.bag_dir / "recorder.qos.yaml").read_text()
+    )
+    return found
+
+
+def test_a_stalled_recorder_loses_nothing_once_its_queues_are_deep(site: Machine) -> None:
+    """Reliable, best effort and with a deadline: one rotation after the first closed split."""
+    robot = ("/odom:100:reliable", "/scan:50:best_effort", "/watched:20:reliable:deadline")
+    with publishing(site.env, *robot):
+        recorder = site.record(
+            "deep", "recording.split_duration_s=1", topics=(*TOPICS, "/tf_static")
+        )
+        [deepened] = recorder.wait_for("queues_deepened")
+        assert "/odom" in deepened["reason"]
+        assert "/scan" in deepened["reason"]
+        [rotated] = recorder.wait_for("rotated")
+        for seconds in STALLS_S:
+            before = len(recorder.events("split_closed"))
+            stall(recorder, seconds)
+            recorder.wait_for("split_closed", before + 1)
+        recorder.stop()
+    profiles = overrides(recorder)
+    assert {topic: each["reliability"] for topic, each in profiles.items()} == {
+        "/odom": "reliable",
+        "/scan": "best_effort",
+        "/watched": "reliable",
+        "/tf_static": "reliable",
+    }
+    assert int(str(profiles["/odom"]["depth"])) >= 200
+    # A deadline that is asked for refuses every publisher without one.
+    assert "deadline" not in profiles["/watched"]
+    after = numbers(recorder.bag_dir, rotated["next"])
+    for topic, found in numbers(recorder.bag_dir).items():
+        kept = found[found.index(after[topic][0]) :]
+        assert len(kept) > 50, topic
+        assert [pair for pair in pairwise(kept) if pair[1] != pair[0] + 1] == [], topic
+
+
+def test_a_publisher_that_comes_with_weaker_qos_is_recorded_at_once(site: Machine) -> None:
+    """And not with the next rotation, ten minutes later."""
+    with publishing(site.env, "/odom:100:reliable") as robot:
+        recorder = site.record("weaker", "recording.split_duration_s=1", topics=("/odom",))
+        recorder.wait_for("rotated")
+        assert overrides(recorder)["/odom"]["reliability"] == "reliable"
+        end(robot)
+        with publishing(site.env, "--first", "1000000", "/odom:100:best_effort"):
+            [asked] = recorder.wait_for("asking_again")
+            assert "/odom" in asked["reason"]
+            wait_for(
+                lambda: numbers(recorder.bag_dir).get("/odom", [0])[-1] >= 1_000_000,
+                "messages of the new publisher",
+                timeout_s=PATIENCE_S,
+                alive=recorder.process,
+            )
+            recorder.stop()

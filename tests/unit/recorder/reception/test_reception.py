@@ -1,0 +1,130 @@
+"""What closed splits show of a topic, and when that takes a new recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from ros2_memory.recorder.reception.measure import burst_of
+from ros2_memory.recorder.reception.reception import (
+    ASK_AGAIN_S,
+    DEEPEN_EVERY_S,
+    Reception,
+    newest_split,
+)
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import odom, write_mcap
+
+NS = 10**9
+T0 = 1_795_000_000 * NS
+
+
+def split(path: Path, hz: int, seconds: int, topic: str = "/odom") -> Path:
+    ticks = range(hz * seconds)
+    return write_mcap(path, [odom(T0 + tick * NS // hz, 1.0, 2.0, topic=topic) for tick in ticks])
+
+
+def reception(queue_bytes: int = 2**26) -> Reception:
+    return Reception(McapReader(), queue_bytes, latched=["/tf_static"], run=lambda task: task())
+
+
+def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
+    found: dict[str, dict[str, object]] = yaml.safe_load(of.overrides(recording))
+    return found
+
+
+def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: Path) -> None:
+    made = reception()
+    assert profiles(made, "a").keys() == {"/tf_static"}
+    assert made.rotation_due("a", 0.0) is None
+    made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
+    rotation = made.rotation_due("a", 10.0)
+    assert rotation is not None
+    assert rotation.event == "queues_deepened"
+    assert rotation.topics == {"/odom"}
+    made.rotation_begun(rotation, 10.0)
+    assert profiles(made, "b")["/odom"]["depth"] == 200
+    made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
+    assert made.rotation_due("b", 1000.0) is None
+
+
+def test_topics_that_come_one_by_one_do_not_rotate_one_by_one(tmp_path: Path) -> None:
+    made = reception()
+    made.overrides("a")
+    made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
+    rotation = made.rotation_due("a", 10.0)
+    assert rotation is not None
+    made.rotation_begun(rotation, 10.0)
+    made.overrides("b")
+    made.learn("b", split(tmp_path / "b_0.mcap", 50, 4, topic="/late"))
+    assert made.rotation_due("b", 10.0 + DEEPEN_EVERY_S - 1) is None
+    later = made.rotation_due("b", 10.0 + DEEPEN_EVERY_S)
+    assert later is not None
+    assert later.topics == {"/late"}
+
+
+def test_a_slow_topic_needs_no_rotation(tmp_path: Path) -> None:
+    made = reception()
+    made.overrides("a")
+    made.learn("a", split(tmp_path / "a_0.mcap", 5, 4))
+    assert made.rotation_due("a", 10.0) is None
+
+
+def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_path: Path) -> None:
+    made = reception()
+    made.recall(split(tmp_path / "old.mcap", 50, 4))
+    assert "/odom" in profiles(made, "a")
+    made.refused("a", "/odom")
+    # The recording that refused it still states what the other publishers offered.
+    made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
+    rotation = made.rotation_due("a", 50.0)
+    assert rotation is not None
+    assert rotation.event == "asking_again"
+    assert rotation.topics == {"/odom"}
+    made.rotation_begun(rotation, 50.0)
+    assert "/odom" not in profiles(made, "b")
+    made.refused("b", "/odom")
+    assert made.rotation_due("b", 50.0 + ASK_AGAIN_S - 1) is None
+    assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
+
+
+def test_a_topic_taken_for_latched_that_is_not_adapts_too() -> None:
+    made = reception()
+    made.overrides("a")
+    made.refused("a", "/tf_static")
+    assert profiles(made, "b") == {}
+
+
+def test_a_queue_that_memory_cuts_short_is_named(tmp_path: Path) -> None:
+    made = reception(queue_bytes=2000)
+    made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
+    assert made.cut_short == {"/odom"}
+
+
+def test_an_unreadable_split_teaches_nothing(tmp_path: Path) -> None:
+    made = reception()
+    made.overrides("a")
+    broken = tmp_path / "a_0.mcap"
+    broken.write_bytes(b"nothing")
+    made.learn("a", broken)
+    made.learn("a", tmp_path / "gone.mcap")
+    assert made.rotation_due("a", 10.0) is None
+
+
+def test_the_newest_split_of_an_earlier_run_is_found(tmp_path: Path) -> None:
+    assert newest_split(tmp_path) is None
+    assert newest_split(tmp_path / "none") is None
+    split(tmp_path / "rec_20261120T080000Z" / "x_0.mcap", 5, 1)
+    split(tmp_path / "other" / "x_0.mcap", 5, 1)
+    newest = split(tmp_path / "rec_20261120T090000Z" / "x_0.mcap", 5, 1)
+    (tmp_path / "rec_20261120T090000Z" / "x_1.mcap").touch()
+    assert newest_split(tmp_path) == newest
+
+
+def test_a_burst_counts_two_seconds_and_a_young_topic_goes_on() -> None:
+    assert burst_of([]) == 0
+    assert burst_of([T0]) == 1
+    assert burst_of([T0 + tick * NS // 50 for tick in range(500)]) == 100
+    assert burst_of([T0 + tick * NS // 50 for tick in range(11)]) == 100
+    assert burst_of([T0] * 30) == 30
