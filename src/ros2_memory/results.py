@@ -611,6 +611,26 @@ class ComparedThing:
 
 
 @dataclass(frozen=True, slots=True)
+class MoverSeen:
+    """What moves by itself in a window: the most at once, how often, and where it was last seen."""
+
+    at_once: int
+    count: int
+    place: Vector3
+    inside: str | None
+    last: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedMover:
+    """What moves by itself, in the earlier window and in the later; None where it was not seen."""
+
+    label: str
+    before: MoverSeen | None
+    after: MoverSeen | None
+
+
+@dataclass(frozen=True, slots=True)
 class ComparedThings:
     """The things that differ between two windows; `same` counts those that do not."""
 
@@ -619,6 +639,7 @@ class ComparedThings:
     missed: tuple[ComparedThing, ...]
     not_looked_at: tuple[ComparedThing, ...]
     same: int
+    movers: tuple[ComparedMover, ...] = ()
 
 
 class Pair(NamedTuple):
@@ -626,6 +647,27 @@ class Pair(NamedTuple):
 
     this: float | None
     other: float | None
+
+
+class Standing(NamedTuple):
+    """A place (m) and the named one it is in: seconds for which the robot stood, since when first.
+
+    `since` has no time where it did not stand there.
+    """
+
+    place: tuple[float, float]
+    inside: str | None
+    seconds: Pair
+    since: tuple[Ns | None, Ns | None]
+
+
+class FarFromOther(NamedTuple):
+    """A point of a way (m): how far the other way is (m), and when the robot was there first."""
+
+    place: tuple[float, float]
+    inside: str | None
+    away_m: float
+    time: Ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -636,6 +678,10 @@ class Comparison(AnswerWithNotes):
         lengths: of the windows (s), and `recorded` how much of each was recorded.
         frame_id: of the things' places.
         way: numbers by name: metres, m/s, seconds and counts.
+        way_frame_id: of the places where the robot stood, and of points of the way.
+        stood: where it stood in one window longer than in the other.
+        farthest: the points of this way, and of the other one, that are farthest from the other
+            and from this; None where the ways are the same.
         places: minutes in each named place.
         errors: reports of each error.
         silences: seconds for which each topic was silent.
@@ -649,6 +695,9 @@ class Comparison(AnswerWithNotes):
     places: tuple[tuple[str, Pair], ...]
     errors: tuple[tuple[str, Pair], ...]
     silences: tuple[tuple[str, Pair], ...]
+    way_frame_id: str = ""
+    stood: tuple[Standing, ...] = ()
+    farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
 
 
 @dataclass(frozen=True, slots=True)

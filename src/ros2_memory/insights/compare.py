@@ -1,4 +1,4 @@
-"""What differs between two windows: things, way, time in places, errors and silences.
+"""What differs between two windows: things, way, standstills, time in places, errors, silences.
 
 Two numbers differ where they are apart by more than a tenth of the larger, and by more than what
 noise and the digests' rounding may make of equal ones (`_LEAST`).
@@ -6,34 +6,42 @@ noise and the digests' rounding may make of equal ones (`_LEAST`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import place_at
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import note_unread, recording_gaps
 from ros2_memory.history.driven_path import length_notes, pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.recap import drive_in, found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits
+from ros2_memory.places.region_visits import place_visits, track_in
+from ros2_memory.places.two_ways import farthest_apart, placed_stands, stood_at
 from ros2_memory.places.where import parse_where, times_inside
-from ros2_memory.results import ComparedThings, Comparison, Pair
+from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, Standing
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
+    from ros2_memory.insights.recap import Drive
+    from ros2_memory.places.map_placement import MapPlacement
+    from ros2_memory.places.two_ways import FarPoint
     from ros2_memory.places.where import Where
 
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}
+_LEAST_APART_M: Final = 0.5
 _LEAST_MINUTES: Final = 0.2
 _LEAST_SILENT_S: Final = 10.0
 _LEAST_COUNT: Final = 0.5
@@ -51,7 +59,8 @@ def compare(
 ) -> Comparison:
     """Returns what differs in a window (Unix seconds, inclusive) from another one.
 
-    `where` takes the things that are in a region in either window, and the time in that region.
+    `where` takes the things that are in a region in either window, and the time, the standstills
+    and the points of the way in that region.
 
     Raises:
         InvalidArgumentsError: the bounds make no window, or `where` is no region.
@@ -64,7 +73,11 @@ def compare(
     view = open_view(memory, call, reach)
     windows = clamped(view, asked), clamped(view, other)
     frame, things = _things(view, windows, region)
-    ways, places = [_way(view, each) for each in windows], _places(view, windows, region)
+    drives = [drive_in(view, each) for each in windows]
+    ways = [_way(view, drive, each) for drive, each in zip(drives, windows, strict=True)]
+    placement = _placement(view)
+    places = _places(view, placement, windows, region)
+    apart = _ways_apart(view, placement, drives, windows, region)
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
     for each in windows:
         note_unread(view, each)
@@ -79,6 +92,9 @@ def compare(
         places=_differing(places[0], places[1], _LEAST_MINUTES),
         errors=_differing(errors[0], errors[1], _LEAST_COUNT),
         silences=_differing(silences[0], silences[1], _LEAST_SILENT_S),
+        way_frame_id=apart.frame_id,
+        stood=apart.stood,
+        farthest=apart.farthest,
         notes=view.notes.sentences(),
     )
 
@@ -104,9 +120,8 @@ def _things(
     return frame, ThingsBetween(known, (first, second), where, limits.places).compared()
 
 
-def _way(view: View, window: TimeWindow) -> dict[str, float | None]:
+def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
     """Returns the numbers of the way; None for what is not known."""
-    drive = drive_in(view, window)
     known = drive.trajectory
     if known is None or not known.is_known:
         return dict.fromkeys(_LEAST)
@@ -122,17 +137,87 @@ def _way(view: View, window: TimeWindow) -> dict[str, float | None]:
     }
 
 
+def _placement(view: View) -> MapPlacement | None:
+    try:
+        topic = resolve_pose_topic(view)
+        return map_placement(view, pose_frame(view, topic), topic)
+    except (InvalidArgumentsError, NoDataError, UndecodableError):
+        return None
+
+
+class _WaysApart(NamedTuple):
+    """What differs between two ways in space, and the frame of its places."""
+
+    frame_id: str = ""
+    stood: tuple[Standing, ...] = ()
+    farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
+
+
+def _ways_apart(
+    view: View,
+    placement: MapPlacement | None,
+    drives: Sequence[Drive],
+    windows: tuple[TimeWindow, TimeWindow],
+    where: Where | None,
+) -> _WaysApart:
+    """Returns where the robot stood, and where it drove, in one window and not in the other."""
+    if placement is None or any(each.path is None for each in drives):
+        return _WaysApart()
+    frame = placement.frame_id
+    if where is not None and where.frame_id not in {None, frame}:
+        return _WaysApart()
+    if not placement.is_map and not _is_one_session(view, windows):
+        view.notes.add(
+            f"where the robot stood and drove is not compared: {frame} begins anew whenever it is "
+            "started, and no transforms lead to a map"
+        )
+        return _WaysApart()
+    region, places = None if where is None else where.region, view.memory.limits.places
+    tracks = [track_in(view, frame, each) for each in windows]
+    stands = [
+        [*placed_stands(track, ((each.start, each.end) for each, _ in drive.standstills), region)]
+        for track, drive in zip(tracks, drives, strict=True)
+    ]
+    stood: list[Standing] = []
+    for at in stood_at(*stands):
+        this, other = (unix_from_ns(each) for each in at.durations)
+        if differ(this, other, _LEAST["stood_s"]):
+            inside = place_at(places, frame, at.x, at.y)
+            stood.append(Standing((at.x, at.y), inside, Pair(this, other), at.since))
+    stood.sort(key=lambda each: -abs((each.seconds.this or 0.0) - (each.seconds.other or 0.0)))
+    points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
+    one, two = (None if each is None else _far(places, frame, each) for each in points)
+    return _WaysApart(frame, tuple(stood), (one, two))
+
+
+def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther | None:
+    """Returns a point with the place that it is in; None where the ways are one."""
+    if point.away_m < _LEAST_APART_M:
+        return None
+    inside = place_at(places, frame, point.x, point.y)
+    return FarFromOther((point.x, point.y), inside, point.away_m, point.time)
+
+
+def _is_one_session(view: View, windows: tuple[TimeWindow, TimeWindow]) -> bool:
+    """Whether all poses of two windows are of one session, whose odometry goes on."""
+    topic, sessions = resolve_pose_topic(view), sessions_of(view)
+    found = {
+        sessions.of(recording)
+        for recording, span in view.snapshot.timeline.recordings(topic).items()
+        if any(each.overlaps(*span) for each in windows)
+    }
+    return len(found) < 2
+
+
 def _places(
-    view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
+    view: View,
+    placement: MapPlacement | None,
+    windows: tuple[TimeWindow, TimeWindow],
+    where: Where | None,
 ) -> list[dict[str, float | None]]:
     """Returns the minutes in each named place, or in a region, of each window."""
     places = view.memory.limits.places
-    if where is None and not places:
-        return [{}, {}]
-    try:
-        topic = resolve_pose_topic(view)
-        placement = map_placement(view, pose_frame(view, topic), topic)
-    except (InvalidArgumentsError, NoDataError, UndecodableError):
+    if placement is None or (where is None and not places):
         return [{}, {}]
     found: list[dict[str, float | None]] = []
     for window in windows:

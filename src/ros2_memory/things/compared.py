@@ -4,11 +4,12 @@ A thing that was seen in both is compared by where it was seen last in each. One
 the later alone *appeared* only where its place was looked at in the earlier one, from where it is
 seen, so often that missing it by chance is below 1 %. One that was seen in the earlier alone is
 reported as not seen where expected by the same rule, and else as not looked at. What moves by
-itself has no place, and is not compared.
+itself has no place: it is compared by whether it was seen, how many at once, and where last.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -16,21 +17,24 @@ import numpy as np
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.results import ComparedThing, ComparedThings, ThingStay
+from ros2_memory.results import ComparedMover, ComparedThing, ComparedThings, MoverSeen, ThingStay
+from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.presence import missed_in
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.timebase import Ns
     from ros2_memory.places.where import Where
-    from ros2_memory.things.instances import Instance, PlacedStay
+    from ros2_memory.things.instances import Instance, Mover, PlacedStay
     from ros2_memory.things.known import KnownThings
 
 _MM: Final = 1000.0
+_SAME_MOVER_M: Final = 1.0
+"""What moves by itself, and was last seen so near to where it was before, is where it was."""
 
 
 class _Seen(NamedTuple):
@@ -76,6 +80,39 @@ class ThingsBetween:
             missed=tuple(lists.get("missed", ())),
             not_looked_at=tuple(lists.get("unknown", ())),
             same=same,
+            movers=tuple(sorted(self._movers(), key=_mover_order)),
+        )
+
+    def _movers(self) -> Iterator[ComparedMover]:
+        """Yields what moves by itself and was not seen alike in both windows."""
+        for mover in self._known.estimate.movers:
+            before = self._mover_in(mover, self._earlier, self._later.start)
+            after = self._mover_in(mover, self._later)
+            if before is None and after is None:
+                continue
+            if before is not None and after is not None:
+                away = math.dist(before.place[:2], after.place[:2])
+                if before.at_once == after.at_once and away <= _SAME_MOVER_M:
+                    continue
+            yield ComparedMover(self._known.estimate.names[mover.key], before, after)
+
+    def _mover_in(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
+        estimate, frame = self._known.estimate, self._known.frames[mover.epoch]
+        rows = self._inside(mover.spots, window, before)
+        spots = estimate.sights.spots
+        rows = rows[[self._is_in(frame, x, y) for x, y in _places(spots[rows])]]
+        if not len(rows):
+            return None
+        seen = spots[rows]
+        x, y, z, last = seen[
+            int(seen[:, Spot.LAST].argmax()), [Spot.X, Spot.Y, Spot.Z, Spot.LAST]
+        ].tolist()
+        return MoverSeen(
+            at_once=most_at_once(seen),
+            count=int(estimate.counts[rows].sum()),
+            place=(x / _MM, y / _MM, z / _MM),
+            inside=place_at(self._places, frame, x / _MM, y / _MM),
+            last=last,
         )
 
     def _compared(self, instance: Instance) -> tuple[str, ComparedThing | None] | None:
@@ -115,15 +152,18 @@ class ThingsBetween:
         return "moved", self._thing(instance, self._last_to(instance, self._earlier), after)
 
     def _seen(self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS) -> _Seen | None:
-        spots = self._known.estimate.sights.spots
         for stay in reversed(instance.stays):
-            rows = stay.spots
-            first, last = spots[rows, Spot.FIRST], spots[rows, Spot.LAST]
-            inside = (first < window.stop) & (last >= window.start) & (last < before)
-            inside &= self._known.estimate.counts[rows] > 0
-            if inside.any():
-                return _Seen(stay, rows[inside])
+            rows = self._inside(stay.spots, window, before)
+            if len(rows):
+                return _Seen(stay, rows)
         return None
+
+    def _inside(self, rows: Ints, window: TimeWindow, before: Ns) -> Ints:
+        """Returns the spots that count, of bags that reach into a window and end before a time."""
+        spots = self._known.estimate.sights.spots
+        first, last = spots[rows, Spot.FIRST], spots[rows, Spot.LAST]
+        inside = (first < window.stop) & (last >= window.start) & (last < before)
+        return np.asarray(rows[inside & (self._known.estimate.counts[rows] > 0)])
 
     def _last_to(self, instance: Instance, window: TimeWindow) -> _Seen:
         """Returns where a thing was last seen before a window's end, as it was known then."""
@@ -132,12 +172,15 @@ class ThingsBetween:
         return _Seen(stay, stay.spots[spots[stay.spots, Spot.FIRST] < window.stop])
 
     def _is_there(self, instance: Instance, seen: _Seen) -> bool:
-        where, frame = self._where, self._known.frames[instance.epoch]
+        return self._is_in(self._known.frames[instance.epoch], seen.stay.x, seen.stay.y)
+
+    def _is_in(self, frame: str, x_mm: float, y_mm: float) -> bool:
+        where = self._where
         if where is None:
             return True
         if where.frame_id not in {None, frame}:
             return False
-        return where.region.contains(seen.stay.x / _MM, seen.stay.y / _MM)
+        return where.region.contains(x_mm / _MM, y_mm / _MM)
 
     def _thing(
         self,
@@ -172,3 +215,13 @@ class ThingsBetween:
 def _by_time(thing: ComparedThing) -> tuple[int, str]:
     stay = thing.after or thing.before
     return (0 if stay is None else -stay.end, thing.label)
+
+
+def _places(spots: Ints) -> list[list[int]]:
+    found: list[list[int]] = spots[:, [Spot.X, Spot.Y]].tolist()
+    return found
+
+
+def _mover_order(mover: ComparedMover) -> tuple[int, str]:
+    seen = mover.after or mover.before
+    return (0 if seen is None else -seen.last, mover.label)

@@ -15,6 +15,7 @@ from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
+from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
 
 if TYPE_CHECKING:
@@ -155,7 +156,6 @@ class _Finder:
         newest = int(spots[:, Spot.LAST].argmax())
         x, y, z, dev = spots[newest, [Spot.X, Spot.Y, Spot.Z, Spot.DEV]].tolist()
         best, median = self._scores(rows)
-        together = np.sort(spots[:, Spot.TOGETHER])
         return Thing(
             label=result.names[mover.key],
             also_seen_as=(),
@@ -170,8 +170,7 @@ class _Finder:
             median=median,
             robot=self._robot(int(rows[newest])),
             still_there=None,
-            # One message in a hundred may have a false one.
-            at_once=max(1, int(together[-max(1, len(together) // 100)])),
+            at_once=most_at_once(spots),
         )
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
@@ -252,10 +251,15 @@ def _place(x_mm: float, y_mm: float, z_mm: float) -> tuple[float, float, float]:
 def _by_place(
     parts: Sequence[tuple[PlacedStay, Ints]],
 ) -> list[list[tuple[PlacedStay, Ints]]]:
-    """Returns the stays in groups of those that follow each other at one place."""
+    """Returns the stays in groups of those that follow each other at one place.
+
+    One after whose end the place was seen without the thing ends a group: it was taken away, and
+    brought back.
+    """
     groups: list[list[tuple[PlacedStay, Ints]]] = []
     for part in parts:
-        if groups and groups[-1][-1][0].place == part[0].place:
+        before = groups[-1][-1][0] if groups else None
+        if before is not None and before.place == part[0].place and before.left is None:
             groups[-1].append(part)
         else:
             groups.append([part])

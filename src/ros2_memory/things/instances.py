@@ -127,7 +127,6 @@ class Mover:
     key: str
     epoch: int
     spots: Ints
-    at_once: int
 
 
 @dataclass(slots=True)
@@ -199,9 +198,7 @@ def estimate(
         if _moves_by_itself(group, linked):
             if not _is_seen(group, seen):
                 continue
-            together = spots[group.rows, Spot.TOGETHER]
-            at_once = int(np.sort(together)[-max(1, len(together) // 100)])
-            movers.append(Mover(group.key, group.epoch, group.rows, at_once))
+            movers.append(Mover(group.key, group.epoch, group.rows))
             continue
         for each in linked:
             last = each.stays[-1]
@@ -496,6 +493,15 @@ def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
             trimmed.also, trimmed.left = stay.also, stay.left
             found.append(trimmed)
     return found
+
+
+def most_at_once(spots: Ints) -> int:
+    """Returns how many of a label were seen at once; one message in a hundred may have a false one.
+
+    `spots` are its rows of `Sights.spots`, at least one.
+    """
+    together = np.sort(spots[:, Spot.TOGETHER])
+    return max(1, int(together[-max(1, len(together) // 100)]))
 
 
 def _is_named_mover(key: str) -> bool:

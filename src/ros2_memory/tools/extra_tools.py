@@ -77,10 +77,11 @@ _THINGS = ToolDeclaration(
 )
 _COMPARE = ToolDeclaration(
     (ToolName("compare", "What differs"),),
-    "What differs between two times: things that moved, appeared, or were missed; way, minutes in "
-    "places, errors, silences. What is equal is left out. Reply: {{things: {{moved: [{{label, was, "
-    "is}}], appeared, not_seen_where_expected, not_looked_at}}, way: {{name: {{this, with}}}}, "
-    "minutes, errors, silent_s}}.",
+    "What differs between two times, or two runs: things that moved, appeared, or were missed; "
+    "way, standstills, minutes in places, errors, silences. What is equal is left out. Reply: "
+    "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "
+    "movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
+    "farthest_apart, minutes, errors, silent_s}}.",
     CompareArguments,
     compare,
     blocking=True,

@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory import results
 from ros2_memory.core.text import shortened
 from ros2_memory.tools.reply_json import degrees, moment, render, rounded, seconds, with_notes
+from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.core.model import Vector3
     from ros2_memory.tools.reply_size import JsonObject
 
-_MOST_MOVED: Final = 10
 _MOST_COMPARED: Final = 5
+_LONGEST_COMPARISON: Final = 6_000
+"""Characters of a comparison; lists are cut until it is no longer."""
 _LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
 _LONGEST_LABEL: Final = 40
@@ -83,46 +87,96 @@ def _place(place: Vector3) -> JsonObject:
 
 @render.register(results.Comparison)
 def _comparison(answer: results.Comparison) -> JsonObject:
-    """Returns what differs; a part in which nothing does is left out."""
+    """Returns what differs; a part in which nothing does is left out, and long lists are cut."""
+    reply: JsonObject = {}
+    for most in range(_MOST_COMPARED, 0, -1):
+        reply = with_notes(_compared(answer, most), answer.notes)
+        if len(to_json_text(reply)) <= _LONGEST_COMPARISON:
+            break
+    return reply
+
+
+def _compared(answer: results.Comparison, most: int) -> JsonObject:
+    """Returns what differs, with `most` of each kind and twice as many things that moved."""
     reply: JsonObject = {
         "duration_s": _pair(answer.lengths, 1),
         "recorded_s": _pair(answer.recorded, 1),
     }
-    things = _compared_things(answer)
-    if things:
-        reply["frame_id"] = answer.frame_id or None
+    things, way = _compared_things(answer.things, most), _ways_apart(answer, most)
+    frames = [answer.frame_id or None] * bool(things) + [answer.way_frame_id] * bool(way)
+    if frames:
+        reply["frame_id"] = frames[0]
+    if frames[1:] and frames[0] != frames[1]:
+        reply["way_frame_id"] = frames[1]
     reply["things"] = things
     reply["things_unchanged"] = answer.things.same
     if answer.way:
         reply["way"] = {name: _pair(pair, 2) for name, pair in answer.way}
+    reply |= way
     for key, places, found in (
         ("minutes", 1, answer.places),
         ("errors", 0, answer.errors),
         ("silent_s", 0, answer.silences),
     ):
         if found:
-            shown = found[:_MOST_COMPARED]
             reply[key] = {
-                shortened(name, _LONGEST_NAME): _pair(pair, places) for name, pair in shown
+                shortened(name, _LONGEST_NAME): _pair(pair, places) for name, pair in found[:most]
             }
-        if len(found) > _MOST_COMPARED:
-            reply[f"{key}_total"] = len(found)
-    return with_notes(reply, answer.notes)
-
-
-def _compared_things(answer: results.Comparison) -> JsonObject:
-    things = answer.things
-    reply: JsonObject = {}
-    for key, found, most in (
-        ("moved", things.moved, _MOST_MOVED),
-        ("appeared", things.appeared, _MOST_COMPARED),
-        ("not_seen_where_expected", things.missed, _MOST_COMPARED),
-        ("not_looked_at", things.not_looked_at, _MOST_COMPARED),
-    ):
-        if found:
-            reply[key] = [_compared_thing(each) for each in found[:most]]
         if len(found) > most:
             reply[f"{key}_total"] = len(found)
+    return reply
+
+
+def _ways_apart(answer: results.Comparison, most: int) -> JsonObject:
+    reply: JsonObject = {}
+    _list(reply, "stood_at", [_standing(each) for each in answer.stood], most)
+    far: JsonObject = {}
+    for key, each in zip(("this", "with"), answer.farthest, strict=True):
+        if each is not None:
+            at = _point(each.place, each.inside)
+            far[key] = {**at, "away_m": rounded(each.away_m, 1), "t": moment(each.time)}
+    return {**reply, "farthest_apart": far} if far else reply
+
+
+def _compared_things(things: results.ComparedThings, most: int) -> JsonObject:
+    reply: JsonObject = {}
+    for key, found, shown in (
+        ("moved", things.moved, 2 * most),
+        ("appeared", things.appeared, most),
+        ("not_seen_where_expected", things.missed, most),
+        ("not_looked_at", things.not_looked_at, most),
+    ):
+        _list(reply, key, [_compared_thing(each) for each in found], shown)
+    _list(reply, "movers", [_compared_mover(each) for each in things.movers], most)
+    return reply
+
+
+def _list(reply: JsonObject, key: str, found: Sequence[JsonObject], most: int) -> None:
+    """Adds the first of some, and how many there are where they are more."""
+    if found:
+        reply[key] = [*found[:most]]
+    if len(found) > most:
+        reply[f"{key}_total"] = len(found)
+
+
+def _compared_mover(mover: results.ComparedMover) -> JsonObject:
+    reply: JsonObject = {"label": shortened(mover.label, _LONGEST_LABEL)}
+    for key, seen in (("was", mover.before), ("is", mover.after)):
+        if seen is not None:
+            reply[key] = {
+                "times": seen.count,
+                "at_once": seen.at_once,
+                **_point(seen.place[:2], seen.inside),
+                "last_seen": moment(seen.last),
+            }
+    return reply
+
+
+def _standing(stood: results.Standing) -> JsonObject:
+    reply = {**_point(stood.place, stood.inside), **_pair(stood.seconds, 0)}
+    for key, since in zip(("this_since", "with_since"), stood.since, strict=True):
+        if since is not None:
+            reply[key] = moment(since)
     return reply
 
 
@@ -138,9 +192,13 @@ def _compared_thing(thing: results.ComparedThing) -> JsonObject:
 
 
 def _at(stay: results.ThingStay) -> JsonObject:
-    x, y, _ = stay.place
-    inside: JsonObject = {} if stay.inside is None else {"in": stay.inside}
-    return {"x": rounded(x, 2), "y": rounded(y, 2), **inside}
+    return _point(stay.place[:2], stay.inside)
+
+
+def _point(place: tuple[float, float], inside: str | None) -> JsonObject:
+    x, y = place
+    named: JsonObject = {} if inside is None else {"in": inside}
+    return {"x": rounded(x, 2), "y": rounded(y, 2), **named}
 
 
 def _pair(pair: results.Pair, places: int) -> JsonObject:

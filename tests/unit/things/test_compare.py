@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +12,19 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.insights.compare import differ
+from ros2_memory.results import (
+    ComparedMover,
+    ComparedThing,
+    ComparedThings,
+    Comparison,
+    FarFromOther,
+    MoverSeen,
+    Pair,
+    Standing,
+    ThingStay,
+)
+from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import log_entry
 from tests.support.memories import asked, memory_of, recalling, replied
 from tests.unit.things.test_find import (
@@ -144,6 +159,146 @@ def test_way_minutes_and_errors_are_listed_where_they_differ(tmp_path: Path) -> 
     [(text, reports)] = reply["errors"].items()
     assert "motor is hot" in text
     assert reports == {"this": 1, "with": 0}
+
+
+def drive(start: int, *corners: tuple[float, float]) -> list[Msg]:
+    """Drives through corners (m) at 0.5 m/s, looking along x, two poses a second."""
+    messages: list[Msg] = []
+    at_s = float(start)
+    for (x, y), (to_x, to_y) in pairwise(corners):
+        steps = max(1, round(math.dist((x, y), (to_x, to_y)) / 0.25))
+        for nth in range(steps):
+            share = nth / steps
+            pose = (x + share * (to_x - x), y + share * (to_y - y), 0.0)
+            messages += scene(at_s, pose, [])
+            at_s += 0.5
+    return messages
+
+
+STRAIGHT = ((0.0, 0.0), (8.0, 0.0))
+DETOUR = ((0.0, 0.0), (3.0, 0.0), (3.0, 1.5), (5.0, 1.5), (5.0, 0.0), (8.0, 0.0))
+
+
+def test_two_runs_of_a_route_differ_by_where_they_are_farthest_apart(tmp_path: Path) -> None:
+    reply = compared(tmp_path, [*drive(0, *STRAIGHT), *drive(60, *DETOUR)])
+    far = reply["farthest_apart"]
+    assert far.keys() == {"this", "with"}
+    assert far["this"]["y"] == pytest.approx(1.5, abs=0.1)
+    assert far["this"]["away_m"] == pytest.approx(1.5, abs=0.1)
+    assert far["this"]["in"] == "kitchen"
+    assert BEGIN + 60 + 8 <= far["this"]["t"] <= BEGIN + 60 + 14
+    assert far["with"]["x"] == pytest.approx(4.0, abs=0.2)
+    assert far["with"]["away_m"] == pytest.approx(1.0, abs=0.1)
+    assert reply["frame_id"] == "map"
+    beyond = ask(tmp_path, **EARLIER, **LATER, where={"x": [6, 9], "y": [-1, 1]})
+    assert "farthest_apart" not in beyond
+
+
+def test_two_equal_runs_do_not_differ_in_space(tmp_path: Path) -> None:
+    reply = compared(tmp_path, [*drive(0, *DETOUR), *drive(60, *DETOUR)])
+    assert not reply.keys() & {"farthest_apart", "stood_at", "way"}
+
+
+def test_standstills_are_compared_by_place_and_length(tmp_path: Path) -> None:
+    """Ten seconds at the door and fifteen at the end, against half a minute at the end."""
+    end = (4.0, 1.0, 0.0)
+    messages = [
+        *looked(0, 29, end),
+        *looked(60, 75, (1.0, 1.0, 0.0)),
+        *looked(75, 90, end),
+    ]
+    reply = compared(tmp_path, messages)
+    door, at_end = sorted(reply["stood_at"], key=lambda each: each["x"])
+    assert (door["x"], door["y"], door["in"]) == (1.0, 1.0, "kitchen")
+    assert (door["this"], door["with"]) == (14, 0)
+    assert door["this_since"] == BEGIN + 60
+    assert "with_since" not in door
+    assert (at_end["x"], at_end["this"], at_end["with"]) == (4.0, 14, 28)
+    assert "stood_s" not in reply["way"]  # as much in all, but elsewhere
+    near = ask(tmp_path, **EARLIER, **LATER, where={"x": 1.0, "y": 1.0, "radius_m": 1.0})
+    assert [each["x"] for each in near["stood_at"]] == [1.0]
+
+
+def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
+    stood = [scene(at, HERE, [], in_map=False) for at in range(30)]
+    later = [scene(at, (3.0, 0.0, 0.0), [], in_map=False) for at in range(60, 90)]
+    write(tmp_path / "two", [each for one in stood for each in one], name="first")
+    write(tmp_path / "two", [each for one in later for each in one], name="second")
+    reply = ask(tmp_path / "two", **EARLIER, **LATER)
+    assert not reply.keys() & {"stood_at", "farthest_apart"}
+    assert any("begins anew" in note for note in reply["notes"])
+    write(tmp_path / "one", [each for one in (*stood, *later) for each in one])
+    reply = ask(tmp_path / "one", **EARLIER, **LATER)
+    assert len(reply["stood_at"]) == 2
+    assert reply["frame_id"] == "odom"
+
+
+def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
+    someone, elsewhere = ("person", 3.0, 0.5), ("person", 4.0, -1.2)
+    first = looked(0, 30, HERE, someone)
+    here = compared(tmp_path / "here", [*first, *looked(60, 90, HERE, someone)])
+    assert here["things"] == {}
+    moved = compared(tmp_path / "moved", [*first, *looked(60, 90, HERE, elsewhere)])
+    assert moved["things"]["movers"] == [
+        {
+            "label": "person",
+            "was": {
+                "times": 30,
+                "at_once": 1,
+                "x": 3.0,
+                "y": 0.5,
+                "in": "kitchen",
+                "last_seen": BEGIN + 29,
+            },
+            "is": {
+                "times": 30,
+                "at_once": 1,
+                "x": 4.0,
+                "y": -1.2,
+                "in": "kitchen",
+                "last_seen": BEGIN + 89,
+            },
+        }
+    ]
+    two = compared(tmp_path / "two", [*first, *looked(60, 90, HERE, someone, elsewhere)])
+    assert two["things"]["movers"][0]["is"]["at_once"] == 2
+    alone = compared(tmp_path / "alone", [*first, *looked(60, 90, HERE)])
+    [person] = alone["things"]["movers"]
+    assert person.keys() == {"label", "was"}
+    away = ask(tmp_path / "alone", **EARLIER, **LATER, where={"x": 9.0, "y": 9.0, "radius_m": 1.0})
+    assert away["things"] == {}
+
+
+def test_a_comparison_is_cut_to_6_kb_however_much_differs() -> None:
+    at, name, pair = BEGIN * S + 565_926_123, "upstairs living room", Pair(100000.12, 34.56)
+    stay = ThingStay(at, at, (-112.34, -113.45, 1.0), 1000, name)
+    thing = ComparedThing("l" * 99, stay, stay, at, 1000)
+    seen = MoverSeen(3, 10_000, (-112.34, -113.45, 1.0), name, at)
+    point = FarFromOther((-112.34, -113.45), name, 12.3, at)
+    many = tuple((f"{nth} {'x' * 120}", pair) for nth in range(20))
+    things = (thing,) * 20
+    answer = Comparison(
+        lengths=pair,
+        recorded=pair,
+        frame_id="map",
+        things=ComparedThings(
+            things, things, things, things, 100, (ComparedMover("p" * 99, seen, seen),) * 20
+        ),
+        way=tuple((each, pair) for each in ("distance_m", "max_speed", "stood_s", "standstills")),
+        places=many,
+        errors=many,
+        silences=many,
+        way_frame_id="odom",
+        stood=(Standing(point.place, name, pair, (at, at)),) * 20,
+        farthest=(point, point),
+        notes=("a note " * 50,) * 3,
+    )
+    reply = render(answer)
+    assert isinstance(reply, dict)
+    assert 3_000 < len(to_json_text(reply)) <= 6_000
+    cut: Any = reply
+    assert (cut["stood_at_total"], cut["things"]["movers_total"], cut["errors_total"]) == (20,) * 3
+    assert len(cut["things"]["moved"]) == 2 * len(cut["stood_at"]) > 0
 
 
 def test_a_window_that_is_none_is_refused_by_its_name(tmp_path: Path) -> None:

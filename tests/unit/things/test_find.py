@@ -138,6 +138,21 @@ def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
         {"from": BEGIN + 40, "to": BEGIN + 59, "place": {"x": -2.0, "y": 0.5}, "times": 20},
     ]
     assert ask(tmp_path, label="mug", where="kitchen")["things"] == []
+
+
+def test_a_thing_that_was_taken_away_and_brought_back_has_its_place_twice(tmp_path: Path) -> None:
+    mug = ("mug", 3.0, 0.5)
+    away = [*looked(0, 20, HERE, mug), *looked(30, 50, AWAY), *looked(60, 80, HERE, mug)]
+    write(tmp_path / "unseen", away)
+    assert "moved" not in ask(tmp_path / "unseen", label="mug")["things"][0]
+    missed = [*looked(0, 20, HERE, mug), *looked(30, 50, HERE), *looked(60, 80, HERE, mug)]
+    write(tmp_path / "missed", missed)
+    [thing] = ask(tmp_path / "missed", label="mug")["things"]
+    assert [(each["from"], each["to"]) for each in thing["moved"]] == [
+        (BEGIN, BEGIN + 19),
+        (BEGIN + 60, BEGIN + 79),
+    ]
+    assert thing["count"] == 40
     [before] = ask(tmp_path, label="mug", where="kitchen", end=BEGIN + 25)["things"]
     assert before["place"]["x"] == 3.0
     assert "not_seen_where_expected" in before["still_there"]

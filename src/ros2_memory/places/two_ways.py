@@ -1,0 +1,214 @@
+"""Two ways of the robot by its tracks: where they are farthest apart, and where it stood in each.
+
+Both are told in one frame, so they are of use where that is the map, or where odometry did not
+begin anew between the two.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.intervals import SILENCE_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from ros2_memory.analysis.bag_frames import Floats, Times
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.regions import Region
+    from ros2_memory.core.timebase import Ns
+
+SAME_STAND_M: Final = 0.5
+"""Standstills so near to each other are at one place."""
+
+_STEP_M: Final = 0.1
+_MOST_SAMPLES: Final = 200_000
+_MOST_CELLS: Final = 4_000
+_CANDIDATES: Final = 64
+_SAMPLES_OF_STAND: Final = 9
+
+
+class FarPoint(NamedTuple):
+    """A point of a way (m), when the robot was there first, and how far the other way is (m)."""
+
+    x: float
+    y: float
+    time: Ns
+    away_m: float
+
+
+class Stand(NamedTuple):
+    """A standstill at a place (m)."""
+
+    x: float
+    y: float
+    start: Ns
+    duration: Ns
+
+
+class StoodAt(NamedTuple):
+    """How long the robot stood at a place (m) in each of two windows, and since when first."""
+
+    x: float
+    y: float
+    durations: tuple[Ns, Ns]
+    since: tuple[Ns | None, Ns | None]
+
+
+class _Steps(NamedTuple):
+    """The straight steps of a track in a window: their ends (m), one row each, and their times."""
+
+    begin: Floats
+    end: Floats
+    start: Times
+    stop: Times
+
+
+def farthest_apart(
+    this: tuple[RobotTrack, TimeWindow],
+    other: tuple[RobotTrack, TimeWindow],
+    region: Region | None = None,
+) -> tuple[FarPoint | None, FarPoint | None]:
+    """Returns the point of each way that is farthest from the other one.
+
+    Of each way the part in a window counts, and of that the points in a region, if one is given.
+    None where it has no point, or the other way has none at all.
+    """
+    one, two = _steps(*this), _steps(*other)
+    return _farthest(one, two, region), _farthest(two, one, region)
+
+
+def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
+    """Returns the steps of a track inside a window; a piece of one vertex is one of no length."""
+    count = len(track.times)
+    ends = np.append(track.begins[1:], [True])[:count]
+    after = np.where(ends, np.arange(count), np.arange(count) + 1)
+    alone = ends & track.begins
+    real = (~ends | alone) & (track.times < window.stop) & (track.times[after] >= window.start)
+    first, last = np.flatnonzero(real), after[real]
+    start = np.maximum(track.times[first], window.start)
+    stop = np.minimum(track.times[last], window.stop - 1)
+    lasted = np.maximum(track.times[last] - track.times[first], 1)
+    here = np.column_stack((track.x[first], track.y[first]))
+    there = np.column_stack((track.x[last], track.y[last]))
+    share = ((start - track.times[first]) / lasted)[:, None]
+    until = ((stop - track.times[first]) / lasted)[:, None]
+    return _Steps(here + share * (there - here), here + until * (there - here), start, stop)
+
+
+def _farthest(own: _Steps, other: _Steps, region: Region | None) -> FarPoint | None:
+    points, times = _sampled(own)
+    if region is not None:
+        inside = [region.contains(x, y) for x, y in points.tolist()]
+        points, times = points[inside], times[inside]
+    if not len(points) or not len(other.begin):
+        return None
+    points, times = _thinned(points, times)
+    marks, _ = _thinned(*_sampled(other))
+    near = np.concatenate(
+        [
+            np.hypot(*(some[:, None, :] - marks[None, :, :]).transpose(2, 0, 1)).min(axis=1)
+            for some in np.array_split(points, len(points) // 256 + 1)
+        ]
+    )
+    tried = np.argsort(-near, kind="stable")[:_CANDIDATES].tolist()
+    away_m, nth = max(((_away(points[nth], other), nth) for nth in tried), key=lambda each: each[0])
+    x, y = points[nth].tolist()
+    return FarPoint(x, y, int(times[nth]), away_m)
+
+
+def _sampled(steps: _Steps) -> tuple[Floats, Times]:
+    """Returns points along the steps, no farther apart than `_STEP_M` unless they are too many."""
+    lengths = np.hypot(*(steps.end - steps.begin).T)
+    step_m = max(_STEP_M, float(lengths.sum()) / _MOST_SAMPLES)
+    parts = np.ceil(lengths / step_m).astype(np.int64) + 1
+    row = np.repeat(np.arange(len(parts)), parts)
+    nth = np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)
+    share = nth / np.maximum(parts[row] - 1, 1)
+    points = steps.begin[row] + share[:, None] * (steps.end - steps.begin)[row]
+    lasted = (steps.stop - steps.start)[row]
+    return points, steps.start[row] + np.rint(lasted * share).astype(np.int64)
+
+
+def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
+    """Returns the first point in each cell of a grid as fine as leaves few of them."""
+    size = _STEP_M
+    while True:
+        cells = np.floor(points / size).astype(np.int64)
+        _, first = np.unique(cells, axis=0, return_index=True)
+        if len(first) <= _MOST_CELLS:
+            first.sort()
+            return points[first], times[first]
+        size *= 2
+
+
+def _away(point: Floats, steps: _Steps) -> float:
+    """Returns how far (m) a point is from the nearest step."""
+    along = steps.end - steps.begin
+    size = (along * along).sum(axis=1)
+    share = ((point - steps.begin) * along).sum(axis=1) / np.where(size > 0, size, 1.0)
+    nearest = steps.begin + np.clip(share, 0.0, 1.0)[:, None] * along
+    return float(np.hypot(*(nearest - point).T).min())
+
+
+def placed_stands(
+    track: RobotTrack, spans: Iterable[tuple[Ns, Ns]], region: Region | None = None
+) -> Iterator[Stand]:
+    """Yields the standstills of some times where the track was then; in a region, if one is given.
+
+    What the track does not know is left out.
+    """
+    if not len(track.times):
+        return
+    since = track.times[0]
+    for start, stop in spans:
+        at = np.linspace(start, stop, _SAMPLES_OF_STAND).astype(np.int64)
+        at = at[_is_known(track, at)]
+        if not len(at):
+            continue
+        x, y = (
+            float(np.median(np.interp(at - since, track.times - since, column)))
+            for column in (track.x, track.y)
+        )
+        if region is None or region.contains(x, y):
+            yield Stand(x, y, start, stop - start)
+
+
+def _is_known(track: RobotTrack, at: Times) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Returns whether a track says where the robot was at some times."""
+    last = np.searchsorted(track.times, at, side="right") - 1
+    following = np.minimum(last + 1, len(track.times) - 1)
+    before = (last >= 0) & (at - track.times[last] <= SILENCE_NS)
+    after = (track.times[following] >= at) & (track.times[following] - at <= SILENCE_NS)
+    between = (last >= 0) & (last + 1 < len(track.times)) & ~track.begins[following]
+    return np.asarray(between | before | after)
+
+
+def stood_at(this: Iterable[Stand], other: Iterable[Stand]) -> list[StoodAt]:
+    """Returns the places where the robot stood in two windows, and how long in each.
+
+    A place is where it stood longest within `SAME_STAND_M`.
+    """
+    every = [(0, each) for each in this] + [(1, each) for each in other]
+    every.sort(key=lambda each: (-each[1].duration, each[1]))
+    middles: list[Stand] = []
+    sums: list[list[Ns]] = []
+    since: list[list[Ns | None]] = []
+    for side, stand in every:
+        away = [(each.x - stand.x) ** 2 + (each.y - stand.y) ** 2 for each in middles]
+        nth = min(range(len(away)), key=away.__getitem__, default=None)
+        if nth is None or away[nth] > SAME_STAND_M**2:
+            nth = len(middles)
+            middles.append(stand)
+            sums.append([0, 0])
+            since.append([None, None])
+        sums[nth][side] += stand.duration
+        known = since[nth][side]
+        since[nth][side] = stand.start if known is None else min(known, stand.start)
+    return [
+        StoodAt(middle.x, middle.y, (both[0], both[1]), (first[0], first[1]))
+        for middle, both, first in zip(middles, sums, since, strict=True)
+    ]

@@ -1,0 +1,140 @@
+"""Two ways of the robot, against points that are laid along them one by one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import Rectangle
+from ros2_memory.places.two_ways import Stand, farthest_apart, placed_stands, stood_at
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+S = 10**9
+EVER = TimeWindow.everything()
+
+Vertex = tuple[float, float, float]
+"""Seconds, and a place (m)."""
+
+
+def track(*pieces: Sequence[Vertex]) -> RobotTrack:
+    """A track of pieces between which the robot was not seen."""
+    every = [vertex for piece in pieces for vertex in piece]
+    times, x, y = (np.array(column, np.float64) for column in zip(*every, strict=True))
+    begins = [nth == 0 for piece in pieces for nth in range(len(piece))]
+    return RobotTrack((times * S).astype(np.int64), x, y, 0 * x, np.array(begins), 0.05)
+
+
+def points_of(piece: Sequence[Vertex]) -> list[tuple[float, float]]:
+    found = []
+    for (_, x, y), (_, to_x, to_y) in zip(piece, [*piece[1:], piece[-1]], strict=True):
+        parts = max(1, math.ceil(math.hypot(to_x - x, to_y - y) / 0.03))
+        found += [
+            (x + (to_x - x) * nth / parts, y + (to_y - y) * nth / parts) for nth in range(parts + 1)
+        ]
+    return found
+
+
+ways = st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=1, max_size=5).map(
+    lambda each: [(nth * 5.0, x, y) for nth, (x, y) in enumerate(each)]
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(ways, ways)
+@example([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)])
+@example([(0.0, 0.0, 0.0), (5.0, 3.0, 0.0)], [(0.0, 1.0, 1.0), (5.0, 1.0, -3.0)])
+def test_the_farthest_point_is_as_far_as_any_laid_along_the_way(
+    one: list[Vertex], two: list[Vertex]
+) -> None:
+    found = farthest_apart((track(one), EVER), (track(two), EVER))
+    laid = np.array(points_of(one)), np.array(points_of(two))
+    for point, own, other in zip(found, laid, laid[::-1], strict=True):
+        assert point is not None
+        away = np.hypot(*(own[:, None] - other[None]).transpose(2, 0, 1)).min(axis=1)
+        assert point.away_m == pytest.approx(float(away.max()), abs=0.16)
+        here = np.array((point.x, point.y))
+        assert np.hypot(*(own - here).T).min() < 0.03
+        assert np.hypot(*(other - here).T).min() == pytest.approx(point.away_m, abs=0.03)
+
+
+def test_a_detour_is_far_from_the_straight_way_and_not_the_other_way_round() -> None:
+    straight = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)])
+    detour = track([(0, 0, 0), (4, 4, 0), (6, 4, 2), (8, 6, 2), (10, 6, 0), (14, 10, 0)])
+    far, back = farthest_apart((detour, EVER), (straight, EVER))
+    assert far is not None
+    assert back is not None
+    assert (far.y, far.away_m) == (2.0, 2.0)
+    assert 4.0 <= far.x <= 6.0
+    assert far.time == pytest.approx((6 + far.x - 4) * S, abs=0.1 * S)
+    assert back.away_m == pytest.approx(1.0, abs=0.05)  # half of the way under the detour
+
+
+def test_only_the_window_and_the_region_count_and_no_way_is_drawn_across_a_gap() -> None:
+    way = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)], [(30.0, 10.0, 5.0), (40.0, 0.0, 5.0)])
+    still = track([(0.0, 0.0, 0.0)])
+    assert farthest_apart((way, EVER), (still, EVER))[0] == (10.0, 5.0, 30 * S, math.hypot(10, 5))
+    early = farthest_apart((way, TimeWindow(0, 4 * S)), (still, EVER))[0]
+    assert early is not None
+    assert early.x == pytest.approx(4.0, abs=0.1)
+    low = farthest_apart((way, EVER), (still, EVER), Rectangle(2.0, 3.0, -1.0, 4.0))[0]
+    assert low is not None
+    assert low.x == pytest.approx(3.0, abs=0.1)
+    assert low.y == 0.0
+    # Nobody knows whether it was half way across.
+    middle = track([(20.0, 10.0, 2.5)])
+    across = farthest_apart((middle, EVER), (way, EVER))[0]
+    assert across is not None
+    assert across.away_m == 2.5
+
+
+def test_without_a_way_there_is_nothing_to_be_far_from() -> None:
+    way = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)])
+    assert farthest_apart((way, EVER), (empty_track(), EVER)) == (None, None)
+    assert [*placed_stands(empty_track(), [(0, S)])] == []
+
+
+def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> None:
+    way = track([(0.0, 1.0, 2.0), (20.0, 1.0, 2.0)], [(100.0, 7.0, 2.0), (120.0, 7.0, 2.0)])
+    spans = [(2 * S, 18 * S), (50 * S, 70 * S), (105 * S, 115 * S)]
+    assert [*placed_stands(way, spans)] == [
+        Stand(1.0, 2.0, 2 * S, 16 * S),
+        Stand(7.0, 2.0, 105 * S, 10 * S),
+    ]
+    assert len([*placed_stands(way, spans, Rectangle(5.0, 8.0, 0.0, 3.0))]) == 1
+
+
+stands = st.lists(
+    st.builds(
+        Stand, st.floats(0, 3), st.floats(0, 3), st.integers(0, 10**9), st.integers(1, 10**9)
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(stands, stands)
+def test_every_standstill_is_of_one_place_and_near_to_it(
+    one: list[Stand], two: list[Stand]
+) -> None:
+    found = stood_at(one, two)
+    for side, given_ones in enumerate((one, two)):
+        assert sum(at.durations[side] for at in found) == sum(each.duration for each in given_ones)
+        for each in given_ones:
+            assert min(math.dist((at.x, at.y), (each.x, each.y)) for at in found) <= 0.5
+    assert {(at.x, at.y) for at in found} <= {(each.x, each.y) for each in (*one, *two)}
+    assert [at.durations for at in stood_at(two, one)] == [at.durations[::-1] for at in found]
+
+
+def test_standstills_at_one_place_add_up_and_have_the_first_time() -> None:
+    here, again = Stand(1.0, 1.0, 50, 10), Stand(1.2, 1.1, 5, 7)
+    [at] = stood_at([here, again], [])
+    assert (at.durations, at.since) == ((17, 0), (5, None))
