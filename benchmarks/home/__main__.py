@@ -61,6 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 "result": each.result,
                 "calls": each.calls,
                 "characters": each.characters,
+                "longest_reply": each.longest_reply,
                 "slowest_s": round(each.slowest_s, 4),
             }
             for each in outcomes

@@ -15,14 +15,16 @@ from tests.support.memories import asked, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
+pytestmark = pytest.mark.xdist_group("home")
+
 S = 10**9
 SCALE = Scale()
 
 
 def test_the_blind_time_and_the_step_of_the_clock_are_all_that_is_reported(
-    tmp_path: Path,
+    worlds: Path,
 ) -> None:
-    bags, truth = made(SCALE, tmp_path) / "bags", truth_of(SCALE)
+    bags, truth = made(SCALE, worlds) / "bags", truth_of(SCALE)
     memory = memory_of(bags, clock=SettableClock(round(truth.recorded[-1][1] + 60) * S))
     reply = asked(memory, bags, "data_time_range")
     [silence], [step] = reply["silences"], reply["clock_steps"]

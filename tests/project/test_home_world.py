@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from benchmarks.home.world import World
     from numpy.typing import NDArray
 
+pytestmark = pytest.mark.xdist_group("home")
+
 SCALE = Scale()
 
 
@@ -48,8 +50,8 @@ def _truth() -> Truth:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made(SCALE, tmp_path_factory.mktemp("worlds"))
+def folder(worlds: Path) -> Path:
+    return made(SCALE, worlds)
 
 
 def _splits(folder: Path) -> list[Path]:

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 LIMIT: Final = 12
 _MOST_NAMES: Final = 5
-_MOST_STAYS: Final = 8
 _MM: Final = 1000.0
 
 
@@ -140,7 +139,7 @@ class _Finder:
             median=median,
             robot=self._robot(int(every[int(spots[:, Spot.LAST].argmax())])),
             still_there=self._still_there(instance, *parts[-1]),
-            moved=tuple(stays[-_MOST_STAYS:]) if len(stays) > 1 else (),
+            moved=tuple(stays) if len(stays) > 1 else (),
         )
 
     def _mover(self, mover: Mover) -> Thing | None:

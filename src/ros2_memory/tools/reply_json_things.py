@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from ros2_memory.tools.reply_size import JsonObject
 
 _MOST_COMPARED: Final = 5
-_LONGEST_COMPARISON: Final = 6_000
-"""Characters of a comparison; lists are cut until it is no longer."""
+_MOST_STAYS: Final = (8, 5, 3, 2)
+_LONGEST: Final = 6_000
+"""Characters of a reply; its lists are cut until it is no longer."""
 _LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
 _LONGEST_LABEL: Final = 40
@@ -25,16 +26,22 @@ _LONGEST_LABEL: Final = 40
 
 @render.register(results.Things)
 def _things(answer: results.Things) -> JsonObject:
-    reply: JsonObject = {
-        "frame_id": answer.frame_id or None,
-        "things": [_thing(each, answer) for each in answer.things],
-        "total": answer.total,
-        "labels": dict(answer.labels),
-    }
-    return with_notes(reply, answer.notes)
+    """Returns the things, each with as many of its newest places as leave the reply short."""
+    reply: JsonObject = {}
+    for most in _MOST_STAYS:
+        reply = {
+            "frame_id": answer.frame_id or None,
+            "things": [_thing(each, answer, most) for each in answer.things],
+            "total": answer.total,
+            "labels": dict(answer.labels),
+        }
+        reply = with_notes(reply, answer.notes)
+        if len(to_json_text(reply)) <= _LONGEST:
+            break
+    return reply
 
 
-def _thing(thing: results.Thing, answer: results.Things) -> JsonObject:
+def _thing(thing: results.Thing, answer: results.Things, most_stays: int) -> JsonObject:
     reply: JsonObject = {"label": thing.label}
     if thing.also_seen_as:
         reply["also_seen_as"] = [*thing.also_seen_as]
@@ -61,7 +68,9 @@ def _thing(thing: results.Thing, answer: results.Things) -> JsonObject:
     if thing.still_there is not None:
         reply["still_there"] = _still_there(thing.still_there)
     if thing.moved:
-        reply["moved"] = [_stay(each) for each in thing.moved]
+        reply["moved"] = [_stay(each) for each in thing.moved[-most_stays:]]
+    if len(thing.moved) > most_stays:
+        reply["moved_total"] = len(thing.moved)
     return reply
 
 
@@ -91,7 +100,7 @@ def _comparison(answer: results.Comparison) -> JsonObject:
     reply: JsonObject = {}
     for most in range(_MOST_COMPARED, 0, -1):
         reply = with_notes(_compared(answer, most), answer.notes)
-        if len(to_json_text(reply)) <= _LONGEST_COMPARISON:
+        if len(to_json_text(reply)) <= _LONGEST:
             break
     return reply
 
