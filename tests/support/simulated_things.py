@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from random import Random
 from typing import TYPE_CHECKING, Final
 
@@ -89,6 +90,7 @@ class Simulation:
 OUT: Final[Point] = (-100.0, -100.0)
 
 
+@lru_cache(100_000)
 def visible(robot: tuple[float, float, float], place: Point) -> bool:
     """Whether a place lies in the view of the detector, with no wall between."""
     x, y, yaw = robot

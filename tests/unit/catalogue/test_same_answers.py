@@ -10,7 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-import pytest
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
@@ -77,7 +76,7 @@ CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
 EXAMPLES = 200 if os.environ.get("EPISODIC_LONG") == "1" else 20
 """Histories for each clock, others in every run; some hundred questions are asked of each."""
 
-FIELDS = ("goal", "detections.label", "detections.bbox", "position", "value", "data", "nowhere")
+FIELDS = ("goal", "detections.label", "position", "value", "data", "nowhere")
 
 
 def questions(moments: list[int], draw: Random) -> Iterator[Question]:
@@ -103,15 +102,12 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
         yield f"before {around}", partial(_before, around)
     for topic in TOPICS:
         for kind, wanted in draw.sample(CONDITIONS, 4):
-            for field in (
-                None,
-                draw.choice(["goal", "detections.label", "position", "value", "data", "nowhere"]),
-            ):
-                before = draw.choice([None, None, draw.choice(moments) / 1e9])
-                yield (
-                    f"last {topic} {kind} {wanted} {field} {before}",
-                    partial(_match, topic, kind, wanted, field, before),
-                )
+            field = draw.choice([None, draw.choice(FIELDS)])
+            before = draw.choice([None, None, draw.choice(moments) / 1e9])
+            yield (
+                f"last {topic} {kind} {wanted} {field} {before}",
+                partial(_match, topic, kind, wanted, field, before),
+            )
         yield f"all {topic} {kind} {wanted}", partial(_matches, topic, kind, wanted, before)
     for topic, label in (("/vision/*", "cup"), ("/*", "person")):
         yield (
@@ -200,12 +196,15 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
         return f"{type(error).__name__}: {said}"
 
 
-@pytest.mark.parametrize("clock", ["auto", "stamp"])
 @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 1.0, 0.5]))
-@example(seed=572545084, part=1.0)
-@example(seed=246, part=1.0)
-@example(seed=11445, part=1.0)
+@given(
+    clock=st.sampled_from(["auto", "stamp"]),
+    seed=st.integers(0, 2**32),
+    part=st.sampled_from([1.0, 1.0, 0.5]),
+)
+@example(clock="auto", seed=572545084, part=1.0)
+@example(clock="stamp", seed=246, part=1.0)
+@example(clock="auto", seed=11445, part=1.0)
 def test_every_question_is_answered_as_without_a_catalogue(
     clock: str, seed: int, part: float
 ) -> None:
