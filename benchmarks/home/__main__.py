@@ -21,6 +21,7 @@ from benchmarks.home.judging import wrong_fields
 from benchmarks.home.questions import questions
 from benchmarks.home.things import LABELS
 from benchmarks.home.truth import places, truth_of
+from benchmarks.home.world import world_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -50,9 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         server = asking.server_over(asking.settings_for(world, scale.split_s))
         outcomes = asking.ask_all(server, questions(scale))
         things = instances.measured(server, truth_of(scale), scale.split_s)
+        denied = instances.denials(server, world_of(scale), truth_of(scale))
     print(asking.as_table(outcomes))
     if things is not None:
-        print("\n".join(["", *things.lines()]))
+        print("\n".join(["", *things.lines(), *denied.lines()]))
     if given.json is not None:
         rows = [
             {

@@ -101,9 +101,9 @@ def in_camera(
     return cos * east + sin * north - CAMERA[0], cos * north - sin * east - CAMERA[1]
 
 
-def look(robot: Pose, seen: Targets, labels: Sequence[str], chance: np.random.Generator) -> Sights:
-    """Returns what the detector sees and reports from each pose."""
-    ahead, left = in_camera(robot, seen.x, seen.y)
+def in_view(robot: Pose, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Returns which points of the map the camera has in view, with no wall between."""
+    ahead, left = in_camera(robot, x, y)
     with np.errstate(invalid="ignore"):
         distance = np.hypot(ahead, left)
         view = (distance >= RANGE_M[0]) & (distance <= RANGE_M[1])
@@ -111,9 +111,14 @@ def look(robot: Pose, seen: Targets, labels: Sequence[str], chance: np.random.Ge
     rows, columns = np.nonzero(view)
     camera_x = robot.x[rows] + CAMERA[0] * np.cos(robot.yaw[rows])
     camera_y = robot.y[rows] + CAMERA[0] * np.sin(robot.yaw[rows])
-    view[rows, columns] = clear_lines(
-        camera_x, camera_y, seen.x[rows, columns], seen.y[rows, columns]
-    )
+    view[rows, columns] = clear_lines(camera_x, camera_y, x[rows, columns], y[rows, columns])
+    return view
+
+
+def look(robot: Pose, seen: Targets, labels: Sequence[str], chance: np.random.Generator) -> Sights:
+    """Returns what the detector sees and reports from each pose."""
+    ahead, left = in_camera(robot, seen.x, seen.y)
+    view = in_view(robot, seen.x, seen.y)
     rows, columns = np.nonzero(view)
     kept = chance.random(len(rows)) >= DROPPED
     rows, columns = rows[kept], columns[kept]

@@ -13,7 +13,12 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from benchmarks.home import replies
+from benchmarks.home.camera import in_view
+from benchmarks.home.paths import Pose
+from benchmarks.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,11 +26,13 @@ if TYPE_CHECKING:
     from benchmarks.home.replies import Row
     from benchmarks.home.things import Place
     from benchmarks.home.truth import PlaceOfThing, ThingTruth, Truth
+    from benchmarks.home.world import World
     from ros2_memory.serving.mcp_server import EpisodicServer
 
 _SAME_M: Final = 0.7
 """A place that is reported so near to a true one is that one: half of the way to another."""
 _DENIED: Final = "not_seen_where_expected"
+_FEWEST_LOOKS: Final = 2
 
 
 @dataclass(slots=True)
@@ -72,6 +79,60 @@ def measured(server: EpisodicServer, truth: Truth, split_s: float) -> Measures |
     except replies.UnreadableError:
         return None
     return found
+
+
+@dataclass(slots=True)
+class Denials:
+    """What was denied as of the end of each recorded time, and what of that without a reason."""
+
+    count: int = 0
+    unseen: list[str] = field(default_factory=list)
+    """Since the thing was seen last, its place was in view in fewer than two messages."""
+    false: list[str] = field(default_factory=list)
+    """The thing stood there all the time."""
+
+    def lines(self) -> list[str]:
+        """Returns them in words."""
+        return [
+            f"denied as of the end of each recorded time: {self.count}",
+            f"denied where nobody looked: {len(self.unseen)}{_listed(self.unseen)}",
+            f"denied although it stood there: {len(self.false)}{_listed(self.false)}",
+        ]
+
+
+def denials(server: EpisodicServer, world: World, truth: Truth) -> Denials:
+    """Returns what `find_things` denied of all things, as of the end of each recorded time."""
+    found = Denials()
+    beats = [world.beats(VISION, each).stamp for each in world.recordings]
+    stamps = np.unique(np.concatenate(beats))
+    clock, robot = world.clock(stamps), world.robot(stamps)
+    for _, stop in truth.recorded:
+        question = {"end": stop, "limit": 100}
+        reply = asyncio.run(server.dispatcher.answer("find_things", question)).text
+        for each in replies.things(json.loads(reply)):
+            still = replies.row(each.get("still_there") or {})
+            if _DENIED not in still:
+                continue
+            found.count += 1
+            point, label = point_of(each), replies.text(each, "label")
+            named = f"{label} at {point[0]:.1f}, {point[1]:.1f} by {stop:.0f}"
+            since, until = replies.time(each, "last_seen"), replies.time(still, _DENIED)
+            looked = np.flatnonzero((clock > since + 0.5) & (clock <= until + 0.5))
+            poses = Pose(robot.x[looked], robot.y[looked], robot.yaw[looked])
+            x, y = (np.full((len(looked), 1), part) for part in point)
+            if np.count_nonzero(in_view(poses, x, y)) < _FEWEST_LOOKS:
+                found.unseen.append(named)
+            if any(_stood(thing, point, since, until) for thing in truth.of(label)):
+                found.false.append(named)
+    return found
+
+
+def _stood(thing: ThingTruth, point: tuple[float, float], since: float, until: float) -> bool:
+    """Whether a thing stood at a point from one time to another."""
+    return any(
+        stay.start <= since and until <= stay.stop and _away(point, stay.place) <= _SAME_M
+        for stay in thing.stays
+    )
 
 
 def _compare(

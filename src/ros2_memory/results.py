@@ -562,7 +562,9 @@ class Thing:
         best, median: of its scores; None without any.
         robot: x, y (m) and yaw (rad) from which it was last seen; None where that is not known.
         moved: its places in order, where there are several.
-        at_once: of what moves by itself, how many were seen at the same time; else None.
+        at_once: how many were seen at the same time: of what moves by itself, and of several things
+            at one place; else None.
+        moves: whether it moves by itself.
     """
 
     label: str
@@ -580,6 +582,7 @@ class Thing:
     still_there: StillThere | None
     moved: tuple[ThingStay, ...] = ()
     at_once: int | None = None
+    moves: bool = False
 
 
 @dataclass(frozen=True, slots=True)

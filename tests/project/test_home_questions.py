@@ -112,6 +112,9 @@ def test_the_script_counts_what_is_right_and_what_no_tool_answers_yet(
     assert re.search(r"0\.\d+ m median", said)
     assert "where a thing never stood: 0," in said
     assert "denied where the thing does stand: 0" in said
+    assert re.search(r"as of the end of each recorded time: [1-9]", said)
+    assert "denied where nobody looked: 0" in said
+    assert "denied although it stood there: 0" in said
     outcomes = json.loads(told.read_text(encoding="utf-8"))
     results = Counter(each["result"] for each in outcomes)
     assert results["right"] == 60

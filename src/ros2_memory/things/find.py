@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.things.instances import Instance, Mover, PlacedStay
 
 LIMIT: Final = 12
+_FEWEST_BESIDE: Final = 3
 _MOST_NAMES: Final = 5
 _MM: Final = 1000.0
 
@@ -140,7 +141,25 @@ class _Finder:
             robot=self._robot(int(every[int(spots[:, Spot.LAST].argmax())])),
             still_there=self._still_there(instance, *parts[-1]),
             moved=tuple(stays) if len(stays) > 1 else (),
+            at_once=self._side_by_side(parts[-1][1]),
         )
+
+    def _side_by_side(self, rows: Ints) -> int | None:
+        """Returns how many of a label are at one place, where messages have several at once.
+
+        Places are no finer than the noise of far detections, but two of one message are never one.
+        A bag counts where each was seen at least half as often as the one seen most.
+        """
+        spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
+        numbers: list[int] = []
+        for bag in np.unique(spots[:, Spot.BAG]).tolist():
+            of = (spots[:, Spot.BAG] == bag) & (counts >= _FEWEST_BESIDE)
+            if of.any():
+                often = int((2 * counts[of] >= counts[of].max()).sum())
+                numbers.append(min(often, int(spots[of, Spot.TOGETHER].max())))
+        # What most bags have, so that no single one with a false detection counts.
+        number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
+        return number if number > 1 else None
 
     def _mover(self, mover: Mover) -> Thing | None:
         """Returns what moves by itself: where it was last seen, inside of the region if one is."""
@@ -170,6 +189,7 @@ class _Finder:
             robot=self._robot(int(rows[newest])),
             still_there=None,
             at_once=most_at_once(spots),
+            moves=True,
         )
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:

@@ -45,9 +45,8 @@ def _thing(thing: results.Thing, answer: results.Things, most_stays: int) -> Jso
     reply: JsonObject = {"label": thing.label}
     if thing.also_seen_as:
         reply["also_seen_as"] = [*thing.also_seen_as]
-    if thing.at_once is not None:
-        reply["moves"] = True
-        reply["at_once"] = thing.at_once
+    kind: JsonObject = {"moves": thing.moves or None, "at_once": thing.at_once}
+    reply |= {key: each for key, each in kind.items() if each is not None}
     reply["place"] = _place(thing.place)
     reply["spread_m"] = rounded(thing.spread_m, 2)
     if thing.frame_id != answer.frame_id:

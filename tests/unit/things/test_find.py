@@ -117,6 +117,26 @@ def test_chairs_are_counted(tmp_path: Path) -> None:
     assert ask(tmp_path)["labels"] == {"chair": 3, "table": 1}
 
 
+def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path) -> None:
+    beside, one = ("chair", 3.0, 0.4), ("chair", 3.0, 0.0)
+    write(tmp_path / "two", looked(0, 30, HERE, one, beside))
+    reply = ask(tmp_path / "two", label="chair")
+    assert (reply["total"], reply["labels"]) == (2, {"chair": 2})
+    [chairs] = reply["things"]
+    assert chairs["at_once"] == 2
+    assert "moves" not in chairs
+    # A detector that now and then has a thing twice is no second thing.
+    now_and_then = [
+        message
+        for at in range(30)
+        for message in scene(at, HERE, [one, beside] if at in {5, 16, 17, 18} else [one])
+    ]
+    write(tmp_path / "double", now_and_then)
+    reply = ask(tmp_path / "double", label="chair")
+    assert reply["total"] == 1
+    assert "at_once" not in reply["things"][0]
+
+
 def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
     mug, moved = ("mug", 3.0, 0.5), ("mug", -2.0, 0.5)
     messages = [
