@@ -344,6 +344,7 @@ class Event:
     """Something that happened at `start`, and went on until `end` where it took time.
 
     With `goes_on`, `end` is only as far as is known. `before`: what changed before, nearest first.
+    `place`: the named place that the robot was in.
     """
 
     kind: str
@@ -352,6 +353,7 @@ class Event:
     text: str
     goes_on: bool = False
     before: tuple[PastChange, ...] = ()
+    place: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -375,6 +377,8 @@ class Recap(AnswerWithNotes):
         counts: how many events of each kind there were, also of those that are left out.
         path_sum_m: the length with what the noise of positions adds, where that is much.
         gap_m: the path across gaps in the recording, in straight lines; None without a gap.
+        where: the region's name, where only what happened there was asked for.
+        visits: how often the robot was there; `inside` is how long in all.
     """
 
     start: Ns
@@ -390,6 +394,9 @@ class Recap(AnswerWithNotes):
     counts: tuple[tuple[str, int], ...] = ()
     path_sum_m: float | None = None
     gap_m: float | None = None
+    where: str | None = None
+    visits: int = 0
+    inside: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)

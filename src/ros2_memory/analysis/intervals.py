@@ -123,6 +123,14 @@ class IntervalTable(NamedTuple):
         rows = _rows(self.rows)
         return IntervalTable(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
 
+    def during(self, spans: Iterable[tuple[Ns, Ns]]) -> IntervalTable:
+        """Returns the intervals some of which is in one of these times (inclusive)."""
+        rows = _rows(self.rows)
+        chosen = np.zeros(rows.size, np.bool_)
+        for start, stop in spans:
+            chosen |= (rows["first"] <= stop) & (rows["last"] >= start)
+        return IntervalTable(self.labels, rows[chosen].tobytes())
+
     def as_one(self, label: str) -> IntervalTable:
         """Returns the intervals of all labels under one label; these may overlap."""
         rows = _rows(self.rows).copy()

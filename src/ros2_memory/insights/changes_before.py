@@ -28,14 +28,13 @@ from ros2_memory.analysis.state_changes import (
 )
 from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
-from ros2_memory.core.geometry import compose
-from ros2_memory.core.model import Pose, TimeWindow, Transform
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import ns_argument, open_view
 from ros2_memory.insights.topic_events import add_events, events_in, toggled
+from ros2_memory.places.pose_frames import placed, with_place
 from ros2_memory.results import Before, PastChange
 
 if TYPE_CHECKING:
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.state_changes import LevelChange, Report, StateChanges
     from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.core.model import Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
@@ -317,11 +317,13 @@ def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]
                 yield f"status of {level.name.removeprefix(STATUS)}", word
 
 
-def before(memory: Memory, call: Call, at_s: float, length_s: float) -> Before:
+def before(
+    memory: Memory, call: Call, at_s: float, length_s: float, frame_id: str | None = None
+) -> Before:
     """Returns what changed in the seconds before a moment, and the state of the robot then.
 
     Raises:
-        InvalidArgumentsError: the moment is not finite.
+        InvalidArgumentsError: the moment is not finite, or no transform leads to `frame_id`.
         NoDataError: the memory holds nothing.
         QueryTimeoutError: the call's time is over.
     """
@@ -330,7 +332,7 @@ def before(memory: Memory, call: Call, at_s: float, length_s: float) -> Before:
     window = TimeWindow(max(at - length, MIN_NS), min(at + SLACK_NS + 1, MAX_NS))
     changes = changes_in(view, window, {})
     found = changes.before(at, length, slack=SLACK_NS)
-    robot, speed_mps = _robot(view, at)
+    robot, speed_mps = _robot(view, at, frame_id)
     if not view.snapshot.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
     elif not changes.recorded:
@@ -354,8 +356,12 @@ def before(memory: Memory, call: Call, at_s: float, length_s: float) -> Before:
     )
 
 
-def _robot(view: View, at: Ns) -> tuple[Pose | None, float | None]:
-    """Returns the robot's newest pose, in the map where that is known, and its speed."""
+def _robot(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float | None]:
+    """Returns the robot's newest pose, in the map where that is known, and its speed.
+
+    Raises:
+        InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
+    """
     window = TimeWindow(max(at - _POSE_NS, MIN_NS), at + 1)
     try:
         found = view.stream.newest(resolve_pose_topic(view), window)
@@ -368,15 +374,11 @@ def _robot(view: View, at: Ns) -> tuple[Pose | None, float | None]:
     pose = view.memory.extractor.pose(message, type_name)
     twist = view.memory.extractor.twist(message, type_name)
     speed_mps = None if twist is None else math.hypot(*twist.linear)
-    target = view.memory.limits.map_frame
-    if pose is None or pose.orientation is None or not target or pose.frame_id == target:
-        return pose, speed_mps
-    try:
-        placed = transform_at(view, target, pose.frame_id, found.time, found.bag.recording)
-    except NoDataError:
-        return pose, speed_mps
-    whole = compose(placed.transform, Transform(pose.position, pose.orientation))
-    return Pose(whole.translation, whole.rotation, target), speed_mps
+    if pose is None:
+        return None, speed_mps
+    recording = found.bag.recording
+    there = placed(view, pose, found.time, recording, frame_id)
+    return with_place(view, there, found.time, recording), speed_mps
 
 
 def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:

@@ -17,7 +17,8 @@ from ros2_memory.history.driven_path import length_notes, pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
-from ros2_memory.insights.recap import drive_in, found_events
+from ros2_memory.insights.drive import drive_in
+from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, track_in
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
-    from ros2_memory.insights.recap import Drive
+    from ros2_memory.insights.drive import Drive
     from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.two_ways import FarPoint
     from ros2_memory.places.where import Where
@@ -122,8 +123,8 @@ def _things(
 
 def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
     """Returns the numbers of the way; None for what is not known."""
-    known = drive.trajectory
-    if known is None or not known.is_known:
+    known = drive.known
+    if known is None:
         return dict.fromkeys(_LEAST)
     for note in length_notes(known):
         view.notes.add(note)

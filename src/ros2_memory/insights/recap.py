@@ -8,36 +8,19 @@ are left out, and counted.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.intervals import united
-from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.standstills import (
-    CONTEXT_NS,
-    CREEP_MPS,
-    SHORTEST_NS,
-    StandstillBuilder,
-    StandstillCollector,
-    StandstillDigest,
-)
-from ros2_memory.analysis.topic_events import has_events
-from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.analysis.motion.standstills import SHORTEST_NS
+from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted, listed
-from ros2_memory.core.timebase import (
-    AT_OR_BEFORE_SLACK_NS,
-    START_SLACK_NS,
-    ns_from_unix,
-    unix_from_ns,
-)
-from ros2_memory.history.bag_groups import DigestKind, Fold
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
-from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
+from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
-from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
@@ -47,8 +30,13 @@ from ros2_memory.insights.changes_before import (
     is_routine,
 )
 from ros2_memory.insights.clock_steps import clock_steps
+from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.silences import grouped, silences_in
 from ros2_memory.insights.topic_events import events_in, toggled
+from ros2_memory.places.driven_inside import driven_way
+from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.scope import times_in_region
+from ros2_memory.places.where import parse_where
 from ros2_memory.results import Before, Event, Recap
 
 if TYPE_CHECKING:
@@ -56,15 +44,14 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.intervals import IntervalTable
     from ros2_memory.analysis.motion.standstills import Standstill
-    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.analysis.topic_events import ReportedError, TopicEvents
-    from ros2_memory.core.model import Pose, TimeWindow
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.driven_path import DrivenPath
-    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import TimeRange, View
+    from ros2_memory.insights.drive import Drive
+    from ros2_memory.places.robot_places import RobotPlaces
+    from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import PastChange
 
 MOST_EVENTS: Final = 25
@@ -91,78 +78,68 @@ _PLURALS: Final = {
 }
 """The kinds of events, the most important first, and the words for several of each."""
 _KINDS: Final = tuple(_PLURALS)
+_OF_ROBOT: Final = frozenset({"error", "stop", "flip"})
+"""The kinds of which matters in which place the robot was."""
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
-    """How the robot moved: its path, and its standstills with whether each goes on afterwards."""
-
-    path: DrivenPath | None = None
-    standstills: tuple[tuple[Standstill, bool], ...] = ()
-
-    @property
-    def trajectory(self) -> Trajectory | None:
-        """The path's trajectory, if there are poses; `is_known` says whether any was valid."""
-        return None if self.path is None else self.path.trajectory
-
-    def stood(self, length: Ns) -> Ns | None:
-        """Returns how long the robot stood in all, in a window of a length; None if not known.
-
-        It is not known where no pose has a valid position, nor where the robot neither moved nor
-        stood for most of the time: noise hides where it stood.
-        """
-        stood = sum(each.end - each.start for each, _ in self.standstills)
-        known = self.trajectory
-        if known is None or not known.is_known:
-            return stood or None
-        if not stood:
-            is_hidden = (
-                length >= SHORTEST_NS
-                and known.totals.distance_m <= CREEP_MPS * known.totals.duration_s
-            )
-            return None if is_hidden else 0
-        else_s = known.totals.duration_s - unix_from_ns(stood)
-        is_hidden = (
-            else_s > known.totals.duration_s / 2 and known.totals.distance_m < CREEP_MPS * else_s
-        )
-        if is_hidden and not known.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
-            return None
-        return stood
-
-
-def recap_or_before(memory: Memory, call: Call, span: TimeRange) -> Recap | Before:
+def recap_or_before(
+    memory: Memory,
+    call: Call,
+    span: TimeRange,
+    *,
+    where: JsonValue = None,
+    frame_id: str | None = None,
+) -> Recap | Before:
     """Returns what happened in a window, or what changed before a moment; see both.
 
     Raises:
-        InvalidArgumentsError: the window and the moment are given in more than one form.
+        InvalidArgumentsError: the window and the moment are given in more than one form, or the
+            moment with `where`.
     """
     is_bounded = span.start_s is not None or span.end_s is not None
     if is_bounded + (span.last_s is not None) + (span.around_s is not None) > 1:
         raise InvalidArgumentsError("last_s, around, or start and end: give one of the three")
     if span.around_s is None:
-        return recap(memory, call, span)
-    return before(memory, call, span.around_s, span.before_s)
+        return recap(memory, call, span, where=where, frame_id=frame_id)
+    if where is not None:
+        raise InvalidArgumentsError("where bounds a time, and around is a moment: give one of them")
+    return before(memory, call, span.around_s, span.before_s, frame_id)
 
 
-def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
-    """Returns what happened in a window.
+def recap(
+    memory: Memory,
+    call: Call,
+    span: TimeRange,
+    *,
+    where: JsonValue = None,
+    frame_id: str | None = None,
+) -> Recap:
+    """Returns what happened in a window; with `where` only while the robot was in that region.
+
+    Places are in the map where transforms lead there at their time, or in `frame_id`.
 
     Raises:
-        InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length.
+        InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
+            is no region, or no position is given in `frame_id`.
         NoDataError: the memory holds nothing.
         QueryTimeoutError: the call's time is over.
     """
+    region = None if where is None else parse_where(memory.limits.places, where)
     view, window = open_span(memory, call, span)
     start, end = window.asked()
+    places = robot_places(view, window, frame_id)
+    there = None if region is None else _There(times_in_region(view, region, window))
     drive = drive_in(view, window)
     found = found_events(view, window)
-    reported, things, throughout = _topic_events(view, window, found)
-    events = [*_stops(drive), *reported]
+    reported, things, throughout = _topic_events(view, window, found, there)
+    events = [*_stops(drive, places), *reported]
     events += [
         Event("gap", begin, until, "nothing was recorded")
         for begin, until in recording_gaps(view, window)
     ]
     events += [*_clock_steps(view, window), *_silences(view, window)]
+    if there is not None:
+        events = [each for each in events if there.has(each)]
     note_unread(view, window)
     note_edges(view, window)
     counts = Counter(each.kind for each in events)
@@ -170,46 +147,100 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         counts["thing"] = things
     shown = _most_important(view, events, counts)
     shown = _with_changes(changes_in(view, window, found), shown)
-    trajectory = drive.trajectory
-    for note in () if trajectory is None else length_notes(trajectory):
-        view.notes.add(note)
+    if places is not None:
+        shown = [_in_place(each, places) for each in shown]
     stood = drive.stood(end - start)
-    known = trajectory if trajectory is not None and trajectory.is_known else None
-    if stood is None and known is not None:
+    if stood is None and drive.known is not None:
         view.notes.add(_STANDSTILLS_UNKNOWN)
-    return Recap(
+    answer = Recap(
         start=start,
         end=end,
         now=memory.now(memory.clock.now(), view.snapshot.latest),
-        distance_m=None if known is None else known.totals.distance_m,
-        max_speed=None if known is None else known.max_speed,
+        distance_m=None,
+        max_speed=None,
         stood=stood,
         shortest_stop=SHORTEST_NS,
-        frame_id=None if drive.path is None else drive.path.frames[0],
+        frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
-        notes=view.notes.sentences(),
-        path_sum_m=None
-        if trajectory is None or not trajectory.is_noisy
-        else trajectory.totals.path_sum_m,
-        gap_m=None if trajectory is None or not trajectory.totals.gaps else trajectory.totals.gap_m,
+    )
+    if there is None or region is None:
+        answer = _with_way(view, answer, drive)
+    else:
+        answer = _with_way_there(view, answer, window, there)
+        answer = replace(answer, where=region.name or "where")
+        if stood is not None:
+            answer = replace(answer, stood=there.length_of(drive.standstills))
+    return replace(answer, notes=view.notes.sentences())
+
+
+class _There:
+    """The times at which the robot was in a region, in order."""
+
+    def __init__(self, spans: Sequence[Inside]) -> None:
+        self.spans = spans
+
+    def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
+        """Returns whether some of a time, or a moment, is among them."""
+        last = start if end is None else end
+        return any(each.start <= last and start <= each.stop for each in self.spans)
+
+    def has(self, event: Event) -> bool:
+        """Returns whether an event happened then; how long a boolean held is of no matter."""
+        if event.kind == "gap":
+            return False
+        return self.overlaps(event.start, None if event.kind == "flip" else event.end)
+
+    def covers(self, start: Ns, end: Ns) -> bool:
+        """Returns whether a time is in one of them as a whole, or in none at all."""
+        inside = any(each.start <= start and end <= each.stop for each in self.spans)
+        return inside or not self.overlaps(start, end)
+
+    def length_of(self, standstills: Iterable[tuple[Standstill, bool]]) -> Ns:
+        """Returns how long the robot stood in them."""
+        return sum(
+            max(0, min(stood.end, each.stop) - max(stood.start, each.start))
+            for stood, _ in standstills
+            for each in self.spans
+        )
+
+
+def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
+    for note in () if drive.path is None else length_notes(drive.path.trajectory):
+        view.notes.add(note)
+    known = drive.known
+    if known is None:
+        return answer
+    return replace(
+        answer,
+        distance_m=known.totals.distance_m,
+        max_speed=known.max_speed,
+        path_sum_m=known.totals.path_sum_m if known.is_noisy else None,
+        gap_m=known.totals.gap_m if known.totals.gaps else None,
     )
 
 
-def drive_in(view: View, window: TimeWindow) -> Drive:
-    """Returns how the robot moved; nothing, with a note, where that is not known."""
-    try:
-        topic = resolve_pose_topic(view)
-        path = driven_path(view, topic, window)
-        note_robots(view, topic, window)
-        standstills = _standstills_in(view, topic, window)
-    except (InvalidArgumentsError, NoDataError) as error:
-        view.notes.add(f"nothing is known of the way: {error}")
-        return Drive()
-    if path is None:
-        view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
-    return Drive(path, standstills)
+def _with_way_there(view: View, answer: Recap, window: TimeWindow, there: _There) -> Recap:
+    """Returns a recap with the way in a region, and how often and how long the robot was there."""
+    way = driven_way(view, resolve_pose_topic(view), window)
+    driven = None if way is None else way.totals(there.spans)
+    return replace(
+        answer,
+        distance_m=None if driven is None else driven.distance_m,
+        max_speed=None if driven is None else driven.max_speed,
+        visits=len(there.spans),
+        inside=sum(each.stop - each.start for each in there.spans),
+    )
+
+
+def _in_place(event: Event, places: RobotPlaces) -> Event:
+    """Returns an event of the robot itself with the named place that it was in then."""
+    if event.kind not in _OF_ROBOT:
+        return event
+    stood = event.kind == "stop" and event.end is not None
+    at = (event.start + (event.end or 0)) // 2 if stood else event.start
+    return replace(event, place=places.place_at(at))
 
 
 def found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | None]:
@@ -223,7 +254,10 @@ def found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | None
 
 
 def _topic_events(
-    view: View, window: TimeWindow, found_of: Mapping[str, TopicEvents | None]
+    view: View,
+    window: TimeWindow,
+    found_of: Mapping[str, TopicEvents | None],
+    there: _There | None,
 ) -> tuple[list[Event], int, set[str]]:
     """Returns events that messages report, the number of things seen, and those seen throughout.
 
@@ -239,12 +273,17 @@ def _topic_events(
     for topic, found in found_of.items():
         if found is None or found.is_empty:
             continue
-        events += [*_flips(topic, found), *map(_error, found.errors)]
+        events += [*_flips(topic, found), *map(_error, _errors(view, topic, found, there))]
         visible.append(found.visible)
         throughout.update(found.visible.throughout(start, end))
         last_seen |= dict.fromkeys(found.visible.at_end(found.last, known_to), found.last)
         _note_limits(view, topic, found)
-    things = united(visible).without(throughout)
+    things = united(visible)
+    if there is None:
+        things = things.without(throughout)
+    else:
+        throughout = set()
+        things = things.during([(each.start, each.stop) for each in there.spans])
     events += [
         Event(
             "thing",
@@ -271,11 +310,30 @@ def _note_limits(view: View, topic: str, events: TopicEvents) -> None:
         )
 
 
-def _stops(drive: Drive) -> Iterator[Event]:
+def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:
     for (start, end, box), goes_on in drive.standstills:
-        x, y, _ = box.centre
+        (x, y, _), frame = box.centre, ""
+        if places is not None and places.frame_id != places.pose_frame:
+            point = places.at((start + end) // 2)
+            x, y = point or (x, y)
+            frame = "" if point else f" in {places.pose_frame}"
         # z: a rounded -0.00 reads as 0.00.
-        yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}", goes_on)
+        yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}{frame}", goes_on)
+
+
+def _errors(
+    view: View, topic: str, found: TopicEvents, there: _There | None
+) -> tuple[ReportedError, ...]:
+    """Returns the errors of a window; in a region only their reports there count."""
+    if there is None or all(there.covers(each.first, each.last) for each in found.errors):
+        return found.errors
+    builder = TopicEventsBuilder()
+    for start, stop, *_ in there.spans:
+        events = events_in(view, topic, TimeWindow(start, stop + 1))
+        if events is not None:
+            builder.join(events)
+    inside = builder.events()
+    return () if inside is None else inside.errors
 
 
 def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:
@@ -360,62 +418,3 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
         )
         view.notes.add(f"left out, since they are too many: {named}; ask for a shorter time")
     return sorted(shown, key=lambda each: (each.start, _KINDS.index(each.kind)))
-
-
-_STANDSTILLS: Final = DigestKind(
-    "standstills",
-    look_up=lambda digests, topic, among: digests.catalogue.standstills(topic, among),
-    encode=encode_standstills,
-    decode=decode_standstills,
-)
-
-
-def _standstills_in(
-    view: View, topic: str, window: TimeWindow
-) -> tuple[tuple[Standstill, bool], ...]:
-    """Returns where the poses of a topic stand still, in order, as far as it is in a window.
-
-    With each comes whether it goes on after the window, or up to the last pose that is known.
-
-    Poses outside of the window count too: a standstill that goes on beyond an end of the window
-    ends there, however little of it is inside. So those of windows that follow each other add up.
-
-    Raises:
-        InvalidArgumentsError: a message of the topic carries no position.
-    """
-    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    builder = StandstillBuilder()
-    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
-    failures: list[UndecodableError] = []
-
-    def add(
-        to: StandstillBuilder | StandstillCollector, messages: Iterable[StoredMessage]
-    ) -> Span | None:
-        def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
-            if is_place(pose.position):
-                to.add(time, pose.position)
-
-        return add_poses(view, add_place, decoder, messages, failures)
-
-    def collect(
-        messages: Iterable[StoredMessage],
-    ) -> tuple[StandstillDigest | None, Span | None]:
-        collector = StandstillCollector()
-        span = add(collector, messages)
-        return collector.digest(), span
-
-    Fold(
-        _STANDSTILLS,
-        add=lambda messages: add(builder, messages),
-        collect=collect,
-        join=lambda digest, _span: builder.join(digest),
-        failures=failures,
-    ).over(view, topic, window.widened(CONTEXT_NS))
-    return tuple(
-        (
-            each._replace(start=max(each.start, start), end=min(each.end, end)),
-            each.end > end or each.end == builder.last,
-        )
-        for each in builder.standstills()
-        if each.start < end and each.end > start
-    )

@@ -156,7 +156,10 @@ class DrivenWay:
         ends = self.times[np.searchsorted(self.times, span.start + _SPEED_NS) :]
         ends = ends[: np.searchsorted(ends, span.stop)] - _SPEED_NS
         begin = np.concatenate(([span.start, end], inner, ends))
-        return float((self._metres_at(begin + _SPEED_NS) - self._metres_at(begin)).max())
+        driven = self._metres_at(begin + _SPEED_NS) - self._metres_at(begin)
+        # Metres are without jumps, but noise may shift some of them along the way.
+        moved = self._places_at(begin + _SPEED_NS) - self._places_at(begin)
+        return float(np.minimum(driven, np.sqrt((moved * moved).sum(axis=1))).max())
 
     def waypoints(self, spans: Sequence[Inside], at_most: int) -> tuple[Waypoint, ...]:
         """Returns the drawn way in some times; `jump` marks where another time begins.
@@ -200,6 +203,13 @@ class DrivenWay:
     def _vertex(self, time: Ns, place: Floats, heading: float) -> Vertex:
         x, y, z = place.tolist()
         return time, (x, y, z), None if math.isnan(heading) else float(heading)
+
+    def _places_at(self, times: Times) -> Floats:
+        since = int(self.times[0])
+        columns = [
+            np.interp(times - since, self.times - since, self.places[:, axis]) for axis in range(3)
+        ]
+        return np.stack(columns, axis=1)
 
     def _metres_at(self, times: Sequence[Ns] | Times) -> Floats:
         since = int(self.times[0])

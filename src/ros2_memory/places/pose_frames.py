@@ -11,6 +11,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from ros2_memory.analysis.bag_frames import HOLD_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import BagSpan
     from ros2_memory.history.view import View
 
 
@@ -63,7 +65,8 @@ def placed_waypoints(
 ) -> tuple[Waypoint, ...]:
     """Returns waypoints of a topic's poses in another frame, each by the transforms of its time.
 
-    Those that no transform places are left out, with a note.
+    At both ends of a recording its first and last transforms hold for 2 s more, as for tracks.
+    Waypoints that no transform places are left out, with a note.
 
     Raises:
         InvalidArgumentsError: no transform places any of them.
@@ -73,7 +76,7 @@ def placed_waypoints(
         bags = view.stream.overlapping_bags([topic], TimeWindow(each.time, each.time + 1))
         half = math.nan if each.yaw_rad is None else each.yaw_rad / 2
         pose = Pose(each.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
-        there = pose_in(view, pose, frame_id, each.time, bags[0].bag.recording) if bags else None
+        there = None if not bags else _pose_near(view, pose, frame_id, each.time, bags[0])
         if there is None or there.orientation is None:
             continue
         turn = None if each.yaw_rad is None else yaw(there.orientation)
@@ -84,6 +87,15 @@ def placed_waypoints(
         left_out = counted(len(waypoints) - len(found), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
     return tuple(found)
+
+
+def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, bag: BagSpan) -> Pose | None:
+    """Returns a pose by the transforms of its time, or of the nearest one up to `HOLD_NS` off."""
+    for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
+        found = pose_in(view, pose, frame_id, time + off, bag.bag.recording)
+        if found is not None:
+            return found
+    return None
 
 
 def _unreachable(frame_id: str, own_frame: str) -> str:

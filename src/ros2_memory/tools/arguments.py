@@ -429,10 +429,12 @@ class TrajectoryArguments(Arguments):
     by: _By | None = None
 
 
-class WindowArguments(Arguments):
-    """A window."""
+class RecapArguments(Arguments):
+    """A window or a moment, and a place."""
 
     span: TimeRange
+    where: _Where | None = None
+    frame_id: _FrameId | None = None
 
 
 class SaveMomentArguments(Arguments):

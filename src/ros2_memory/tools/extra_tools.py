@@ -17,12 +17,12 @@ from ros2_memory.tools.arguments import (
     MatchesArguments,
     MomentArguments,
     NoArguments,
+    RecapArguments,
     RecapTime,
     SaveMomentArguments,
     ThingsArguments,
     TypeArguments,
     VisitsArguments,
-    WindowArguments,
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
@@ -41,10 +41,10 @@ _SIGHTINGS = ToolDeclaration(
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps, silences. "
-    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text, "
+    "Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text, in, "
     "before: what changed in the 10 s before}}], counts}}. With around: {{before: [{{text, "
     "s_before}}], nearest first, recorded, robot, state}}.",
-    WindowArguments,
+    RecapArguments,
     recap_or_before,
     blocking=True,
 )

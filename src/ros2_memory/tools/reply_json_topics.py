@@ -269,6 +269,7 @@ def _recap(answer: results.Recap) -> JsonObject:
         "max_speed": None if answer.max_speed is None else rounded(answer.max_speed, 3),
         "stood_s": None if answer.stood is None else seconds(answer.stood),
         "shortest_stop_s": seconds(answer.shortest_stop),
+        **_there(answer),
         "frame_id": answer.frame_id or None,
         "events": [_event(each, answer.now, local) for each in answer.events],
     }
@@ -282,6 +283,12 @@ def _recap(answer: results.Recap) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
+def _there(answer: results.Recap) -> JsonObject:
+    if answer.where is None:
+        return {}
+    return {"where": answer.where, "visits": answer.visits, "inside_s": seconds(answer.inside)}
+
+
 def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
     reply: JsonObject = {
         "timestamp": moment(event.start),
@@ -291,6 +298,8 @@ def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
     }
     if event.end is not None:
         reply["duration_s"] = seconds(event.end - event.start)
+    if event.place is not None:
+        reply["in"] = event.place
     if event.before:
         reply["before"] = _changes(event.before)
     return with_notes(reply, (), goes_on=event.goes_on)

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.topic_events import MAX_FLAGS, MAX_LABELS
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import MessageSchedule
@@ -27,10 +28,23 @@ from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import STATUS_FLAGS, Msg, boolean, detections, make, odom, stamp, write_mcap
+from tests.support.bags import (
+    STATUS_FLAGS,
+    Msg,
+    boolean,
+    detections,
+    log_entry,
+    make,
+    odom,
+    stamp,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import asked, memory_of, recalling
+from tests.support.moving_map import write_moving_map
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -93,7 +107,9 @@ def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
     memory = memory_of(tmp_path, clock=SettableClock(now))
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    answer = over(memory, 5.0, 95.0)
+    span = TimeRange(start_s=BEGIN / S + 5.0, end_s=BEGIN / S + 95.0)
+    answer = recap(memory, Call(), span, frame_id="odom")
+    assert answer.frame_id == "odom"
     standing = [
         (max(start, 5.0), min(end, 95.0)) for start, end in _standing(0.0, 110.0) if 5 < end < 95
     ]
@@ -591,3 +607,119 @@ def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> Non
     before = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 8).events}
     assert before["stood at x 1.00, y 2.00"]
     assert "cup in view" not in before  # all the time
+
+
+PLACES = (
+    Place("room", "map", Rectangle(-1, 5, -1, 4)),
+    Place("corner", "map", Circle(0.0, 3.0, 0.5)),
+    Place("elsewhere", "map", Rectangle(50, 51, 50, 51)),
+)
+
+
+def in_places(memory: Memory, frame_id: str = "map") -> Memory:
+    places = tuple(replace(each, frame_id=frame_id) for each in PLACES)
+    return replace(memory, limits=replace(memory.limits, places=places))
+
+
+@each_way
+def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Stands at x 0, 2 and 4 of odometry, which the map then has 1, 2 and 3 m north of x 0."""
+    messages = []
+    for step in range(600):
+        at, nth = BEGIN + step * S // 10, step // 200
+        x = 2.0 * nth + min(max(step % 200 - 150, 0) * 0.04, 2.0)
+        messages.append(odom(at, x, 0.0))
+        if step % 10 == 0:
+            messages.append(tf(at, transform(at, "map", "odom", (-2.0 * nth, nth + 1.0, 0.0))))
+    for nth in range(6):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth * 110 : (nth + 1) * 110])
+    memory = in_places(memory_of(tmp_path))
+    memory = recalling(memory, tmp_path) if recalls else memory
+    span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 200)
+    found = recap(memory, Call(), span)
+    own = recap(memory, Call(), span, frame_id="odom")
+    assert (found.frame_id, own.frame_id) == ("map", "odom")
+    assert [(each.text, each.place) for each in found.events if each.kind == "stop"] == [
+        ("stood at x 0.00, y 1.00", "room"),
+        ("stood at x 0.00, y 2.00", "room"),
+        ("stood at x 0.00, y 3.00", "corner"),
+    ]
+    assert [each.text for each in own.events if each.kind == "stop"] == [
+        "stood at x 0.00, y 0.00",
+        "stood at x 2.00, y 0.00",
+        "stood at x 4.00, y 0.00",
+    ]
+    assert [each.place for each in own.events] == [each.place for each in found.events]
+    with pytest.raises(InvalidArgumentsError, match="frame_id"):
+        recap(memory, Call(), span, frame_id="moon")
+
+
+@each_way
+def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool) -> None:
+    """Drives 1 m/s through the room and out of it, stands at 20 s and at 50 s, bumps twice."""
+    messages = []
+    for step in range(700):
+        seconds = step / 10
+        stood = min(max(seconds - 20, 0), 10) + min(max(seconds - 50, 0), 10)
+        messages.append(odom(BEGIN + step * S // 10, seconds - stood - 16, 0.0))
+        if step % 10 == 0:
+            bump = int(seconds) in {18, 45}
+            messages.append(boolean(BEGIN + step * S // 10, bump, topic="/bumper"))
+            label = "cup" if 17 <= seconds < 30 else "plant"
+            messages.append(detections(BEGIN + step * S // 10, [label]))
+        if step in {180, 450, 460}:
+            messages.append(log_entry(BEGIN + step * S // 10, 40, "base", "stuck"))
+    for nth in range(7):
+        write_mcap(
+            tmp_path / "rec" / f"rec_{nth}.mcap",
+            [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth],
+        )
+    memory = in_places(memory_of(tmp_path), "odom")
+    memory = recalling(memory, tmp_path) if recalls else memory
+    span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 70)
+    there = recap(memory, Call(), span, where="room")
+    # In the room from x = -1 at 15 s to x = 5 at 31 s.
+    assert (there.where, there.visits) == ("room", 1)
+    assert there.inside / S == pytest.approx(16, abs=0.2)
+    assert there.distance_m == pytest.approx(6, abs=0.1)
+    assert (there.stood or 0) / S == pytest.approx(10, abs=0.2)
+    assert [(each.kind, each.text.partition(",")[0], each.place) for each in there.events] == [
+        ("thing", "plant in view", None),
+        ("thing", "cup in view", None),
+        ("error", "error: base: stuck", "room"),
+        ("flip", "/bumper became true", "room"),
+        ("flip", "/bumper became false", "room"),
+        ("stop", "stood at x 4.00", "room"),
+        ("thing", "plant in view", None),
+    ]
+    never = recap(memory, Call(), span, where="elsewhere")
+    assert (never.visits, never.events, never.distance_m, never.stood) == (0, (), 0, 0)
+    refused = asked(memory, tmp_path, "recap", around=BEGIN / S + 20, where="room")
+    assert refused["error"] == "invalid_arguments"
+    robot = asked(memory, tmp_path, "recap", around=BEGIN / S + 20)["robot"]
+    assert (robot["frame_id"], robot["in"]) == ("odom", "room")
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 10_000),
+    part=st.sampled_from([0.3, 1.0]),
+    split_s=st.sampled_from([4.0, 10.0]),
+)
+def test_a_recap_of_a_place_is_the_same_whatever_the_catalogue_knows(
+    seed: int, part: float, split_s: float
+) -> None:
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        if seed % 2:
+            write_moving_map(bag_dir, seed, seconds=60, split_s=split_s)
+        else:
+            write_history(bag_dir, random.Random(seed))
+        memory = in_places(memory_of(bag_dir))
+        known = recalling(memory, bag_dir, part=part)
+        for given in ({}, {"where": "room"}, {"where": {"x": [-1, 1], "y": [-1, 1]}}):
+            arguments = {"start": 0, "end": 4e9, **given}
+            one = asked(memory, bag_dir, "recap", **arguments)
+            assert one == asked(known, bag_dir, "recap", **arguments)

@@ -20,7 +20,7 @@ from ros2_memory.tools.arguments import (
     Last,
     LastMatchArguments,
     MotionArguments,
-    WindowArguments,
+    RecapArguments,
 )
 from ros2_memory.tools.declaration import Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
@@ -89,7 +89,7 @@ OPTIONAL = {
         "by",
         "limit",
     },
-    "recap": {"start", "end", "around", "seconds_before"},
+    "recap": {"start", "end", "around", "seconds_before", "where", "frame_id"},
     "compare": {"where"},
     "find_things": {"label", "where", "start", "end", "min_score", "limit"},
     "list_recorded_topics": {"pattern"},
@@ -413,7 +413,7 @@ def test_a_time_argument_replaces_the_moment() -> None:
 
 
 def test_a_time_argument_replaces_the_span() -> None:
-    arguments = Signature(WindowArguments, Last).parse({"seconds": 60})
+    arguments = Signature(RecapArguments, Last).parse({"seconds": 60})
     assert dict(arguments)["span"] == TimeRange(last_s=60.0)
 
 

@@ -1,0 +1,153 @@
+"""How the robot moved in a window: its path, and where it stood still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.analysis.bulk_decode import motion_decoder
+from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.standstills import (
+    CONTEXT_NS,
+    CREEP_MPS,
+    SHORTEST_NS,
+    StandstillBuilder,
+    StandstillCollector,
+    StandstillDigest,
+)
+from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    START_SLACK_NS,
+    ns_from_unix,
+    unix_from_ns,
+)
+from ros2_memory.history.bag_groups import DigestKind, Fold
+from ros2_memory.history.driven_path import add_poses, driven_path
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.robots import note_robots
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from ros2_memory.analysis.motion.standstills import Standstill
+    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.core.model import Pose, TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.bag_groups import Span
+    from ros2_memory.history.driven_path import DrivenPath
+    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.view import View
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """How the robot moved: its path, and its standstills with whether each goes on afterwards."""
+
+    path: DrivenPath | None = None
+    standstills: tuple[tuple[Standstill, bool], ...] = ()
+
+    @property
+    def known(self) -> Trajectory | None:
+        """The path's trajectory, if it has a valid pose."""
+        known = None if self.path is None else self.path.trajectory
+        return known if known is not None and known.is_known else None
+
+    def stood(self, length: Ns) -> Ns | None:
+        """Returns how long the robot stood in all, in a window of a length; None if not known.
+
+        It is not known where no pose has a valid position, nor where the robot neither moved nor
+        stood for most of the time: noise hides where it stood.
+        """
+        stood = sum(each.end - each.start for each, _ in self.standstills)
+        known = self.known
+        if known is None:
+            return stood or None
+        if not stood:
+            is_hidden = (
+                length >= SHORTEST_NS
+                and known.totals.distance_m <= CREEP_MPS * known.totals.duration_s
+            )
+            return None if is_hidden else 0
+        else_s = known.totals.duration_s - unix_from_ns(stood)
+        is_hidden = (
+            else_s > known.totals.duration_s / 2 and known.totals.distance_m < CREEP_MPS * else_s
+        )
+        if is_hidden and not known.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
+            return None
+        return stood
+
+
+def drive_in(view: View, window: TimeWindow) -> Drive:
+    """Returns how the robot moved; nothing, with a note, where that is not known."""
+    try:
+        topic = resolve_pose_topic(view)
+        path = driven_path(view, topic, window)
+        note_robots(view, topic, window)
+        standstills = _standstills_in(view, topic, window)
+    except (InvalidArgumentsError, NoDataError) as error:
+        view.notes.add(f"nothing is known of the way: {error}")
+        return Drive()
+    if path is None:
+        view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
+    return Drive(path, standstills)
+
+
+_STANDSTILLS: Final = DigestKind(
+    "standstills",
+    look_up=lambda digests, topic, among: digests.catalogue.standstills(topic, among),
+    encode=encode_standstills,
+    decode=decode_standstills,
+)
+
+
+def _standstills_in(
+    view: View, topic: str, window: TimeWindow
+) -> tuple[tuple[Standstill, bool], ...]:
+    """Returns where the poses of a topic stand still, in order, as far as it is in a window.
+
+    With each comes whether it goes on after the window, or up to the last pose that is known.
+
+    Poses outside of the window count too: a standstill that goes on beyond an end of the window
+    ends there, however little of it is inside. So those of windows that follow each other add up.
+
+    Raises:
+        InvalidArgumentsError: a message of the topic carries no position.
+    """
+    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    builder = StandstillBuilder()
+    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
+    failures: list[UndecodableError] = []
+
+    def add(
+        to: StandstillBuilder | StandstillCollector, messages: Iterable[StoredMessage]
+    ) -> Span | None:
+        def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
+            if is_place(pose.position):
+                to.add(time, pose.position)
+
+        return add_poses(view, add_place, decoder, messages, failures)
+
+    def collect(
+        messages: Iterable[StoredMessage],
+    ) -> tuple[StandstillDigest | None, Span | None]:
+        collector = StandstillCollector()
+        span = add(collector, messages)
+        return collector.digest(), span
+
+    Fold(
+        _STANDSTILLS,
+        add=lambda messages: add(builder, messages),
+        collect=collect,
+        join=lambda digest, _span: builder.join(digest),
+        failures=failures,
+    ).over(view, topic, window.widened(CONTEXT_NS))
+    return tuple(
+        (
+            each._replace(start=max(each.start, start), end=min(each.end, end)),
+            each.end > end or each.end == builder.last,
+        )
+        for each in builder.standstills()
+        if each.start < end and each.end > start
+    )
