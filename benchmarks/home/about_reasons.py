@@ -9,6 +9,7 @@ from benchmarks.home import replies
 from benchmarks.home.days import CLOCK_STEP_S
 from benchmarks.home.judging import Number, Time, Words, YesNo
 from benchmarks.home.questions import Question, ask, in_words
+from benchmarks.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -87,7 +88,10 @@ def _blind(asked: Asked) -> list[Question]:
     def of_yesterday(found: Sequence[Row]) -> Answer:
         midnight = asked.day(asked.last)
         return {
-            "blind": any(replies.time(each, "start", "from") < midnight for each in silences(found))
+            "blind": any(
+                each["topic"] == VISION.topic and replies.time(each, "start", "from") < midnight
+                for each in silences(found)
+            )
         }
 
     return [
