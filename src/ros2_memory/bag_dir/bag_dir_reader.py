@@ -15,7 +15,6 @@ import os
 import stat
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
@@ -38,7 +37,7 @@ from ros2_memory.storage.base import BagReader
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.bag_dir.handover_file import Exclusion
+    from ros2_memory.bag_dir.handover_file import Exclusion, FileRule
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import CdrLayout, Channel, Closing, Record
@@ -89,12 +88,12 @@ class BagDirReader(BagReader):
         handover, problem = self._handover(path)
         if problem is not None:
             summary = summary.replaced(notes=(*summary.notes, problem))
-        if handover.hides_all:
-            return summary.replaced(topics=())
-        exclusions = handover.exclusions(path.name)
-        if not exclusions:
+        rule = handover.rule(path.name)
+        if rule is None:
             return summary
-        topics = (self._counted(path, topic, exclusions) for topic in summary.topics)
+        if rule.hides_all:
+            return summary.replaced(topics=())
+        topics = (self._counted(path, topic, rule) for topic in summary.topics)
         return summary.replaced(
             topics=tuple(topic for topic in topics if topic is not None),
             notes=(*summary.notes, *handover.notes),
@@ -116,12 +115,11 @@ class BagDirReader(BagReader):
 
         def opened() -> Iterator[Iterator[Record]]:
             found = self._located(path)
-            exclusions = self._exclusions(found, window)
-            if exclusions is None:
+            rule = self._rule(found, topics, window)
+            if rule is not None and rule.hides_all:
                 return
             records = self._reader.records(found, topics, window, newest_first=newest_first)
-            counts = partial(_counts, exclusions=exclusions)
-            yield filter(counts, records) if exclusions else records
+            yield records if rule is None else filter(rule.counts, records)
 
         # A generator would end at the first error; after a damaged chunk the adapter's iterator
         # goes on behind it, and so do `filter` and `chain`.
@@ -134,10 +132,7 @@ class BagDirReader(BagReader):
             BagError: as the adapter, or the path leads out of the bag directory.
         """
         found = self._located(path)
-        exclusions = self._exclusions(found, window)
-        if exclusions is None:
-            return None
-        if exclusions:
+        if self._rule(found, [topic], window) is not None:
             return super().newest(found, topic, window)
         return self._reader.newest(found, topic, window)
 
@@ -148,10 +143,7 @@ class BagDirReader(BagReader):
             BagError: as the adapter, or the path leads out of the bag directory.
         """
         found = self._located(path)
-        exclusions = self._exclusions(found, window)
-        if exclusions is None:
-            return ()
-        if exclusions:
+        if self._rule(found, [topic], window) is not None:
             return [record.log_time for record in self.records(found, [topic], window)]
         return self._reader.log_times(found, topic, window)
 
@@ -214,13 +206,13 @@ class BagDirReader(BagReader):
             path = next((each for each in links if os.path.lexists(each)), path)
         return self._confined(path)
 
-    def _exclusions(self, path: Path, window: TimeWindow) -> list[Exclusion] | None:
-        """Returns what does not count among the log times of a window; None: nothing does."""
+    def _rule(self, path: Path, topics: Collection[str], window: TimeWindow) -> FileRule | None:
+        """Returns which messages of the topics in a window count; None where all do."""
         reading = self._handover(path)
         if reading is _NO_SIDECAR:
-            return []
-        handover = reading.handover
-        return None if handover.hides_all else _touching(handover.exclusions(path.name), window)
+            return None
+        rule = reading.handover.rule(path.name)
+        return rule if rule is not None and rule.touches(window, topics) else None
 
     def _handover(self, path: Path) -> HandoverReading:
         """Returns the sidecar of a file's recording, parsed again only when it has changed.
@@ -252,17 +244,16 @@ class BagDirReader(BagReader):
         self._sidecars[sidecar] = (stamp, reading)
         return reading
 
-    def _counted(
-        self, path: Path, topic: TopicSummary, exclusions: Sequence[Exclusion]
-    ) -> TopicSummary | None:
+    def _counted(self, path: Path, topic: TopicSummary, rule: FileRule) -> TopicSummary | None:
         """Returns the topic without the messages that count elsewhere; None if none is left."""
         span = TimeWindow(topic.first, topic.last + 1)
-        if topic.latched or not _touching(exclusions, span):
+        if (topic.latched and not rule.hides_latched) or not rule.touches(span, [topic.topic]):
             return topic
-        # Excluded messages lie in few chunks: only these are read.
+        # Excluded messages lie in few chunks: only these are read, but for listed ones.
+        windows = [span] if topic.topic in rule.elsewhere else _united(rule.exclusions, span)
         lost = sum(
-            record.channel.type == topic.type and not _counts(record, exclusions)
-            for window in _united(exclusions, span)
+            record.channel.type == topic.type and not rule.counts(record)
+            for window in windows
             for record in self._reader.records(path, [topic.topic], window)
         )
         if not lost:
@@ -279,24 +270,13 @@ class BagDirReader(BagReader):
         return replace(topic, count=topic.count - lost, first=first, last=last)
 
 
-def _touching(exclusions: Iterable[Exclusion], window: TimeWindow) -> list[Exclusion]:
-    """Returns the exclusions that apply to log times of a window."""
-    return [
-        each for each in exclusions if each.log_from < window.stop and window.start < each.log_until
-    ]
-
-
 def _united(exclusions: Iterable[Exclusion], span: TimeWindow) -> list[TimeWindow]:
     """Returns the parts of a span that exclusions touch, without overlaps."""
+    touching = [
+        each for each in exclusions if each.log_from < span.stop and span.start < each.log_until
+    ]
     united: list[TimeWindow] = []
-    for each in sorted(_touching(exclusions, span), key=attrgetter("log_from")):
+    for each in sorted(touching, key=attrgetter("log_from")):
         start = max(each.log_from, united[-1].stop if united else span.start)
         united.append(TimeWindow(start, max(start, min(each.log_until, span.stop))))
     return united
-
-
-def _counts(record: Record, exclusions: Sequence[Exclusion]) -> bool:
-    """Returns whether a message counts in its recording."""
-    return record.channel.latched or not any(
-        each.excludes(record.publish_time, record.log_time) for each in exclusions
-    )

@@ -14,20 +14,28 @@ else every message counts.
             "counts_from_ns": 1795150000500000000,
             "begin": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_B_0.mcap"]}, ...}
 
+A cut alone would hide what only one of the two has on disk, because the other stalled. So once the
+files on both sides are closed the recorder compares them (`recorder.handover.union`), and lists the
+messages for which the cut is not the answer: those that count here all the same (`also_counts`),
+and those that do not (`counts_elsewhere`), by file and topic. A message is the same in both
+recordings by topic, publish time and payload.
+
 Every recording receives latched messages again, long after they were published. A cut cannot
-separate them; they are recognised by topic, publish time and payload, so do not apply `Exclusion`
-to a latched channel.
+separate them; they are recognised by topic, publish time and payload as well, in queries, so no cut
+applies to a latched channel.
 """
 
 from __future__ import annotations
 
 import errno
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
+from zlib import crc32
 
-from pydantic import AfterValidator, ConfigDict, TypeAdapter
+from pydantic import AfterValidator, ConfigDict, StringConstraints, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
 from ros2_memory.bag_dir.json_fields import Int64, json_object, validated
@@ -36,10 +44,12 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import Record
 
 FORMAT: Final = 1
 LOG_CLOCK_NOTE: Final = (
@@ -70,6 +80,9 @@ def _checked_name(value: str) -> str:
 
 
 _Name: TypeAlias = Annotated[str, AfterValidator(_checked_name)]
+_MessageId: TypeAlias = Annotated[str, StringConstraints(pattern=r"^-?\d{1,19} [0-9a-f]{8}$")]
+MessageList: TypeAlias = "dict[str, dict[str, tuple[_MessageId, ...]]]"
+"""Messages by file and topic: publish time in nanoseconds and CRC-32 of the payload, as text."""
 _Time: TypeAlias = Int64 | None
 # The keys of the file: those of times end in `_ns`.
 _KEYS: Final = ConfigDict(
@@ -96,8 +109,9 @@ class Handover:
     """The content of `handover.json`; by default everything counts.
 
     `previous` and `next` are names of recordings beside this one. Messages published before
-    `counts_from` (in `begin`), and at or after `counts_until` (in `end`), count elsewhere. A
-    `next` without `counts_until` is a handover that was begun and not finished.
+    `counts_from` (in `begin`), and at or after `counts_until` (in `end`), count elsewhere, but for
+    those listed. A `next` without `counts_until` is a handover that was begun and not finished.
+    `compared` is False until the recording was compared with the previous one.
     """
 
     __pydantic_config__ = _KEYS
@@ -111,20 +125,32 @@ class Handover:
     counts_until: _Time = None
     end: Overlap | None = None
     notes: tuple[str, ...] = ()
+    compared: bool | None = None  # None: by a version that did not compare
+    also_counts: MessageList = field(default_factory=dict)
+    counts_elsewhere: MessageList = field(default_factory=dict)
 
     @property
     def hides_all(self) -> bool:
-        """Returns whether no message of the recording counts."""
+        """Returns whether no message of the recording counts, but for those in `also_counts`."""
         return self.state is not Counting.COUNTS
 
     def exclusions(self, file_name: str) -> tuple[Exclusion, ...]:
-        """Returns what does not count in one bag file, if not `hides_all`; mostly nothing."""
+        """Returns what the cuts exclude of one bag file, if not `hides_all`; mostly nothing."""
         found: list[Exclusion] = []
         if self.begin is not None and self.counts_from is not None:
             found += _exclusion(self.begin, file_name, MIN_NS, self.counts_from)
         if self.end is not None and self.counts_until is not None:
             found += _exclusion(self.end, file_name, self.counts_until, MAX_NS)
         return tuple(found)
+
+    def rule(self, file_name: str) -> FileRule | None:
+        """Returns which messages of one bag file count; None where all do, as in most files."""
+        exclusions = (_EVERYTHING,) if self.hides_all else self.exclusions(file_name)
+        also = self.also_counts.get(file_name, {})
+        elsewhere = self.counts_elsewhere.get(file_name, {})
+        if not (exclusions or elsewhere):
+            return None
+        return FileRule(exclusions, also, elsewhere, hides_latched=self.hides_all)
 
 
 _HANDOVER: Final = TypeAdapter(Handover)
@@ -139,10 +165,58 @@ class Exclusion(NamedTuple):
     log_until: Ns
 
     def excludes(self, publish_time: Ns, log_time: Ns) -> bool:
-        """Returns whether a message with these times counts in another recording."""
+        """Returns whether a message with these times counts in another recording.
+
+        A publish time of 0 is none: then the cut is by log time.
+        """
         return (
-            self.publish_from <= publish_time < self.publish_until
+            self.publish_from <= (publish_time or log_time) < self.publish_until
             and self.log_from <= log_time < self.log_until
+        )
+
+
+_EVERYTHING: Final = Exclusion(MIN_NS, MAX_NS, MIN_NS, MAX_NS)
+
+
+def message_id(publish_time: Ns, payload: bytes) -> str:
+    """Returns what identifies a message of a topic in both recordings, as sidecars list it."""
+    return f"{publish_time} {crc32(payload):08x}"
+
+
+@lru_cache(maxsize=256)
+def _as_set(listed: tuple[str, ...]) -> frozenset[str]:
+    return frozenset(listed)
+
+
+class FileRule(NamedTuple):
+    """Which messages of one bag file count: all but the excluded, and but for the listed ones."""
+
+    exclusions: tuple[Exclusion, ...]
+    also: Mapping[str, tuple[str, ...]]
+    elsewhere: Mapping[str, tuple[str, ...]]
+    hides_latched: bool = False
+
+    @property
+    def hides_all(self) -> bool:
+        """Whether no message of the file counts."""
+        return self.hides_latched and not self.also
+
+    def counts(self, record: Record) -> bool:
+        """Returns whether a message of the file counts."""
+        channel = record.channel
+        excluded = (self.hides_latched or not channel.latched) and any(
+            each.excludes(record.publish_time, record.log_time) for each in self.exclusions
+        )
+        listed = (self.also if excluded else self.elsewhere).get(channel.topic)
+        if not listed:
+            return not excluded
+        return (message_id(record.publish_time, record.payload) in _as_set(listed)) == excluded
+
+    def touches(self, window: TimeWindow, topics: Collection[str]) -> bool:
+        """Returns whether some message of the topics with log time in a window may not count."""
+        return any(each in self.elsewhere for each in topics) or any(
+            each.log_from < window.stop and window.start < each.log_until
+            for each in self.exclusions
         )
 
 

@@ -18,6 +18,7 @@ from ros2_memory.recorder.handover.plan import (
     HandoverPlan,
     Step,
 )
+from ros2_memory.recorder.handover.recovery import settle_handover
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.policies import describe_silent_topics
 from ros2_memory.recorder.process.child import end_all
@@ -100,6 +101,8 @@ class RecordingSessions:
         self.running: tuple[RecordingSession, ...] = ()
         # By the old recording's name, until that has ended.
         self._completed: dict[str, HandoverTransfer] = {}
+        # Old and new recordings whose sidecars may have to change.
+        self._unsettled: list[tuple[Path, Path]] = []
         self._ended_bytes = 0
         self.restarts = 0
 
@@ -146,6 +149,8 @@ class RecordingSessions:
             closed = closed or bool(changes.closed)
             if changes.gone and session.state is not SessionState.ENDING:
                 self._handle_vanished(session)
+        if closed:
+            self._settle_handovers()
         return closed
 
     def advance_handover(self, now: ClockReading) -> Step:
@@ -194,9 +199,15 @@ class RecordingSessions:
 
     def collect_ended(self, now: ClockReading) -> None:
         """Signals sessions that are ending again, and finalizes those that have ended."""
-        for session in self.running:
-            if session.state is SessionState.ENDING and session.child.end() is not None:
-                self._finalize(session, now)
+        ended = [
+            session
+            for session in self.running
+            if session.state is SessionState.ENDING and session.child.end() is not None
+        ]
+        for session in ended:
+            self._finalize(session, now)
+        if ended:
+            self._settle_handovers()
 
     def end_all(self, now: ClockReading) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
@@ -205,10 +216,10 @@ class RecordingSessions:
             completed = False
             with self._reported(handover.old):
                 completed = handover.complete(now)
+            self._unsettled.append(handover.directories)
             if completed:
                 self._completed[handover.old.name] = handover
-            else:
-                self._abandon(handover)
+            # Else the old one counts up to its end, and the new one from there.
         for session in self.running:
             session.end()
         self.current, self.handover = None, None
@@ -280,6 +291,7 @@ class RecordingSessions:
             )
         handover.complete(now)
         self._completed[handover.old.name] = handover
+        self._unsettled.append(handover.directories)
         handover.old.end()
         self.current, self.handover = handover.new, None
         self._events.info("rotated", recording=handover.old.name, next=handover.new.name)
@@ -289,6 +301,7 @@ class RecordingSessions:
         self.handover = None
         with self._reported(handover.old):
             handover.abandon()
+        self._unsettled.append(handover.directories)
         handover.new.end()
 
     def _replace_current(self) -> None:
@@ -297,8 +310,25 @@ class RecordingSessions:
         self.current, self.handover = None, None
         if handover is not None:
             self.current = handover.new
-            with self._reported(handover.old):
-                handover.recover()
+            self._unsettled.append(handover.directories)
+            self._settle_handovers()
+
+    def _settle_handovers(self) -> None:
+        """Completes handovers whose recordings have ended, and compares the two where they can be.
+
+        What fails is tried again when the next split is closed.
+        """
+        running = {each.name for each in self.running}
+        left = []
+        for old, new in self._unsettled:
+            settled = False
+            try:
+                settled = settle_handover(old, new, self._reader, running)
+            except RecorderError as error:
+                self._events.fail("rotation_failed", str(error), recording=old.name)
+            if not settled:
+                left.append((old, new))
+        self._unsettled = left
 
     def _handle_vanished(self, session: RecordingSession) -> None:
         sentence = f"the directory of recording {session.name} has gone; a new one is begun"

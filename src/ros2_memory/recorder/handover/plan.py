@@ -3,7 +3,8 @@
 The new recorder is started beside the old one, and waits until it has subscribed to all topics of
 the old one, but not for ever, since a publisher may be gone. Then both run for two more seconds.
 The cut lies in the middle of those: messages published around it are in both recordings, so that a
-message in transit, or a clock that is off by less than a second, loses and doubles nothing.
+message in transit, or a clock that is off by less than a second, loses and doubles nothing. A
+recorder that stalled meanwhile lost what was published: `union` finds that in the other one.
 """
 
 from __future__ import annotations
@@ -138,8 +139,8 @@ def pending(old_name: str) -> Handover:
 
 
 def void(old_name: str) -> Handover:
-    """Returns the sidecar of a new recording that did not take over: the old one has all of it."""
-    return Handover(state=Counting.VOID, previous=old_name)
+    """Returns the sidecar of a new recording that did not take over: the old one went on."""
+    return Handover(state=Counting.VOID, previous=old_name, compared=False)
 
 
 def complete_sidecars(
@@ -183,5 +184,6 @@ def complete_sidecars(
             counts_from=bounds.cut,
             begin=Overlap(began, ended, tuple(sorted(new_files))),
             notes=notes,
+            compared=False,
         ),
     )

@@ -2,7 +2,7 @@
 
 The old recording names the new one before that is started, so nothing is inferred from times: only
 for a pair that is known to have overlapped is the end of the old one read. Its messages count up to
-there, and those of the new one from then on.
+there, and those of the new one from then on, but for what `union` finds.
 """
 
 from __future__ import annotations
@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.bag_dir.handover_file import (
+    LOG_CLOCK_NOTE,
     Counting,
     CutClock,
+    Handover,
     Overlap,
     handover_to_change,
     read_handover,
@@ -26,6 +28,7 @@ from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.recorder.handover.plan import Sidecars, intended
+from ros2_memory.recorder.handover.union import bag_files, bags_of, compare_recordings
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -53,11 +56,17 @@ def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str]
         OSError: the bag directory cannot be listed.
     """
     for directory in sorted(each for each in bag_dir.iterdir() if _is_folder(each)):
-        new_name = None if directory.name in running else incomplete_handover(directory)
-        if new_name is None:
-            continue
+        handover = read_handover(directory).handover
         try:
-            recover_handover(directory, bag_dir / new_name, reader)
+            if (
+                handover.next is not None
+                and handover.counts_until is None
+                and directory.name not in running
+            ):
+                recover_handover(directory, bag_dir / handover.next, reader)
+                compare_recordings(directory, bag_dir / handover.next, reader, running)
+            if handover.previous is not None and handover.compared is False:
+                compare_recordings(bag_dir / handover.previous, directory, reader, running)
         except RecorderError as error:
             _log.error("handover_not_settled", recording=directory.name, reason=str(error))
 
@@ -69,6 +78,30 @@ def recover_unwritten(bag_dir: Path, reader: BagReader) -> None:
         OSError: the bag directory cannot be listed.
     """
     recover_handovers(bag_dir, reader, read_heartbeat(bag_dir).recordings)
+
+
+def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection[str]) -> bool:
+    """Completes the handover between two recordings as far as these have ended, and compares them.
+
+    Returns:
+        Whether nothing is left to do.
+
+    Raises:
+        RecorderError: the recordings cannot be read, or the sidecars cannot be written.
+    """
+    if not _is_folder(new):
+        if _is_folder(old) and incomplete_handover(old) == new.name:
+            write_handover(old, intended(handover_to_change(old), None))
+        return True
+    if not _is_folder(old):
+        if handover_to_change(new).hides_all:
+            write_handover(new, Handover())
+        return True
+    if incomplete_handover(old) == new.name:
+        if old.name in running:
+            return False
+        recover_handover(old, new, reader)
+    return compare_recordings(old, new, reader, running)
 
 
 def _is_folder(path: Path) -> bool:
@@ -109,7 +142,7 @@ def _complete(old: Path, new: Path, reader: BagReader) -> None:
     elif after.state is Counting.COUNTS and after.counts_from is not None:
         # The crash came between the two sidecars of a complete handover.
         start = after.begin.log_from if after.begin is not None else None
-        files = tuple(name for name, summary in _bags(old, reader) if _reaches(summary, start))
+        files = tuple(name for name, summary in bags_of(old, reader) if _reaches(summary, start))
         end = Overlap(start, None, files)
         write_handover(old, replace(before, counts_until=after.counts_from, end=end))
     else:
@@ -117,7 +150,7 @@ def _complete(old: Path, new: Path, reader: BagReader) -> None:
 
 
 def cut_clock(bag: Path, reader: BagReader) -> CutClock:
-    """Finds out whether publish times differ from log times in a bag file; yes if it is empty.
+    """Finds out whether a bag file has publish times of their own; yes if it is empty.
 
     Raises:
         RecorderError: the disk fails.
@@ -128,7 +161,7 @@ def cut_clock(bag: Path, reader: BagReader) -> CutClock:
         raise RecorderError(str(error)) from error
     except BagError:
         return CutClock.PUBLISH
-    equal = bool(records) and all(each.publish_time == each.log_time for each in records)
+    equal = bool(records) and all(each.publish_time in {0, each.log_time} for each in records)
     return CutClock.LOG if equal else CutClock.PUBLISH
 
 
@@ -146,24 +179,34 @@ def _cut_at_the_end(old: Path, new: Path, found: Sidecars, reader: BagReader) ->
     before, after = found
     last = _end_of(old, reader)
     if last is None:
-        write_handover(new, replace(after, state=Counting.COUNTS, previous=old.name))
+        write_handover(new, replace(after, state=Counting.COUNTS, previous=old.name, compared=True))
         write_handover(old, intended(before, None))
         return
-    bags = _bags(new, reader)
+    bags = bags_of(new, reader)
     first = min((summary.start for _, summary in bags), default=last.log_time)
     cut, until = last.publish_time + 1, min(last.log_time + JITTER_NS, first + LONGEST_NS)
     later = {name for name, summary in bags if summary.start >= until}
     # A file that cannot be read yet is still being written.
-    files = tuple(path.name for path in _files(new, reader) if path.name not in later)
+    files = tuple(path.name for path in bag_files(new, reader) if path.name not in later)
     begin = Overlap(None, until, files)
-    start = replace(after, state=Counting.COUNTS, previous=old.name, counts_from=cut, begin=begin)
+    clock = cut_clock(new / bags[0][0], reader) if bags else CutClock.PUBLISH
+    start = replace(
+        after,
+        state=Counting.COUNTS,
+        clock=clock,
+        previous=old.name,
+        counts_from=cut,
+        begin=begin,
+        notes=(LOG_CLOCK_NOTE,) if clock is CutClock.LOG else (),
+        compared=False,
+    )
     write_handover(new, start)
     write_handover(old, replace(before, counts_until=cut, end=Overlap(None, None, ())))
 
 
 def _end_of(recording: Path, reader: BagReader) -> _End | None:
     """Returns the newest publish time and log time in the last bag file that is not empty."""
-    bags = _bags(recording, reader)
+    bags = bags_of(recording, reader)
     if not bags:
         return None
     name, _ = max(bags, key=lambda each: each[1].end)
@@ -171,31 +214,14 @@ def _end_of(recording: Path, reader: BagReader) -> _End | None:
     try:
         for record in _records(recording / name, reader):
             published, logged = newest or (MIN_NS, MIN_NS)
-            newest = _End(max(published, record.publish_time), max(logged, record.log_time))
+            # A publish time of 0 is none.
+            latest = max(published, record.publish_time or record.log_time)
+            newest = _End(latest, max(logged, record.log_time))
     except BagUnreachableError:
         raise
     except BagError:
         pass  # what could be read of it counts
     return newest
-
-
-def _bags(recording: Path, reader: BagReader) -> list[tuple[str, BagSummary]]:
-    """Returns name and summary of each bag file that is not empty."""
-    found: list[tuple[str, BagSummary]] = []
-    for path in _files(recording, reader):
-        try:
-            summary = reader.summarize(path)
-        except BagUnreachableError:
-            raise
-        except BagError:
-            continue
-        if not summary.empty:
-            found.append((path.name, summary))
-    return found
-
-
-def _files(recording: Path, reader: BagReader) -> list[Path]:
-    return sorted(each for each in recording.iterdir() if reader.reads(each))
 
 
 def _records(bag: Path, reader: BagReader) -> Iterator[Record]:

@@ -2,7 +2,7 @@
 
 Each is written before it can matter: the old recording names the new one before that is started,
 the new one is marked as not counting as soon as it exists, and the cut is written to the new one
-first. So a crash leaves a pair of sidecars that `recover_handover` can complete.
+first. So a crash leaves a pair of sidecars that `settle_handover` can complete.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import (
     CutClock,
-    Handover,
     handover_to_change,
     write_handover,
     write_handovers,
@@ -24,7 +23,7 @@ from ros2_memory.recorder.handover.plan import (
     pending,
     void,
 )
-from ros2_memory.recorder.handover.recovery import cut_clock, recover_handover
+from ros2_memory.recorder.handover.recovery import cut_clock
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,6 +75,11 @@ class HandoverTransfer:
             write_handover(directory, intended(handover_to_change(directory), new_name))
 
     @property
+    def directories(self) -> tuple[Path, Path]:
+        """The old and the new recording."""
+        return self.old.splits.directory, self.new.splits.directory
+
+    @property
     def missing(self) -> frozenset[str]:
         """Topics that the old recorder has subscribed to and the new one has not."""
         return frozenset(self.old.subscribed - self.new.subscribed)
@@ -101,6 +105,10 @@ class HandoverTransfer:
         bounds = self._plan.bounds(now)
         if bounds is None:
             return False
+        clock = self._clock()
+        if self._simulated and clock is CutClock.LOG:
+            # No time of the wall clock separates them: the old one counts up to its end.
+            return True
         sidecars = complete_sidecars(
             handover_to_change(self.old.splits.directory),
             self.old.name,
@@ -109,7 +117,7 @@ class HandoverTransfer:
             old_files=self._old_files(),
             new_files=self.new.splits.names(),
             simulated=self._simulated,
-            clock=self._clock(),
+            clock=clock,
         )
         write_handovers(
             {
@@ -120,7 +128,7 @@ class HandoverTransfer:
         return True
 
     def abandon(self) -> None:
-        """Marks the new recording as not counting: the old one continues and has all of it.
+        """Marks the new recording as not counting: the old one continues.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -140,17 +148,6 @@ class HandoverTransfer:
         if handover.end is not None:
             files = tuple(sorted(self._old_files() | frozenset(handover.end.files)))
             write_handover(directory, replace(handover, end=replace(handover.end, files=files)))
-
-    def recover(self) -> None:
-        """Has the new recording count from the end of the old one, whose recorder died half-way.
-
-        Raises:
-            RecorderError: a sidecar cannot be written.
-        """
-        if _is_there(self.old.splits.directory):
-            recover_handover(self.old.splits.directory, self.new.splits.directory, self._reader)
-        elif _is_there(self.new.splits.directory):
-            write_handover(self.new.splits.directory, Handover())
 
     def _old_files(self) -> frozenset[str]:
         return self.old.splits.names() - self._closed_before
