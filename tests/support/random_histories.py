@@ -13,6 +13,8 @@ from mcap.exceptions import McapError
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.recorder.handover.union import compare_recordings
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -134,7 +136,16 @@ def write_history(bag_dir: Path, draw: Random) -> Written:
             arrived += [_shifted(each, draw.randint(10_000, 900_000)) for each in before[1][-6:]]
             if draw.random() < 0.4:
                 _hand_over(bag_dir, before[0], name, now)
+                # The recorder before stalled: it missed these.
+                missed = [
+                    each
+                    for each in robot.between(before[1][0].log_time, now)
+                    if each.topic not in LATCHED
+                ]
+                arrived += [_shifted(each, draw.randint(10_000, 900_000)) for each in missed]
         _write_recording(bag_dir / name, arrived, draw)
+        if before is not None:
+            compare_recordings(bag_dir / before[0], bag_dir / name, McapReader())
         written.moments += [each.log_time for each in arrived]
         before = (name, fresh)
         now = stop + draw.choice([0, 0, -S, 60 * S])
@@ -183,7 +194,9 @@ def _hand_over(bag_dir: Path, before: str, after: str, cut: int) -> None:
     files = (f"{after}_0.mcap",)
     write_handover(
         bag_dir / after,
-        Handover(previous=before, counts_from=cut, begin=Overlap(None, None, files)),
+        Handover(
+            previous=before, counts_from=cut, begin=Overlap(None, None, files), compared=False
+        ),
     )
 
 

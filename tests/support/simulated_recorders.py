@@ -53,6 +53,7 @@ class PlayedRecorder(Child):
     asked_to_end: int = 0
     splits: int = 0
     patience_s: float = 15.0
+    deaf: bool = False
     _age_s: float = 0.0
     _subscribed: bool = False
     _held: list[Msg] = field(default_factory=list)
@@ -95,7 +96,7 @@ class PlayedRecorder(Child):
             ]
 
     def receive(self, published: int) -> None:
-        if self.status is not None or not self._subscribed:
+        if self.status is not None or not self._subscribed or self.deaf:
             return
         logged = published + 20_000 + self.pid * 1_000
         if (

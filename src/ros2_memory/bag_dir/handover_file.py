@@ -86,7 +86,7 @@ MessageList: TypeAlias = "dict[str, dict[str, tuple[_MessageId, ...]]]"
 _Time: TypeAlias = Int64 | None
 # The keys of the file: those of times end in `_ns`.
 _KEYS: Final = ConfigDict(
-    alias_generator=lambda name: f"{name}_ns" if name.startswith(("counts_", "log_")) else name
+    alias_generator=lambda name: f"{name}_ns" if name.endswith(("_from", "_until")) else name
 )
 
 

@@ -93,13 +93,18 @@ class TestCounting:
         assert excluded(loose, "rec_2_0.mcap", 10, MIN_NS)
         assert excluded(loose, "rec_2_0.mcap", 10, MAX_NS - 1)
 
+    def test_without_a_publish_time_the_cut_is_by_log_time(self) -> None:
+        old = Handover(next="b", counts_until=50, end=Overlap(0, 101, ("a_9.mcap",)))
+        assert not excluded(old, "a_9.mcap", 0, 49)
+        assert excluded(old, "a_9.mcap", 0, 50)
+
     @pytest.mark.parametrize("state", [Counting.PENDING, Counting.VOID])
     def test_a_recording_that_did_not_take_over_counts_for_nothing(self, state: Counting) -> None:
         assert Handover(state=state, previous="rec_1").hides_all
 
     @given(
         cut=st.integers(0, 100),
-        publish_time=st.integers(0, 100),
+        publish_time=st.integers(1, 100),
         log_times=st.tuples(st.integers(0, 100), st.integers(0, 100)),
     )
     def test_in_the_overlap_a_message_counts_in_exactly_one_of_the_two(

@@ -198,6 +198,38 @@ class TestStop:
         assert "process 100" in str(said["reason"])
 
 
+class TestMessagesOfOneRecordingAlone:
+    @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 22.0, 23.0, 23.5])
+    def test_a_stop_amid_a_rotation_hides_nothing(self, tmp_path: Path, after_s: float) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(after_s - 0.5)
+        world.recorders[0].deaf = True
+        world.run(0.5)
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    @pytest.mark.parametrize("which", [0, 1])
+    def test_what_one_missed_in_a_rotation_counts_in_the_other(
+        self, tmp_path: Path, which: int
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(21.75)
+        world.recorders[which].deaf = True
+        world.run(0.75)
+        world.recorders[which].deaf = False
+        # Compared as soon as the first split of the new one is closed, long before it ends.
+        world.run(12)
+        assert len(world.running) == 1
+        stands = {at for at in world.published(counting=False) if at < world.wall - 7 * NS_PER_S}
+        counts = world.published(counting=True)
+        assert {at: counts[at] for at in stands} == dict.fromkeys(stands, 1)
+        world.supervisor.stop()
+        assert_each_counts_once(world)
+
+
 class TestClock:
     def test_set_back_in_a_handover_the_handover_is_tried_again(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20)

@@ -97,14 +97,11 @@ def compare_recordings(
     try:
         one, other = (_side(each, reader, running) for each in (old, new))
         ended, lasting = (one, other) if ends_first is old else (other, one)
-        if not (one.bags and other.bags):
-            if lasting.recording.name in running and ended.bags:
-                return False
-            found = _Lists({}, {}), _Lists({}, {})
-        else:
-            if lasting.recording.name in running and lasting.end < ended.end + STALL_NS:
-                return False
-            found = _differences(one, other, reader)
+        if lasting.recording.name in running and (
+            not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
+        ):
+            return False
+        found = _differences(one, other, reader)
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
     except BagUnreachableError as error:
@@ -135,13 +132,19 @@ def _side(recording: Path, reader: BagReader, running: Collection[str]) -> _Side
 
 def _differences(old: _Side, new: _Side, reader: BagReader) -> tuple[_Lists, _Lists]:
     """Returns what counts against the cut, for both sidecars."""
-    window = TimeWindow(max(old.start, new.start) - STALL_NS, min(old.end, new.end) + STALL_NS + 1)
+    window = TimeWindow.everything()
+    if old.bags and new.bags:
+        start, end = max(old.start, new.start), min(old.end, new.end)
+        window = TimeWindow(start - STALL_NS, end + STALL_NS + 1)
     # The cut does not apply to latched channels, but all of a recording without effect is hidden.
     latched = new.handover.state is Counting.VOID
     of_old, of_new = (_copies(each, window, reader, latched=latched) for each in (old, new))
     lists = _Lists({}, {}), _Lists({}, {})
     for key in of_old.keys() | of_new.keys():
-        copies = tuple(of_side.get(key, _NONE) for of_side in (of_old, of_new))
+        of_one, of_other = (of_side.get(key, _NONE) for of_side in (of_old, of_new))
+        if of_one is None or of_other is None:
+            continue
+        copies = of_one, of_other
         counted = [each.counted.total() for each in copies]
         held = [each.counted.total() + each.excluded.total() for each in copies]
         # Where both hold it as often, the cut decides.
@@ -159,9 +162,12 @@ _NONE: Final = _Copies(Counter(), Counter())
 
 def _copies(
     side: _Side, window: TimeWindow, reader: BagReader, *, latched: bool
-) -> dict[_Key, _Copies]:
-    """Returns what a recording holds in a window, by topic and identity."""
-    found: dict[_Key, _Copies] = {}
+) -> dict[_Key, _Copies | None]:
+    """Returns what a recording holds in a window, by topic and identity.
+
+    None stands for a message without a publish time of its own.
+    """
+    found: dict[_Key, _Copies | None] = {}
     for name, summary in side.bags.items():
         topics = [each.topic for each in summary.topics]
         if not window.overlaps(summary.start, summary.end):
@@ -169,13 +175,14 @@ def _copies(
         rule = side.handover.rule(name)
         for record in _readable(reader.records(side.recording / name, topics, window)):
             published, logged = record.publish_time, record.log_time
-            if published in {0, logged}:
-                continue
             if record.channel.latched and not (latched and logged - published <= FRESH_NS):
                 continue
             key = record.channel.topic, message_id(published, record.payload)
             copies = found.setdefault(key, _Copies(Counter(), Counter()))
-            copies[rule is not None and not rule.counts(record)][name] += 1
+            if published in {0, logged}:
+                found[key] = None
+            elif copies is not None:
+                copies[rule is not None and not rule.counts(record)][name] += 1
     return found
 
 

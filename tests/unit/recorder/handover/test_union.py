@@ -1,0 +1,303 @@
+"""Two recordings of one robot, each with stalls: what either of them holds counts, and once."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import (
+    LOG_CLOCK_NOTE,
+    CutClock,
+    Handover,
+    read_handover,
+    write_handover,
+    write_handovers,
+)
+from ros2_memory.core.errors import BagUnreachableError, RecorderError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.recorder.handover import union
+from ros2_memory.recorder.handover.plan import (
+    Bounds,
+    complete_sidecars,
+    intended,
+    pending,
+    void,
+)
+from ros2_memory.recorder.handover.recovery import recover_handovers, settle_handover
+from ros2_memory.recorder.handover.union import compare_recordings
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import McapLayout, Msg, text, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+S = 10**9
+T0 = 1_795_150_800 * S
+READER = McapReader()
+TOPICS = ("/fast", "/slow", "/latched")
+LAYOUT = McapLayout(latched=frozenset({"/latched"}))
+
+
+class Published(NamedTuple):
+    """A message by its own number, which no code under test knows of."""
+
+    number: int
+    topic: str
+    at: float  # seconds
+
+
+class Stall(NamedTuple):
+    """When a recorder stands still, and for how long, in seconds."""
+
+    at: float
+    lasts: float
+
+
+class Recorder(NamedTuple):
+    """One recorder: when it begins and ends, in seconds, how deep its queues are."""
+
+    start: float
+    stop: float
+    stalls: tuple[Stall, ...] = ()
+    depth: int = 2
+    splits: tuple[float, ...] = ()
+    delay_ns: int = 20_000
+
+    def receives(self, published: Iterable[Published]) -> list[Msg]:
+        """What it writes: after a stall the newest messages of each queue, and the time of then."""
+        received: list[Msg] = []
+        queues: dict[tuple[Stall, str], list[Msg]] = {}
+        for each in published:
+            if not self.start <= each.at < self.stop:
+                continue
+            stall = next((s for s in self.stalls if s.at <= each.at < s.at + s.lasts), None)
+            at = each.at if stall is None else stall.at + stall.lasts
+            made = text(T0, str(each.number), each.topic)
+            log_time = T0 + round(at * S) + self.delay_ns
+            message = Msg(each.topic, made.type, log_time, made.body, T0 + round(each.at * S))
+            if stall is None:
+                received.append(message)
+            else:
+                queues.setdefault((stall, each.topic), []).append(message)
+        for queue in queues.values():
+            received += queue[-self.depth :]
+        return sorted(received, key=lambda each: each.log_time)
+
+    def writes(self, directory: Path, published: Iterable[Published]) -> None:
+        messages = self.receives(published)
+        edges = [0.0, *self.splits, 1000.0]
+        directory.mkdir()
+        for number, (begin, end) in enumerate(itertools.pairwise(edges)):
+            split = [m for m in messages if begin <= (m.log_time - T0) / S < end]
+            write_mcap(directory / f"{directory.name}_{number}.mcap", split, LAYOUT)
+
+
+def publications(length_s: float, doubled: frozenset[int] = frozenset()) -> list[Published]:
+    """20 and 3 messages a second; of the doubled numbers two publishers send one and the same."""
+    found: list[Published] = []
+    for topic, period in (("/fast", 0.05), ("/slow", 0.333)):
+        at = 0.003
+        while at < length_s:
+            one = Published(len(found), topic, at)
+            found += [one, one] if one.number in doubled else [one]
+            at += period
+    return sorted(found, key=lambda each: each.at)
+
+
+def held(path: Path, reader: McapReader | BagDirReader) -> list[int]:
+    records = reader.records(path, TOPICS, TimeWindow.everything())
+    return [int(reader.decode(each).data) for each in records]  # type: ignore[attr-defined]
+
+
+def numbers(recording: Path, reader: McapReader | BagDirReader) -> Counter[int]:
+    return Counter(n for path in sorted(recording.glob("*.mcap")) for n in held(path, reader))
+
+
+def assert_union(bag_dir: Path) -> None:
+    """Against the messages' own numbers, in whatever way a bag is read."""
+    reader = BagDirReader(READER)
+    both = [numbers(bag_dir / name, READER) for name in ("a", "b")]
+    counted = numbers(bag_dir / "a", reader) + numbers(bag_dir / "b", reader)
+    assert counted == both[0] | both[1]
+    for path in bag_dir.glob("*/*.mcap"):
+        summary, everything = reader.summarize(path), TimeWindow.everything()
+        forward = list(reader.records(path, TOPICS, everything))
+        assert summary.count == len(forward)
+        assert list(reader.records(path, TOPICS, everything, newest_first=True)) == forward[::-1]
+        for topic in TOPICS:
+            of_topic = [each for each in forward if each.channel.topic == topic]
+            assert list(reader.log_times(path, topic, everything)) == [m.log_time for m in of_topic]
+            newest = reader.newest(path, topic, everything)
+            assert newest == (of_topic[-1] if of_topic else None)
+
+
+def hand_over(bag_dir: Path, both_s: float, *, clock: CutClock = CutClock.PUBLISH) -> None:
+    """Writes the sidecars of a handover that was complete two seconds after both recorded."""
+    at = [T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 1, both_s + 2)]
+
+    def files(name: str) -> list[str]:
+        spans = {p.name: READER.summarize(p) for p in (bag_dir / name).glob("*.mcap")}
+        return [
+            file
+            for file, each in spans.items()
+            if each.empty or (each.end >= at[1] if name == "a" else each.start <= at[3])
+        ]
+
+    old, new = complete_sidecars(
+        Handover(),
+        "a",
+        "b",
+        Bounds(*at),
+        old_files=files("a"),
+        new_files=files("b"),
+        simulated=False,
+        clock=clock,
+    )
+    write_handovers({bag_dir / "b": new, bag_dir / "a": old})
+
+
+STALLS = st.lists(st.builds(Stall, st.floats(3, 9), st.floats(0.05, 1.5)), max_size=2).map(tuple)
+SPLITS = st.lists(st.floats(2, 10), max_size=2).map(sorted).map(tuple)
+DOUBLED = st.frozensets(st.integers(60, 180), max_size=6)
+
+
+@settings(max_examples=40)
+@given(
+    stalls=st.tuples(STALLS, STALLS),
+    splits=st.tuples(SPLITS, SPLITS),
+    depth=st.integers(1, 30),
+    ends_after=st.floats(0, 1),
+    doubled=DOUBLED,
+    kind=st.sampled_from(["complete", "stopped", "void"]),
+)
+def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
+    tmp_path_factory: pytest.TempPathFactory,
+    stalls: tuple[tuple[Stall, ...], tuple[Stall, ...]],
+    splits: tuple[tuple[float, ...], tuple[float, ...]],
+    depth: int,
+    ends_after: float,
+    doubled: frozenset[int],
+    kind: str,
+) -> None:
+    bag_dir = tmp_path_factory.mktemp("bags")
+    old_stop, new_stop = {
+        "complete": (7 + ends_after, 13.0),
+        "stopped": (6 + ends_after, 6.5),
+        "void": (13.0, 6 + ends_after),
+    }[kind]
+    published = publications(13, doubled)
+    Recorder(0, old_stop, stalls[0], depth, splits[0]).writes(bag_dir / "a", published)
+    Recorder(4, new_stop, stalls[1], depth, splits[1], 31_000).writes(bag_dir / "b", published)
+    if kind == "complete":
+        hand_over(bag_dir, 5)
+    else:
+        write_handover(bag_dir / "a", Handover() if kind == "void" else intended(Handover(), "b"))
+        write_handover(bag_dir / "b", void("a") if kind == "void" else pending("a"))
+    assert settle_handover(bag_dir / "a", bag_dir / "b", READER, ())
+    assert_union(bag_dir)
+
+
+def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Path) -> None:
+    published = publications(13)
+    Recorder(0, 7.5).writes(tmp_path / "a", published)
+    Recorder(4, 13).writes(tmp_path / "b", published)
+    hand_over(tmp_path, 5)
+    before = (tmp_path / "a" / "handover.json").stat().st_mtime_ns
+    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    assert (tmp_path / "a" / "handover.json").stat().st_mtime_ns == before
+    after = read_handover(tmp_path / "b").handover
+    assert (after.compared, after.also_counts, after.counts_elsewhere) == (True, {}, {})
+    assert_union(tmp_path)
+
+
+@pytest.mark.parametrize("empty", ["a", "b"])
+def test_of_one_that_holds_nothing_the_other_has_all(tmp_path: Path, empty: str) -> None:
+    published = publications(13)
+    Recorder(0, 0 if empty == "a" else 7.5).writes(tmp_path / "a", published)
+    Recorder(4, 4 if empty == "b" else 13).writes(tmp_path / "b", published)
+    hand_over(tmp_path, 5)
+    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    assert_union(tmp_path)
+
+
+class TestWhenItIsDue:
+    def test_not_while_a_file_that_may_hold_the_messages_is_written(self, tmp_path: Path) -> None:
+        published = publications(30)
+        Recorder(0, 7.5, splits=(6.0,)).writes(tmp_path / "a", published)
+        Recorder(4, 9, (Stall(6, 1),), splits=(8.0,)).writes(tmp_path / "b", published)
+        hand_over(tmp_path, 5)
+        old, new = tmp_path / "a", tmp_path / "b"
+        assert not compare_recordings(old, new, READER, running={"a", "b"})
+        assert not compare_recordings(old, new, READER, running={"b"})
+        more = Recorder(9, 14).receives(published)
+        write_mcap(new / "b_2.mcap", more, LAYOUT)
+        assert compare_recordings(old, new, READER, running={"b"})
+        assert_union(tmp_path)
+
+    def test_a_recorder_that_was_killed_before_does_it_at_its_next_start(
+        self, tmp_path: Path
+    ) -> None:
+        published = publications(13)
+        Recorder(0, 7.5).writes(tmp_path / "a", published)
+        Recorder(4, 13, (Stall(5.8, 1),)).writes(tmp_path / "b", published)
+        hand_over(tmp_path, 5)
+        recover_handovers(tmp_path, READER)
+        assert read_handover(tmp_path / "a").handover.also_counts
+        assert_union(tmp_path)
+
+    def test_a_disk_that_fails_is_no_missing_message(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        published = publications(13)
+        Recorder(0, 7.5).writes(tmp_path / "a", published)
+        Recorder(4, 13).writes(tmp_path / "b", published)
+        hand_over(tmp_path, 5)
+
+        def fails(*_: object, **__: object) -> object:
+            raise BagUnreachableError("b_0.mcap", "input/output error")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(McapReader, "records", fails)
+            with pytest.raises(RecorderError, match="input/output"):
+                compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+        assert read_handover(tmp_path / "b").handover.compared is False
+
+
+@pytest.mark.parametrize("published_at", ["log", "zero"])
+def test_without_publish_times_the_cut_stays_and_a_note_says_so(
+    tmp_path: Path, published_at: str
+) -> None:
+    for name, start, stop in (("a", 0.0, 7.5), ("b", 4.0, 13.0)):
+        messages = Recorder(start, stop, delay_ns=0).receives(publications(13))
+        publish = [0 if published_at == "zero" else each.log_time for each in messages]
+        written = [
+            Msg(each.topic, each.type, each.log_time, each.body, at)
+            for each, at in zip(messages, publish, strict=True)
+        ]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", written, LAYOUT)
+    hand_over(tmp_path, 5, clock=CutClock.LOG)
+    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    after = read_handover(tmp_path / "b").handover
+    assert (after.notes, after.also_counts) == ((LOG_CLOCK_NOTE,), {})
+    assert_union(tmp_path)
+
+
+def test_where_too_many_would_be_listed_all_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(union, "MOST_LISTED", 5)
+    published = publications(13)
+    Recorder(0, 7.5).writes(tmp_path / "a", published)
+    Recorder(4, 13, (Stall(5.8, 1),)).writes(tmp_path / "b", published)
+    hand_over(tmp_path, 5)
+    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    reader = BagDirReader(READER)
+    for name in ("a", "b"):
+        assert numbers(tmp_path / name, reader) == numbers(tmp_path / name, READER)
