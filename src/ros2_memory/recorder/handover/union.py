@@ -58,10 +58,16 @@ class _Copies(NamedTuple):
 
 
 class _Side(NamedTuple):
-    """One of the two recordings: its sidecar, and its bags that are not empty, by file name."""
+    """One of the two recordings.
+
+    `handover` is its sidecar, and `cut` as much of that as is about these two: what it says about
+    the recording before or after them is another comparison's. `bags` are those that are not
+    empty, by file name.
+    """
 
     recording: Path
     handover: Handover
+    cut: Handover
     bags: dict[str, BagSummary]
 
     @property
@@ -95,7 +101,7 @@ def compare_recordings(
     if after.state is Counting.PENDING or ends_first.name in running:
         return False
     try:
-        one, other = (_side(each, reader, running) for each in (old, new))
+        one, other = _sides(old, new, reader, running)
         ended, lasting = (one, other) if ends_first is old else (other, one)
         if lasting.recording.name in running and (
             not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
@@ -125,9 +131,18 @@ class _Lists(NamedTuple):
         )
 
 
-def _side(recording: Path, reader: BagReader, running: Collection[str]) -> _Side:
-    bags = bags_of(recording, reader, only_closed=recording.name in running)
-    return _Side(recording, handover_to_change(recording), dict(bags))
+def _sides(
+    old: Path, new: Path, reader: BagReader, running: Collection[str]
+) -> tuple[_Side, _Side]:
+    before, after = handover_to_change(old), handover_to_change(new)
+    before_cut = Handover(counts_until=before.counts_until, end=before.end)
+    if before.next != new.name:
+        before_cut = Handover()
+    after_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
+    one, other = (
+        dict(bags_of(each, reader, only_closed=each.name in running)) for each in (old, new)
+    )
+    return _Side(old, before, before_cut, one), _Side(new, after, after_cut, other)
 
 
 def _differences(old: _Side, new: _Side, reader: BagReader) -> tuple[_Lists, _Lists]:
@@ -172,7 +187,7 @@ def _copies(
         topics = [each.topic for each in summary.topics]
         if not window.overlaps(summary.start, summary.end):
             continue
-        rule = side.handover.rule(name)
+        rule = side.cut.rule(name)
         for record in _readable(reader.records(side.recording / name, topics, window)):
             published, logged = record.publish_time, record.log_time
             if record.channel.latched and not (latched and logged - published <= FRESH_NS):

@@ -138,29 +138,36 @@ def assert_union(bag_dir: Path) -> None:
             assert newest == (of_topic[-1] if of_topic else None)
 
 
-def hand_over(bag_dir: Path, both_s: float, *, clock: CutClock = CutClock.PUBLISH) -> None:
+def hand_over(
+    bag_dir: Path,
+    both_s: float,
+    *,
+    names: tuple[str, str] = ("a", "b"),
+    clock: CutClock = CutClock.PUBLISH,
+) -> None:
     """Writes the sidecars of a handover that was complete two seconds after both recorded."""
     at = [T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 1, both_s + 2)]
+    before, after = (bag_dir / name for name in names)
 
-    def files(name: str) -> list[str]:
-        spans = {p.name: READER.summarize(p) for p in (bag_dir / name).glob("*.mcap")}
+    def files(folder: Path) -> list[str]:
+        spans = {p.name: READER.summarize(p) for p in folder.glob("*.mcap")}
         return [
             file
             for file, each in spans.items()
-            if each.empty or (each.end >= at[1] if name == "a" else each.start <= at[3])
+            if each.empty or (each.end >= at[1] if folder == before else each.start <= at[3])
         ]
 
     old, new = complete_sidecars(
-        Handover(),
-        "a",
-        "b",
+        read_handover(before).handover,
+        before.name,
+        after.name,
         Bounds(*at),
-        old_files=files("a"),
-        new_files=files("b"),
+        old_files=files(before),
+        new_files=files(after),
         simulated=False,
         clock=clock,
     )
-    write_handovers({bag_dir / "b": new, bag_dir / "a": old})
+    write_handovers({after: new, before: old})
 
 
 STALLS = st.lists(st.builds(Stall, st.floats(3, 9), st.floats(0.05, 1.5)), max_size=2).map(tuple)
@@ -202,6 +209,20 @@ def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
         write_handover(bag_dir / "b", void("a") if kind == "void" else pending("a"))
     assert settle_handover(bag_dir / "a", bag_dir / "b", READER, ())
     assert_union(bag_dir)
+
+
+def test_short_recordings_that_follow_each_other_are_compared_in_pairs(tmp_path: Path) -> None:
+    """What the second leaves to the third is not what the first has missed."""
+    published = publications(16)
+    Recorder(0, 7.2, (Stall(5.2, 0.5),)).writes(tmp_path / "a", published)
+    Recorder(4, 10.2, (Stall(6.2, 0.5), Stall(8.9, 0.3))).writes(tmp_path / "b", published)
+    Recorder(7, 16, (Stall(9.2, 0.7),)).writes(tmp_path / "c", published)
+    hand_over(tmp_path, 5)
+    hand_over(tmp_path, 8, names=("b", "c"))
+    recover_handovers(tmp_path, READER)
+    held_by = [numbers(tmp_path / name, READER) for name in "abc"]
+    counted = [numbers(tmp_path / name, BagDirReader(READER)) for name in "abc"]
+    assert sum(counted, Counter[int]()) == held_by[0] | held_by[1] | held_by[2]
 
 
 def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Path) -> None:

@@ -1,0 +1,121 @@
+"""Rotations while either recorder is stopped again and again: what a file holds counts, and once.
+
+Three rotations; EPISODIC_LONG=1 makes it 100. EPISODIC_SEED chooses other stalls.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import sys
+import time
+from collections import Counter
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import pytest
+
+from tests.support.live_recorder import NS_PER_S, await_moment, bag_files, machine, ticks
+from tests.support.ros_processes import (
+    RECORDERS,
+    installation,
+    publishing_robot,
+    ros_environment,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.live_recorder import LiveRecorder
+
+ROTATIONS: Final = 100 if os.environ.get("EPISODIC_LONG") == "1" else 3
+SEED: Final = int(os.environ.get("EPISODIC_SEED", "13"))
+HZ: Final = 50.0
+LONGEST_STALL_S: Final = 1.0
+LONGEST_PAUSE_S: Final = 1.5
+
+
+class Rotated(NamedTuple):
+    """The ticks of `/odom` by how often each recording holds them, and how often they count."""
+
+    held: dict[str, Counter[int]]
+    counting: dict[str, Counter[int]]
+    stalls: int
+    compared: int
+
+
+@pytest.fixture(scope="module", params=RECORDERS)
+def rotated(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Rotated:
+    real = installation(request)
+    folder = tmp_path_factory.mktemp("stalls")
+    with (
+        ros_environment(folder, real=real) as env,
+        machine(folder, env) as site,
+        publishing_robot(env, folder / "truth.json", "--topics", "/odom", "--hz", str(HZ)) as robot,
+    ):
+        t0 = robot.t0
+        recorder = site.record(
+            "stalls",
+            "recording.split_duration_s=2",
+            "recording.session_duration_s=4",
+            topics=["/odom"],
+        )
+        recorder.wait_for("subscribed")
+        stalls = stall_until_rotated(recorder, random.Random(SEED))
+        recorder.stop()
+        compared = sum(event["messages"] for event in recorder.events("handover_compared"))
+        held, counting = (
+            {
+                folder.name: numbers(folder, t0, counting=counting)
+                for folder in recorder.bag_dir.glob("*_*")
+            }
+            for counting in (False, True)
+        )
+    return Rotated(held, counting, stalls, compared)
+
+
+def stall_until_rotated(recorder: LiveRecorder, chance: random.Random) -> int:
+    """Stops one of its recorders after the other, by chance; returns how often it did."""
+    stalls = 0
+    while len(recorder.events("rotated")) < ROTATIONS:
+        assert recorder.process.poll() is None, recorder.log.read_text()
+        children = recorder.children()
+        if not children:
+            continue
+        stalls += 1
+        child = chance.choice(children)
+        # It may end at any moment.
+        with suppress(ProcessLookupError):
+            os.kill(child.pid, signal.SIGSTOP)
+            await_moment(time.time_ns() + round(chance.uniform(0.05, LONGEST_STALL_S) * NS_PER_S))
+            os.kill(child.pid, signal.SIGCONT)
+        await_moment(time.time_ns() + round(chance.uniform(0.0, LONGEST_PAUSE_S) * NS_PER_S))
+    return stalls
+
+
+def numbers(recording: Path, t0: int, *, counting: bool) -> Counter[int]:
+    files = [path for path in bag_files(recording.parent) if path.parent == recording]
+    return Counter(tick.number for tick in ticks(files, t0, HZ, counting=counting))
+
+
+def test_what_any_file_holds_counts_and_nothing_counts_twice(rotated: Rotated) -> None:
+    held = Counter[int]()
+    for each in rotated.held.values():
+        held |= each
+    counting = sum(rotated.counting.values(), Counter[int]())
+    last, first = max(held), min(held)
+    twice = sum(counts > 1 for counts in held.values())
+    sys.stdout.write(
+        f"{len(rotated.held)} recordings, {rotated.stalls} stalls, {len(held)} messages held, "
+        f"{last - first + 1 - len(held)} in no file, {twice} twice in one recording, "
+        f"{(held - counting).total()} held and hidden, {(counting - held).total()} double, "
+        f"{rotated.compared} that a cut alone would have got wrong\n"
+    )
+    assert counting == held
+
+
+def test_recordings_overlapped(rotated: Rotated) -> None:
+    stored = sum(each.total() for each in rotated.held.values())
+    assert stored > sum(each.total() for each in rotated.counting.values())
+    assert len(rotated.held) >= ROTATIONS
