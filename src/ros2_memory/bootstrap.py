@@ -25,9 +25,10 @@ from ros2_memory.config import (
     load_labels,
     load_message_schemas,
     load_places,
+    load_rules,
 )
 from ros2_memory.core import directories
-from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.core.telemetry import SILENT, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
 from ros2_memory.recorder.base import Recorder
@@ -35,19 +36,23 @@ from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.config import AdapterNode, PlaceShape, Settings
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.telemetry import Observer
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.retention.repair import Repairer
+    from ros2_memory.retention.saved_moments import MomentKeeper
     from ros2_memory.serving.backfill import Backfill, Progress
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.triggers.rules import Rule
+    from ros2_memory.triggers.watch import Triggers
 
 _Port = TypeVar("_Port")
 
@@ -107,27 +112,112 @@ def build_housekeeper(
     `own` lists the recordings that were made in the bag directory.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
     from ros2_memory.recorder.time_sync import is_synchronised
     from ros2_memory.storage.mcap.writer import McapWriter
 
     retention = settings.retention
+    # At most half the budget, so that saved moments leave room for new recordings.
+    moments_bytes = round(min(retention.max_moments_gb, retention.max_total_gb / 2) * GB)
+    rules = rules_of(settings, moments_bytes)
+    bags = BagDirReader(reader)
+    own = own or OwnRecordings(bag_dir)
     return BackgroundHousekeeper(
         Housekeeping(
             bag_dir,
-            BagDirReader(reader),
+            bags,
             McapWriter(settings.reader.max_chunk_mb),
             WallClock(),
             retention_limits(settings),
             is_synchronised=is_synchronised,
             split_duration_s=settings.recording.split_duration_s,
             own=own,
-            # At most half the budget, so that saved moments leave room for new recordings.
-            moments_bytes=round(min(retention.max_moments_gb, retention.max_total_gb / 2) * GB),
+            moments_bytes=moments_bytes,
+            rule_bytes={each.name: each.max_bytes for each in rules},
+            watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
             static_topics=settings.data.tf_static_topics,
             grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
         )
     )
+
+
+def _watch_of(
+    settings: Settings,
+    bag_dir: Path,
+    reader: BagReader,
+    own: OwnRecordings,
+    rules: Sequence[Rule],
+) -> Callable[[MomentKeeper], Triggers]:
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.triggers.search import SplitSearch
+    from ros2_memory.triggers.watch import Triggers
+
+    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    return partial(
+        Triggers,
+        bag_dir,
+        rules,
+        SplitSearch(reader, extractor, rules),
+        own,
+        clock=WallClock(),
+        split_duration_s=settings.recording.split_duration_s,
+    )
+
+
+def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
+    """Returns the rules of `recording.keep_when`.
+
+    `moments_bytes` is what all moments may take, which is enough for all rules together.
+
+    Raises:
+        ConfigError: their file is missing, a rule is refused, or they may take too much together.
+    """
+    from ros2_memory.analysis.conditions import parse_condition
+    from ros2_memory.bag_dir.moment_file import fault_of_label
+    from ros2_memory.triggers.rules import Rule, RuleKind
+
+    path = settings.recording.keep_when
+    rules: list[Rule] = []
+    for name, given in load_rules(settings).items():
+        label = given.label or name
+        if fault := fault_of_label(label):
+            raise ConfigError(f"{path}: the rule {name!r}: its label {fault}")
+        condition = None
+        if given.condition_type is not None:
+            value: JsonValue = dict(given.value) if isinstance(given.value, dict) else given.value
+            try:
+                condition = parse_condition(
+                    given.condition_type,
+                    value,
+                    settings.data.position_tolerance_m,
+                    given.field,
+                    settings.data.min_score if given.min_score is None else given.min_score,
+                )
+            except InvalidArgumentsError as error:
+                raise ConfigError(f"{path}: the rule {name!r}: {error}") from error
+        rules.append(
+            Rule(
+                name=name,
+                kind=RuleKind(given.kind),
+                topic=given.topic,
+                condition=condition,
+                hold=ns_from_unix(given.for_s),
+                before=ns_from_unix(given.before_s),
+                after=ns_from_unix(given.after_s),
+                label=label,
+                max_bytes=round(given.max_gb * GB),
+                max_per_hour=given.max_per_hour,
+            )
+        )
+    wanted = sum(each.max_bytes for each in rules)
+    if wanted > moments_bytes:
+        raise ConfigError(
+            f"{path}: max_gb of all rules together is {wanted / GB:g}, and all moments may take "
+            f"{moments_bytes / GB:g} GB (retention.max_moments_gb, at most half of "
+            "retention.max_total_gb): lower one, or raise the other"
+        )
+    return tuple(rules)
 
 
 def build_repairer() -> Repairer:

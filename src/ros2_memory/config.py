@@ -115,6 +115,7 @@ Mebibytes: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=1024)]
 Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
 Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+Span: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=3600)]
 AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
 Folder: TypeAlias = Annotated[AnyPath, PathType("dir")]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
@@ -128,7 +129,8 @@ _REFUSE_UNKNOWN: Final = ConfigDict(extra="forbid")
 class RecordingSettings:
     """What is recorded, and where to.
 
-    `split_duration_s` is an integer because `ros2 bag record` takes whole seconds.
+    `split_duration_s` is an integer because `ros2 bag record` takes whole seconds. `keep_when` is
+    the file of rules that keep what was recorded around an event.
     """
 
     bag_dir: AnyPath
@@ -138,6 +140,7 @@ class RecordingSettings:
     use_sim_time: Flag
     clear_on_startup: Flag
     topics_file: ConfigFile
+    keep_when: ConfigFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -348,6 +351,51 @@ class PlacesFile:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class KeepRule:
+    """When what was recorded is kept as a moment, and how much of it.
+
+    `topic`, `condition_type`, `value`, `field` and `min_score` as in `find_matches`; `for_s` is how
+    long the condition, or a silence, must hold. A moment has `before_s` before the match began and
+    `after_s` after the rule fired. All moments of the rule together take `max_gb` at most.
+    """
+
+    kind: Literal["message", "silent", "recorder_restart"] = "message"
+    topic: Text | None = None
+    condition_type: Text | None = None
+    value: bool | int | float | str | dict[str, float] | None = None
+    field: Text | None = None
+    min_score: Tolerance | None = None
+    for_s: Tolerance = 0.0
+    before_s: Span = 30.0
+    after_s: Span = 30.0
+    label: Text | None = None
+    max_gb: Positive = 0.1
+    max_per_hour: Count = 6
+
+    def __post_init__(self) -> None:
+        """Refuses a rule that lacks what its kind needs, or has what it does not know."""
+        tests = self.condition_type is not None and self.value is not None
+        has_test = tests or self.field is not None or self.min_score is not None
+        if self.kind == "message":
+            if self.topic is None or not tests:
+                raise ValueError("must have topic, condition_type and value, as find_matches has")
+        elif has_test:
+            raise ValueError(f"must not have a condition: its kind is {self.kind}")
+        elif self.kind == "silent":
+            if self.topic is None or not self.for_s:
+                raise ValueError("must have topic and for_s: its kind is silent")
+        elif self.topic is not None or self.for_s:
+            raise ValueError(f"must have neither topic nor for_s: its kind is {self.kind}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class TriggersFile:
+    """The rules, by name."""
+
+    rules: dict[Text, KeepRule]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class Settings:
     """The whole configuration, validated."""
 
@@ -465,6 +513,15 @@ def load_places(settings: Settings) -> Mapping[str, PlaceShape]:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
     return _load_file(PlacesFile, "data.places_file", settings.data.places_file).places
+
+
+def load_rules(settings: Settings) -> Mapping[str, KeepRule]:
+    """Returns the rules of `recording.keep_when`, by name.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or its content is refused.
+    """
+    return _load_file(TriggersFile, "recording.keep_when", settings.recording.keep_when).rules
 
 
 def _load_file(model: type[_T], key: str, path: Path) -> _T:

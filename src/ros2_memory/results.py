@@ -735,12 +735,36 @@ class RememberedMoment:
 
 
 @dataclass(frozen=True, slots=True)
+class FiredRule:
+    """How often a rule of `recording.keep_when` fired, and how many moments that made.
+
+    Attributes:
+        name: of the rule.
+        fired: how often it fired.
+        moments: how many moments it made; a moment may hold several matches.
+        refused: how often nothing was kept.
+        last: log time at which it fired last; None where it never did.
+        always_since: since when it matches without an end, where that is long; else None.
+        problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
+    """
+
+    name: str
+    fired: int
+    moments: int
+    refused: int
+    last: Ns | None
+    always_since: Ns | None
+    problem: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class MomentList:
-    """The saved moments, newest first; `more` is how many there are besides."""
+    """The saved moments, newest first; `more` is how many there are besides; the rules by name."""
 
     moments: tuple[StoredMoment, ...]
     more: int
     now: Ns
+    rules: tuple[FiredRule, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

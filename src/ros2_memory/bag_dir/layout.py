@@ -18,6 +18,7 @@
       .episodic/recorded.jsonl     recorded time when each recording ended
       .episodic/requests/          requests of the query server (see `request_queue`)
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
+      .episodic/triggers.json      what rules found so far (see `trigger_file`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
@@ -52,6 +53,7 @@ OWN_FOLDER: Final = ".episodic"
 RECORDED_FILE: Final = "recorded.jsonl"
 REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
 LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
+TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 from pydantic import AfterValidator, ConfigDict, Field, StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import json_object, validated
+from ros2_memory.bag_dir.json_fields import Count, json_object, validated
 from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -97,12 +97,15 @@ class SavedMoment:
     """A moment as its file describes it.
 
     `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
-    were not saved. By default nothing is saved yet.
+    were not saved. By default nothing is saved yet. `rule` is the rule that asked for it, and
+    `matches` how often that fired in it; None where somebody asked.
     """
 
     request: _Request
     pending: StrictBool = True
     missing: tuple[str, ...] = ()
+    rule: str | None = None
+    matches: Count = 1
 
 
 _MOMENT: Final = TypeAdapter(SavedMoment)
@@ -162,6 +165,8 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
         "complete": not (moment.pending or moment.missing),
         "missing": list(moment.missing),
     }
+    if moment.rule is not None:
+        content |= {"rule": moment.rule, "matches": moment.matches}
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     write_durably(folder / MOMENT_FILE, text)
 

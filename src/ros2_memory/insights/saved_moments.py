@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.bag_dir.trigger_file import read_trigger_state
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
 from ros2_memory.history.view import View
-from ros2_memory.results import MomentList, RememberedMoment, ShownMoment
+from ros2_memory.results import FiredRule, MomentList, RememberedMoment, ShownMoment
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ros2_memory.bag_dir.request_queue import Outcome
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
@@ -104,7 +107,32 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     """
     stored = [*stored_moments_in(memory.index.bag_dir)]
     stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
-    return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now)
+    rules = fired_rules(memory.index.bag_dir)
+    return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
+
+
+def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
+    """Returns what the recorder's rules did so far, by name; none where that cannot be read.
+
+    Raises:
+        OSError: it is there and cannot be read.
+    """
+    try:
+        state = read_trigger_state(bag_dir)
+    except ValueError:
+        return ()  # the recorder reports that, and begins anew
+    return tuple(
+        FiredRule(
+            name,
+            each.fired,
+            each.moments,
+            each.refused,
+            each.last_fired,
+            each.always_since,
+            each.problem,
+        )
+        for name, each in sorted(({} if state is None else state.rules).items())
+    )
 
 
 def unlisted(error: OSError) -> str:

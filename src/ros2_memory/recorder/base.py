@@ -119,6 +119,9 @@ class Housekeeper:
             monotonic_s: the monotonic clock, in seconds.
         """
 
+    def note_restart(self) -> None:
+        """Takes up that a recording ended unasked, and another one begins."""
+
     def age_held(self) -> str | None:
         """Describes the bags that are kept although their dates make them too old, or None."""
         return None

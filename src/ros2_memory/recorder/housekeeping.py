@@ -11,6 +11,7 @@ import os
 import threading
 import time
 from contextlib import suppress
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
     from ros2_memory.storage.base import BagReader, BagWriter
+    from ros2_memory.triggers.watch import Triggers
 
 REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30
@@ -66,6 +68,8 @@ class Housekeeping(Housekeeper):
         split_duration_s: how long the recorder writes one file.
         own: the recordings that the recorder made.
         moments_bytes: how much of the budget saved moments may take.
+        rule_bytes: how much of that each rule may take.
+        watch: makes the rules' watch over what is recorded; None where there are no rules.
         static_topics: topics that are latched whatever their publishers declare.
         grace_s: for how long a query may work on an older snapshot of the bags.
         measure_free: measures what the disk has left, in bytes.
@@ -84,6 +88,8 @@ class Housekeeping(Housekeeper):
         split_duration_s: float,
         own: OwnRecordings | None = None,
         moments_bytes: int = 0,
+        rule_bytes: Mapping[str, int] = MappingProxyType({}),
+        watch: Callable[[MomentKeeper], Triggers] | None = None,
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
@@ -102,6 +108,7 @@ class Housekeeping(Housekeeper):
             is_synchronised=is_synchronised,
             static_topics=static_topics,
             grace_s=grace_s,
+            needed=self._needed,
             measure_free=measure_free,
             monotonic=monotonic,
         )
@@ -113,7 +120,8 @@ class Housekeeping(Housekeeper):
             split_duration_s=split_duration_s,
             collector=collector,
         )
-        self._moments = MomentKeeper(bag_dir, moments_bytes, clock)
+        self._moments = MomentKeeper(bag_dir, moments_bytes, clock, rule_bytes)
+        self._triggers = None if watch is None else watch(self._moments)
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
         self._clock = clock
@@ -130,6 +138,8 @@ class Housekeeping(Housekeeper):
             OSError: the bag directory, or the list of the recorder's own recordings, cannot be
                 read.
         """
+        if self._triggers is not None:
+            self._triggers.note_unclean_end()
         named = _named(self._bag_dir)
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
@@ -162,12 +172,22 @@ class Housekeeping(Housekeeper):
         """Saves the moments that were asked for, and continues those that wait for bags.
 
         Raises:
+            EpisodicError: the disk fails while bags are read.
             OSError: the folders of requests or moments cannot be listed or written to.
         """
         self._moments.open()
-        if self._moments.has_work():
+        restarted = self._triggers is not None and self._triggers.has_restarts
+        if restarted or self._moments.has_work():
             with self._index.undisturbed() as snapshot:
                 self._moments.keep(snapshot)
+                if restarted:
+                    self._look(snapshot)
+
+    def note_restart(self) -> None:
+        """Takes up that a recording ended unasked, and another one begins."""
+        if self._triggers is not None:
+            now = self._clock.now()
+            self._triggers.note_restart(now, now)
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
@@ -206,6 +226,8 @@ class Housekeeping(Housekeeper):
             **wanted,
         )
         self._report_changes(before, collected)
+        if self._triggers is not None and collected.needed:
+            self._triggers.note_deleted(collected.needed)
 
     def _report_changes(self, before: Collected, after: Collected) -> None:
         """Reports what began or ended with this pass: age held back, and bags no limit counts."""
@@ -232,8 +254,16 @@ class Housekeeping(Housekeeper):
                 if self._moments.has_work():
                     self._moments.keep(snapshot)
                 self._moments.update_sidecars()
-        except OSError as error:
+                self._look(snapshot)
+        except (EpisodicError, OSError) as error:
             _log.error("moments_not_minded", reason=str(error))
+
+    def _look(self, snapshot: Snapshot) -> None:
+        if self._triggers is not None:
+            self._triggers.look(snapshot)
+
+    def _needed(self, snapshot: Snapshot) -> frozenset[str]:
+        return frozenset() if self._triggers is None else self._triggers.needed(snapshot)
 
     def _repair_recording(self, directory: Path) -> None:
         try:
@@ -372,6 +402,10 @@ class BackgroundHousekeeper(Housekeeper):
     ) -> None:
         """Counts the time for which these recordings are written."""
         self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
+
+    def note_restart(self) -> None:
+        """Takes up that a recording ended unasked, and another one begins."""
+        self._housekeeper.note_restart()
 
     def age_held(self) -> str | None:
         """Describes the bags that are kept though their dates make them too old, or None."""

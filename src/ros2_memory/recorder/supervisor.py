@@ -224,6 +224,7 @@ class Supervisor:
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
         for lived_s in self._sessions.handle_exits(now):
+            self._housekeeper.note_restart()
             self._postpone("rotate", self._rotation_backoff.failed(lived_s), now)
             self._postpone("restart", self._backoff.failed(lived_s), now)
         if self._sessions.end_unready(now):

@@ -53,6 +53,7 @@ class Collected:
         fits: whether the limits are kept.
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
+        needed: how many of the deleted bags rules may still have needed.
     """
 
     bags: int = 0
@@ -64,6 +65,7 @@ class Collected:
     foreign_bytes: int = 0
     fits: bool = True
     held: int = 0
+    needed: int = 0
 
 
 @dataclass(slots=True)
@@ -101,6 +103,7 @@ class GarbageCollector:
         is_synchronised: whether the system clock is synchronised; may take some seconds.
         static_topics: topics that are latched whatever their publishers declare.
         grace_s: how long latched messages are carried before their bag is deleted.
+        needed: gives the bags that rules may still need, which no age deletes.
         measure_free: measures what the disk of a directory has left, in bytes.
         monotonic: a clock that never steps, in seconds.
     """
@@ -116,6 +119,7 @@ class GarbageCollector:
         is_synchronised: Callable[[], bool],
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
+        needed: Callable[[Snapshot], frozenset[str]] = lambda _: frozenset(),
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -126,6 +130,7 @@ class GarbageCollector:
         self._is_synchronised = is_synchronised
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
+        self._needed = needed
         self._measure_free = measure_free
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
@@ -150,8 +155,10 @@ class GarbageCollector:
         if free_bytes_wanted is not None:
             limits = replace(limits, min_free_bytes=free_bytes_wanted)
         run = _Pass(urgent=free_bytes_wanted is not None)
+        needed = self._needed(snapshot)
         while True:
             stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
+            stock = replace(stock, needed=needed)
             if free_bytes_wanted is not None:
                 stock = replace(stock, free_bytes=self._measure_free(self._bag_dir))
             stock = self._with_clocks(stock, limits, run)
@@ -169,6 +176,7 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
+        run.result.needed = len(needed & run.deleted)
         return run.result
 
     def _with_clocks(

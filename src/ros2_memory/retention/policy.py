@@ -97,6 +97,7 @@ class RetentionStock:
             recording that is missing counts as new.
         synchronised: whether the system clock is synchronised.
         foreign_bytes: the size of bags of other programs, which no limit counts.
+        needed: bags that rules may still need; no age deletes them.
     """
 
     bags: Sequence[StoredBag]
@@ -108,6 +109,7 @@ class RetentionStock:
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
     synchronised: bool = False
     foreign_bytes: int = 0
+    needed: frozenset[str] = frozenset()
 
 
 class Ages(NamedTuple):
@@ -144,7 +146,7 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
     total = plan.total
     eras = _eras(stock, limits)
     old = _ages(stock, eras, limits.max_age_ns)
-    aged = old.by_dates if stock.synchronised else old.by_recording
+    aged = (old.by_dates if stock.synchronised else old.by_recording) - stock.needed
     if not aged and plan.fits(limits):
         return DeletionPlan((), total, fits=True)
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)

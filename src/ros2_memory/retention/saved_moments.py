@@ -1,4 +1,7 @@
-"""Saves the moments that were asked for: hard links in `moments/`, which retention never deletes.
+"""Saves moments: hard links in `moments/`, which retention never deletes.
+
+Somebody asked for a moment, or a rule fired (see `triggers`). What each rule may take is set aside,
+so that none takes what belongs to another, or to those who ask.
 
 The recorder alone does this, while nothing is deleted. A crash between two steps does no harm: a
 moment's file marks it as pending before its first link is made, and a request stays in the
@@ -12,6 +15,7 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
@@ -31,7 +35,7 @@ from ros2_memory.bag_dir.moment_file import (
 from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, iso_local
 from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
 
@@ -48,7 +52,10 @@ REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
 LONGEST_WAIT_NS: Final[Ns] = 2 * 3600 * NS_PER_S
 """No split stays open for longer, unless another program writes it, or clocks differ."""
 
-_FULL: Final = "the share of moments (retention.max_moments_gb) was used up: not all of it is kept"
+SHORTEST_HOLE_NS: Final[Ns] = 2 * NS_PER_S
+"""A shorter time without a bag is not worth a sentence."""
+
+_SHARE: Final = "retention.max_moments_gb"
 _OWN_FOLDER: Final = re.compile(r"\d{8}T\d{6}Z-[a-z0-9-]+(_\d+)?")
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -115,11 +122,16 @@ def fitting(
 
 
 def no_room(
-    files: Iterable[tuple[int, int]], stored: Mapping[int, int], share: int, expected: int = 0
+    files: Iterable[tuple[int, int]],
+    stored: Mapping[int, int],
+    share: int,
+    expected: int = 0,
+    key: str = _SHARE,
 ) -> str | None:
     """Describes why a moment is refused for want of room; None if all of its files fit.
 
-    `files`, `stored` and `share` as for `fitting`; `expected` are the bytes of open files.
+    `files`, `stored` and `share` as for `fitting`; `expected` are the bytes of open files, `key`
+    names the setting that limits them.
     """
     used = sum(stored.values())
     new = {inode: size for inode, size in files if inode not in stored}
@@ -129,8 +141,20 @@ def no_room(
     return (
         f"moments may take {share / GB:.3g} GB, {used / GB:.3g} GB of that are "
         f"used, and this one takes {more / GB:.3g} GB more; delete folders in moments/ of the bag "
-        "directory, raise retention.max_moments_gb, or ask for fewer seconds"
+        f"directory, raise {key}, or ask for fewer seconds"
     )
+
+
+def unrecorded(window: TimeWindow, bags: Iterable[BagFile]) -> tuple[str, ...]:
+    """Returns a sentence on each part of a window that no bag reaches into."""
+    sentences = []
+    reached = window.start
+    for start, end in (*sorted((bag.start, bag.end) for bag in bags), (window.stop, window.stop)):
+        if start - reached > SHORTEST_HOLE_NS:
+            hole = f"{iso_local(reached)} to {iso_local(start)}"
+            sentences.append(f"nothing is recorded from {hole}")
+        reached = max(reached, end)
+    return tuple(sentences)
 
 
 class MomentKeeper:
@@ -140,11 +164,19 @@ class MomentKeeper:
         bag_dir: the bag directory.
         share_bytes: how much of the budget moments may take.
         clock: the wall clock.
+        rule_bytes: how much of that is set aside for each rule.
     """
 
-    def __init__(self, bag_dir: Path, share_bytes: int, clock: Clock) -> None:
+    def __init__(
+        self,
+        bag_dir: Path,
+        share_bytes: int,
+        clock: Clock,
+        rule_bytes: Mapping[str, int] = MappingProxyType({}),
+    ) -> None:
         self._bag_dir = bag_dir
         self._share = share_bytes
+        self._rule_bytes = rule_bytes
         self._clock = clock
         self._queue = RequestQueue(bag_dir)
         self._links = HardLinks(bag_dir)
@@ -170,13 +202,46 @@ class MomentKeeper:
         stored = {each.folder.name: each for each in stored_moments_in(self._bag_dir)}
         for name, moment in stored.items():
             if moment.moment.pending:
-                stored[name] = self._advance(moment, _all_files(stored), snapshot)
+                stored[name] = self._advance(moment, stored, snapshot)
         numbers = {each.moment.request.number: each for each in stored.values()}
         for request in self._queue.take(now) if self._queue.has_requests() else ():
             known = numbers.get(request.number)
             outcome = _outcome_of(known) if known else self._grant(request, stored, snapshot)
             self._queue.answer(request, outcome)
         self._waiting = any(each.moment.pending for each in stored.values())
+
+    def keep_for_rule(
+        self, request: SaveRequest, rule: str, matches: int, snapshot: Snapshot
+    ) -> str | None:
+        """Begins the moment of a rule, or extends it; returns why nothing of it is kept, or None.
+
+        The same request changes nothing the second time. Nothing may be deleted meanwhile.
+
+        Raises:
+            OSError: it cannot be stored; the same request may be made again.
+        """
+        self._remove_unbegun()
+        stored = {each.folder.name: each for each in stored_moments_in(self._bag_dir)}
+        wanted = SavedMoment(request, rule=rule, matches=matches)
+        for each in stored.values():
+            known = each.moment
+            if known.request.number != request.number:
+                continue
+            if known.matches < matches or known.request.end < request.end:
+                write_saved_moment(each.folder, replace(wanted, missing=known.missing))
+                extended = StoredMoment(
+                    each.folder, replace(wanted, missing=known.missing), each.files
+                )
+                self._advance(extended, stored, snapshot)
+                self._waiting = True
+            return None
+        need = self._needed(request, snapshot)
+        refused = self._refusal(wanted, need, stored, snapshot)
+        if refused is None:
+            moment = self._begin(wanted, need)
+            self._waiting = True
+            _log.info("moment_kept", folder=moment.folder.name, bags=len(moment.files), rule=rule)
+        return refused
 
     def update_sidecars(self) -> None:
         """Links the sidecars of recordings again that were rewritten; a fault is reported.
@@ -199,10 +264,10 @@ class MomentKeeper:
     ) -> Outcome:
         """Begins a moment and adds it to `stored`, or refuses it."""
         need = self._needed(request, snapshot)
-        refused = self._refusal(request, need, stored, snapshot)
+        refused = self._refusal(SavedMoment(request), need, stored, snapshot)
         if refused is None:
             try:
-                moment = self._begin(request, need)
+                moment = self._begin(SavedMoment(request), need)
             except OSError as error:
                 refused = (
                     f"the bags cannot be kept in {moments_of(self._bag_dir)} by hard links: "
@@ -217,28 +282,46 @@ class MomentKeeper:
 
     def _refusal(
         self,
-        request: SaveRequest,
+        moment: SavedMoment,
         need: NeededBags,
         stored: dict[str, StoredMoment],
         snapshot: Snapshot,
     ) -> str | None:
-        if len(stored) >= MAX_MOMENTS:
+        group = self._group(moment, stored)
+        most = MAX_MOMENTS // (1 + len(self._rule_bytes))
+        if len(group) >= most:
             return (
-                f"there are {len(stored)} moments, which is as many as are kept; delete folders in "
+                f"there are {len(group)} moments, which is as many as are kept; delete folders in "
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
             return "nothing was recorded then: ask for a time at which something was"
         files = filter(None, map(_file_of, need.bags))
-        expected = self._open_bytes(request, snapshot) if need.waits else 0
-        return no_room(files, _all_files(stored), self._share, expected)
+        expected = self._open_bytes(moment.request, snapshot) if need.waits else 0
+        share, key = self._share_of(moment)
+        return no_room(files, _all_files(group), share, expected, key)
 
-    def _begin(self, request: SaveRequest, need: NeededBags) -> StoredMoment:
-        folder = make_moment_folder(self._bag_dir, request)
-        begun = SavedMoment(request)
+    def _group(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> list[StoredMoment]:
+        """Returns the moments that share a limit with one: of its rule, or of no configured one."""
+        rule = moment.rule if moment.rule in self._rule_bytes else None
+        return [
+            each
+            for each in stored.values()
+            if (each.moment.rule if each.moment.rule in self._rule_bytes else None) == rule
+        ]
+
+    def _share_of(self, moment: SavedMoment) -> tuple[int, str]:
+        """Returns how much such moments may take together, in bytes, and the key that says so."""
+        if moment.rule is not None and moment.rule in self._rule_bytes:
+            return self._rule_bytes[moment.rule], f"max_gb of the rule {moment.rule}"
+        return max(self._share - sum(self._rule_bytes.values()), 0), _SHARE
+
+    def _begin(self, begun: SavedMoment, need: NeededBags) -> StoredMoment:
+        folder = make_moment_folder(self._bag_dir, begun.request)
         try:
             write_saved_moment(folder, begun)
             missing, files = self._link(folder, need.bags, None)
+            missing = (*missing, *_holes(begun, need))
             moment = replace(begun, pending=need.waits, missing=missing)
             if moment != begun:
                 write_saved_moment(folder, moment)
@@ -249,16 +332,18 @@ class MomentKeeper:
         return StoredMoment(folder, moment, files)
 
     def _advance(
-        self, stored: StoredMoment, files: dict[int, int], snapshot: Snapshot
+        self, stored: StoredMoment, all_stored: Mapping[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment:
         """Continues a pending moment; its file lists what cannot be kept."""
         before = stored.moment
         need = self._needed(before.request, snapshot)
+        share, key = self._share_of(before)
+        files = _all_files(self._group(before, all_stored))
         try:
-            missing, linked = self._link(stored.folder, need.bags, files)
+            missing, linked = self._link(stored.folder, need.bags, (files, share, key))
         except OSError as error:
             missing, linked = (f"not all can be kept: {error.strerror or error}",), {}
-        missing = tuple(dict.fromkeys((*before.missing, *missing)))
+        missing = tuple(dict.fromkeys((*before.missing, *missing, *_holes(before, need))))
         after = replace(before, pending=need.waits, missing=missing)
         files_now = {**stored.files, **linked}
         if after != before:
@@ -287,12 +372,15 @@ class MomentKeeper:
         )
 
     def _link(
-        self, folder: Path, bags: Sequence[BagFile], stored: dict[int, int] | None
+        self,
+        folder: Path,
+        bags: Sequence[BagFile],
+        limit: tuple[Mapping[int, int], int, str] | None,
     ) -> tuple[tuple[str, ...], dict[int, int]]:
         """Links bags into a moment's folder.
 
-        Returns why some could not be linked, and the sizes of the links by inode. `stored` is what
-        all moments store, where the share limits them.
+        Returns why some could not be linked, and the sizes of the links by inode. `limit`, where
+        there is one, is what moments that share it store, how much they may, and what says so.
 
         Raises:
             OSError: a link cannot be made.
@@ -300,7 +388,7 @@ class MomentKeeper:
         missing: dict[str, None] = {}
         linked: dict[int, int] = {}
         files = [_file_of(bag) for bag in bags]
-        allowed = None if stored is None else fitting(filter(None, files), stored, self._share)
+        allowed = None if limit is None else fitting(filter(None, files), limit[0], limit[1])
         touched: set[Path] = set()
         for bag, file in zip(bags, files, strict=True):
             name = os.path.relpath(self._links.recorded_as(bag.file), self._bag_dir)
@@ -309,8 +397,8 @@ class MomentKeeper:
                 # `forget` deletes in another process, since the index was made.
                 if not target.exists():
                     missing[_gone(name)] = None
-            elif allowed is not None and file[0] not in allowed:
-                missing[_FULL] = None
+            elif limit is not None and allowed is not None and file[0] not in allowed:
+                missing[_used_up(limit[2])] = None
             else:
                 directories.make(self._bag_dir, target.parent)
                 if not _link_bag(bag.path, target, file[0]):
@@ -352,9 +440,21 @@ def _gone(name: str) -> str:
     return f"{name} has gone, or another file of that name is kept"
 
 
-def _all_files(stored: Mapping[str, StoredMoment]) -> dict[int, int]:
+def _used_up(key: str) -> str:
+    what = f"the share of moments ({key})" if key == _SHARE else key
+    return f"{what} was used up: not all of it is kept"
+
+
+def _holes(moment: SavedMoment, need: NeededBags) -> tuple[str, ...]:
+    """Returns what was never recorded of a rule's moment for which no bag is to come."""
+    if moment.rule is None or need.waits:
+        return ()
+    return unrecorded(window_of(moment.request.start, moment.request.end), need.bags)
+
+
+def _all_files(moments: Iterable[StoredMoment]) -> dict[int, int]:
     """Returns the sizes of all files in moments by inode, so that each counts once."""
-    return {inode: size for each in stored.values() for inode, size in each.files.items()}
+    return {inode: size for each in moments for inode, size in each.files.items()}
 
 
 def _outcome_of(stored: StoredMoment) -> Outcome:

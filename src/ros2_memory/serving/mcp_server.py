@@ -73,7 +73,7 @@ STATUS: Final = Resource(
 MOMENTS: Final = Resource(
     uri="episodic://moments",
     name="moments",
-    description="What remember_moment kept, newest first.",
+    description="What remember_moment and rules kept, newest first.",
     mime_type=_JSON,
 )
 TOOLS_OF_RESOURCES: Final = {

@@ -150,7 +150,7 @@ def _newest_moments(newest: results.MomentList | None) -> JsonObject:
     reply: JsonObject = {"moments": _stored_moments(newest)["moments"]}
     if newest.more:
         reply["moments_count"] = len(newest.moments) + newest.more
-    return reply
+    return {**reply, **_fired_rules(newest)}
 
 
 def _budget(budget: results.Budget) -> JsonObject:
@@ -193,7 +193,26 @@ def _stored_moments(answer: results.MomentList) -> JsonObject:
     reply: JsonObject = {"moments": [_stored(each, answer.now, local) for each in answer.moments]}
     if answer.more:
         reply["more"] = answer.more
-    return reply
+    return {**reply, **_fired_rules(answer)}
+
+
+def _fired_rules(answer: results.MomentList) -> JsonObject:
+    """Returns what rules did, where there are any; without a time where one never fired."""
+    rows: list[JsonValue] = []
+    for each in answer.rules[:_MAX_LISTED]:
+        row: JsonObject = {"rule": each.name, "fired": each.fired, "moments": each.moments}
+        if each.last is not None:
+            row |= {"last_ts": moment(each.last), "last_ago_s": seconds(answer.now - each.last)}
+        if each.refused:
+            row["refused"] = each.refused
+        if each.always_since is not None:
+            row["matches_since"] = moment(each.always_since)
+        if each.problem is not None:
+            row["problem"] = each.problem
+        rows.append(row)
+    if len(answer.rules) > len(rows):
+        return {"rules": rows, "rules_count": len(answer.rules)}
+    return {"rules": rows} if rows else {}
 
 
 @render.register(results.ShownMoment)
@@ -212,6 +231,8 @@ def _stored(stored: StoredMoment, now: Ns, local: LocalTimes) -> JsonObject:
         "size_gb": round(sum(stored.files.values()) / GB, 6),
         "complete": not (saved.pending or saved.missing),
     }
+    if saved.rule is not None:
+        reply |= {"rule": saved.rule, "matches": saved.matches}
     return with_notes(reply, saved.missing, pending=saved.pending)
 
 

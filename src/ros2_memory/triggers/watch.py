@@ -1,0 +1,362 @@
+"""Evaluates the rules of one bag directory, and has kept what they ask for.
+
+Each look takes up a copy of the state, searches what was closed since, begins or extends moments,
+and writes the state. A kill in between does no harm: the next look finds the same again, and a
+moment that was begun is recognised by its number. What cannot be stored, as on a full disk, is
+tried again with every look.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from copy import deepcopy
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.bag_dir.handover_file import Counting, read_handover
+from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.bag_dir.moment_file import SaveRequest
+from ros2_memory.bag_dir.trigger_file import (
+    RuleMoment,
+    RuleRecord,
+    TriggerState,
+    read_trigger_state,
+    write_trigger_state,
+)
+from ros2_memory.core.model import BagState
+from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
+from ros2_memory.triggers.fold import Firing
+from ros2_memory.triggers.rules import RuleKind
+from ros2_memory.triggers.splits import chains_to_search
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Clock
+    from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.retention.saved_moments import MomentKeeper
+    from ros2_memory.triggers.rules import Rule
+    from ros2_memory.triggers.search import SplitSearch
+
+LOOK_S: Final = 2.0
+"""How long one look searches: meanwhile nothing is deleted, and no other moment is saved."""
+HOUR_NS: Final[Ns] = 3600 * NS_PER_S
+LONGEST_NS: Final[Ns] = 600 * NS_PER_S
+"""Matches join to moments that are no longer than this, or than one match needs."""
+MOST_WAITING: Final = 100
+"""Moments of a rule that wait because they cannot be stored."""
+MOST_SEARCHED: Final = 64
+"""Recordings that are remembered one by one; older ones were searched to their end."""
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+class Triggers:
+    """The rules of one bag directory. Not thread-safe, except for `note_restart`.
+
+    Args:
+        bag_dir: the bag directory.
+        rules: what to look for, by unique names.
+        search: searches closed splits for it.
+        own: the recordings that the recorder made, which alone are searched.
+        moments: saves what is to be kept.
+        clock: the wall clock.
+        split_duration_s: how long one split is.
+        monotonic: a clock that never steps, in seconds.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        rules: Sequence[Rule],
+        search: SplitSearch,
+        own: OwnRecordings,
+        moments: MomentKeeper,
+        *,
+        clock: Clock,
+        split_duration_s: float,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._bag_dir = bag_dir
+        self._rules = {each.name: each for each in rules}
+        self._search = search
+        self._moments = moments
+        self._own = own
+        self._clock = clock
+        self._split = ns_from_unix(split_duration_s)
+        self._monotonic = monotonic
+        self._state: TriggerState | None = None
+        self._lock = threading.Lock()
+        self._restarts: list[tuple[Ns, Ns]] = []
+        self._deleted = 0
+        self._is_written = False
+        self._reported: dict[str, Ns] = {}
+
+    def note_restart(self, first: Ns, at: Ns) -> None:
+        """Takes up that recording ended unasked and began again, between two wall clock times."""
+        with self._lock:
+            self._restarts.append((first, at))
+
+    def note_unclean_end(self) -> None:
+        """Takes up that the recorder ended without saying so, by its last heartbeat.
+
+        Call it before anything is recorded.
+        """
+        last = read_heartbeat(self._bag_dir).heartbeat
+        if last is not None and last.state is not RecorderState.STOPPED:
+            now = self._clock.now()
+            self.note_restart(min(last.updated, now), now)
+
+    @property
+    def has_restarts(self) -> bool:
+        """Whether a restart waits to be looked at."""
+        return bool(self._restarts)
+
+    def look(self, snapshot: Snapshot) -> None:
+        """Searches what was closed since the last look. Nothing may be deleted meanwhile.
+
+        Raises:
+            EpisodicError: the disk fails while bags are read; the next look tries again.
+            OSError: the state or the list of recordings cannot be read, or the state not written.
+        """
+        state = deepcopy(self._loaded(snapshot))
+        deadline = self._monotonic() + LOOK_S
+        closed = self._closed(snapshot, state)
+        chains = chains_to_search(
+            closed, self._live(snapshot), state.searched, self._previous, self._split
+        )
+        for chain in chains:
+            fired, stopped = self._search.search(chain, state, lambda: self._monotonic() > deadline)
+            for firing in fired:
+                self._take(firing, state, snapshot)
+            for part in chain.parts:
+                stop = part.window.stop if stopped is None else min(part.window.stop, stopped)
+                state.searched[part.recording] = max(stop, part.window.start)
+            if stopped is not None:
+                break
+        for first, at in self._taken_restarts():
+            for rule in self._rules.values():
+                if rule.kind is RuleKind.RECORDER_RESTART:
+                    self._take(Firing(rule.name, "", first, at), state, snapshot)
+        for name in self._rules:
+            self._store(name, state.rules[name], snapshot)
+            self._judge(name, state)
+        self._note_lacking(state)
+        _forget_oldest(state)
+        # Even if it cannot be written, what was found is not searched for again.
+        self._is_written &= state == self._state
+        self._state = state
+        if not self._is_written:
+            write_trigger_state(self._bag_dir, state)
+            self._is_written = True
+
+    def needed(self, snapshot: Snapshot) -> frozenset[str]:
+        """Returns the bags that rules may still need: those not searched, and some time before."""
+        state = self._loaded(snapshot)
+        before = max((each.before for each in self._rules.values()), default=0)
+        reached = next(reversed(state.searched.values()), None)
+        since = MIN_NS if reached is None else reached - before
+        return frozenset(
+            bag.file
+            for name, bags in self._closed(snapshot, state).items()
+            for bag in bags
+            if bag.end >= min(state.searched.get(name, MIN_NS), since)
+        )
+
+    def note_deleted(self, bags: int) -> None:
+        """Takes up that so many needed bags were deleted, since the size budget comes first."""
+        with self._lock:
+            self._deleted += bags
+
+    def _loaded(self, snapshot: Snapshot) -> TriggerState:
+        """Returns the state, which begins with what is recorded from now on.
+
+        Raises:
+            OSError: it cannot be read.
+        """
+        state = self._state
+        if state is None:
+            problem = None
+            try:
+                state = read_trigger_state(self._bag_dir)
+            except ValueError as error:
+                problem = f"what the rules knew is lost: .episodic/triggers.json: {error}"
+                _log.error("trigger_state_lost", reason=problem)
+            if state is None:
+                state = self._begun(snapshot)
+            state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
+            for record in state.rules.values():
+                record.problem = problem or record.problem
+            self._state = state
+        return state
+
+    def _begun(self, snapshot: Snapshot) -> TriggerState:
+        live = self._live(snapshot)
+        names = [*self._own.names()]
+        state = TriggerState(
+            before=next((each for each in reversed(names) if each not in live), None)
+        )
+        for name, bags in self._closed(snapshot, TriggerState()).items():
+            if name in live:
+                state.searched[name] = max(each.end for each in bags) + 1
+        return state
+
+    def _live(self, snapshot: Snapshot) -> frozenset[str]:
+        """Returns the recordings that are being written."""
+        named = read_heartbeat(self._bag_dir).recordings
+        active = (self._own.name_of(each.path.parent) for each in snapshot.active)
+        return frozenset(named) | frozenset(active)
+
+    def _closed(self, snapshot: Snapshot, state: TriggerState) -> dict[str, list[BagFile]]:
+        """Returns the closed bags of recordings that are not finished, in their order."""
+        names = [*self._own.names()]
+        at = {name: number for number, name in enumerate(names)}
+        known = [at[name] for name in (state.before, *state.searched) if name in at]
+        first = at[state.before] + 1 if state.before in at else min(known, default=0)
+        folders = {str(self._bag_dir / name): name for name in names[first:]}
+        live = self._live(snapshot)
+        closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
+        for segment in snapshot.timeline.segments:
+            if folders.keys().isdisjoint(segment.folders):
+                continue
+            for bag in segment.bags:
+                name = folders.get(str(bag.recording))
+                if name is None:
+                    continue
+                if bag.state is BagState.CLOSED or name not in live:
+                    closed[name].append(bag)
+        return {name: bags for name, bags in closed.items() if bags}
+
+    def _previous(self, recording: str) -> str | None:
+        handover = read_handover(self._bag_dir / recording).handover
+        return handover.previous if handover.state is Counting.COUNTS else None
+
+    def _taken_restarts(self) -> list[tuple[Ns, Ns]]:
+        with self._lock:
+            taken, self._restarts = self._restarts, []
+        return taken
+
+    def _note_lacking(self, state: TriggerState) -> None:
+        """Says that bags were deleted before the rules could use them."""
+        with self._lock:
+            bags, self._deleted = self._deleted, 0
+        if not bags:
+            return
+        sentence = (
+            f"{counted(bags, 'bag')} that rules may have needed went for want of room "
+            "(retention.max_total_gb, min_free_gb)"
+        )
+        _log.warning("needed_bags_deleted", bags=bags, reason=sentence)
+        for record in state.rules.values():
+            record.problem = sentence
+
+    def _take(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
+        """Counts a firing, and joins it to the newest moment of its rule or begins another."""
+        rule, record = self._rules[firing.rule], state.rules[firing.rule]
+        record.fired += 1
+        record.last_fired = firing.at
+        _log.info("trigger_fired", rule=rule.name, topic=firing.topic, at_ns=firing.at)
+        window = rule.window(firing.first, firing.at)
+        newest = record.newest[-1] if record.newest else None
+        if newest is not None and _joins(newest.start, newest.end, window.start, window.stop):
+            newest.start, newest.end = min(newest.start, window.start), max(newest.end, window.stop)
+            newest.matches += 1
+            newest.stored = False
+            return
+        record.begun = [each for each in record.begun if abs(firing.at - each) < HOUR_NS]
+        if len(record.begun) >= rule.max_per_hour:
+            self._refuse(rule.name, record, _TOO_OFTEN.format(rule.max_per_hour))
+            return
+        if newest is not None and not newest.stored:
+            self._store(rule.name, record, snapshot)
+        if len(record.newest) >= MOST_WAITING:
+            self._refuse(rule.name, record, f"{MOST_WAITING} of its moments wait to be stored")
+            return
+        record.begun.append(firing.at)
+        if not self._said_lately(rule.name, firing.at):
+            record.problem = None
+        number = uuid.uuid5(uuid.NAMESPACE_OID, f"{rule.name}/{firing.topic}/{firing.at}").hex
+        record.newest.append(RuleMoment(number, window.start, window.stop))
+
+    def _store(self, name: str, record: RuleRecord, snapshot: Snapshot) -> None:
+        """Has the moments of a rule stored that are not; a fault is reported, and tried again."""
+        kept: list[RuleMoment] = []
+        for moment in record.newest:
+            if not moment.stored:
+                is_new = not moment.known
+                request = SaveRequest(
+                    moment.number,
+                    self._rules[name].label,
+                    moment.start,
+                    moment.end,
+                    self._clock.now(),
+                )
+                try:
+                    refused = self._moments.keep_for_rule(request, name, moment.matches, snapshot)
+                except OSError as error:
+                    self._report(name, record, f"its moments cannot be stored: {error.strerror}")
+                else:
+                    moment.stored = True
+                    if refused is not None:
+                        self._refuse(name, record, refused)
+                        continue
+                    record.moments += is_new
+                    moment.known = True
+            kept.append(moment)
+        record.newest = [each for each in kept[:-1] if not each.stored] + kept[-1:]
+
+    def _refuse(self, name: str, record: RuleRecord, reason: str) -> None:
+        record.refused += 1
+        self._report(name, record, reason)
+
+    def _report(self, name: str, record: RuleRecord, problem: str) -> None:
+        """Notes why a rule keeps nothing, and logs it once for as long as that goes on."""
+        at = record.last_fired or 0
+        if record.problem != problem or not self._said_lately(name, at):
+            _log.warning("trigger_not_kept", rule=name, reason=problem)
+        record.problem = problem
+        self._reported[name] = at
+
+    def _said_lately(self, name: str, at: Ns) -> bool:
+        """Whether a problem was noted in the hour before a rule fired."""
+        return name in self._reported and abs(at - self._reported[name]) < HOUR_NS
+
+    def _judge(self, name: str, state: TriggerState) -> None:
+        """Says once that a rule has matched for so long that it distinguishes nothing."""
+        record = state.rules[name]
+        runs = [each for each in record.runs.values() if each.fired]
+        longest = min(
+            (each.first for each in runs if each.last - each.first > HOUR_NS), default=None
+        )
+        is_silence = self._rules[name].kind is RuleKind.SILENT
+        if longest is not None and record.always_since is None and not is_silence:
+            _log.warning("trigger_matches_always", rule=name, since_ns=longest)
+        record.always_since = None if is_silence else longest
+
+
+_TOO_OFTEN: Final = (
+    "it fires more often than it may begin moments (max_per_hour: {}): narrow its condition, or "
+    "raise for_s"
+)
+
+
+def _joins(start: Ns, end: Ns, other_start: Ns, other_end: Ns) -> bool:
+    """Whether two windows touch, and are not too long together."""
+    if other_start > end or start > other_end:
+        return False
+    longest = max(LONGEST_NS, end - start, other_end - other_start)
+    return max(end, other_end) - min(start, other_start) <= longest
+
+
+def _forget_oldest(state: TriggerState) -> None:
+    """Bounds the state: what lies far back was searched to its end."""
+    while len(state.searched) > MOST_SEARCHED:
+        state.before = next(iter(state.searched))
+        del state.searched[state.before]

@@ -1,0 +1,179 @@
+"""A bag directory that a recorder of ours fills split by split, and a watch of rules over it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import structlog
+
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, read_handover, write_handover
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.layout import utc_stamp
+from ros2_memory.bag_dir.moment_file import stored_moments_in
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.trigger_file import read_trigger_state
+from ros2_memory.core.directories import identity_of
+from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.triggers.rules import Rule, RuleKind
+from ros2_memory.triggers.search import SplitSearch
+from ros2_memory.triggers.watch import Triggers
+from tests.support.bags import Msg, boolean, write_mcap
+from tests.support.clocks import SettableClock
+from tests.support.memories import shipped_extractor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.moment_file import StoredMoment
+    from ros2_memory.bag_dir.trigger_file import RuleRecord
+
+S = 10**9
+T0 = 1_790_000_000 * S
+PLENTY = 10**15
+
+
+def rule(name: str = "bumper", **given: Any) -> Rule:
+    """A rule on `/bumper` being true, unless told otherwise."""
+    kind = given.pop("kind", RuleKind.MESSAGE)
+    condition = parse_condition("equals", True, 0.5) if kind is RuleKind.MESSAGE else None
+    made: dict[str, Any] = {
+        "name": name,
+        "kind": kind,
+        "topic": None if kind is RuleKind.RECORDER_RESTART else "/bumper",
+        "condition": condition,
+        "before": 5 * S,
+        "after": 3 * S,
+        "label": name,
+        "max_bytes": PLENTY // 100,
+        "max_per_hour": 1000,
+    }
+    return Rule(**made | given)
+
+
+def flag(second: float, value: bool, topic: str = "/bumper") -> Msg:
+    return boolean(T0 + round(second * S), value, topic)
+
+
+class WatchedBags:
+    """Writes splits as the recorder does, and has them looked at.
+
+    Args:
+        bag_dir: where the recordings are.
+        rules: what to look for.
+        limits: of the housekeeper: `max_bytes`, `max_age_h`, `moments_bytes`.
+    """
+
+    def __init__(self, bag_dir: Path, rules: Sequence[Rule], **limits: Any) -> None:
+        bag_dir.mkdir(exist_ok=True)
+        self.bag_dir = bag_dir
+        self.rules = rules
+        self.limits = limits
+        self.clock = SettableClock(T0)
+        self.own = OwnRecordings(bag_dir)
+        self.names: list[str] = []
+        self._splits = 0
+        self.log: list[dict[str, Any]] = []
+        self.house = self.new_house()
+        self.beat()
+        self.look()
+
+    def new_house(self) -> Housekeeping:
+        """A housekeeper as a recorder that starts anew has one."""
+        reader = BagDirReader(McapReader())
+        search = SplitSearch(reader, shipped_extractor(), self.rules)
+        limits = RetentionLimits(
+            self.limits.get("max_bytes", PLENTY),
+            round(self.limits.get("max_age_h", 10**4) * 3600 * S),
+        )
+        return Housekeeping(
+            self.bag_dir,
+            reader,
+            McapWriter(),
+            self.clock,
+            limits,
+            is_synchronised=lambda: True,
+            split_duration_s=10.0,
+            own=self.own,
+            moments_bytes=self.limits.get("moments_bytes", PLENTY),
+            rule_bytes={each.name: each.max_bytes for each in self.rules},
+            watch=lambda moments: Triggers(
+                self.bag_dir,
+                self.rules,
+                search,
+                self.own,
+                moments,
+                clock=self.clock,
+                split_duration_s=10.0,
+            ),
+            measure_free=lambda _: PLENTY,
+        )
+
+    def beat(self, *live: str, state: RecorderState = RecorderState.RECORDING) -> None:
+        now = self.clock.now()
+        write_heartbeat(self.bag_dir, Heartbeat(1, now, state, live, now, 0, (), (), None, 2.0))
+
+    def begin(self, at: int) -> str:
+        """Begins a recording, which is being written from now on."""
+        name = f"rec_{utc_stamp(at)}"
+        while name in self.names:
+            name += "_2"
+        self.own.begin(name)
+        self.names.append(name)
+        self._splits = 0
+        self.beat(name)
+        return name
+
+    def split(self, messages: Iterable[Msg], name: str | None = None, **layout: Any) -> Path:
+        """Writes and closes a split of the newest recording."""
+        recording = name or self.names[-1]
+        path = self.bag_dir / recording / f"{recording}_{self._splits}.mcap"
+        self._splits += 1
+        written = write_mcap(path, messages, **layout)
+        self.own.adopt({recording: identity_of(path.parent)})
+        return written
+
+    def hand_over(self, old: str, new: str, cut: int, last_of_old: str) -> None:
+        """Has messages published from a moment on count in the new recording alone."""
+        end, begin = (Overlap(None, None, (each,)) for each in (last_of_old, f"{new}_0.mcap"))
+        before = read_handover(self.bag_dir / old).handover
+        write_handover(self.bag_dir / old, replace(before, next=new, counts_until=cut, end=end))
+        (self.bag_dir / new).mkdir(exist_ok=True)
+        write_handover(self.bag_dir / new, Handover(previous=old, counts_from=cut, begin=begin))
+
+    def look(self) -> None:
+        with structlog.testing.capture_logs() as log:
+            self.house.apply()
+        self.log += log
+
+    def logged(self, event: str) -> list[dict[str, Any]]:
+        return [each for each in self.log if each["event"] == event]
+
+    def fired_at(self) -> list[int]:
+        """When rules fired, in order."""
+        return sorted(each["at_ns"] for each in self.logged("trigger_fired"))
+
+    def close_all(self) -> None:
+        """Ends what is being written, and has it looked at."""
+        self.beat(state=RecorderState.STOPPED)
+        self.look()
+
+    def record(self, name: str = "bumper") -> RuleRecord:
+        state = read_trigger_state(self.bag_dir)
+        assert state is not None
+        return state.rules[name]
+
+    def moments(self) -> list[StoredMoment]:
+        found = [*stored_moments_in(self.bag_dir)]
+        return sorted(found, key=lambda each: each.moment.request.start)
+
+    def spans(self) -> list[tuple[float, float]]:
+        """From when to when each moment is, in seconds since `T0`."""
+        requests = [each.moment.request for each in self.moments()]
+        return [((each.start - T0) / S, (each.end - T0) / S) for each in requests]
