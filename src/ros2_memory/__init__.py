@@ -20,10 +20,11 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     storage         bag readers and writers; storage.mcap: the MCAP format
     messages        a decoded message as JSON: its fields, conversions, detections
     bag_dir         the contract between the two programs: file names, heartbeat, handover, lock,
-                    own recordings, saved moments, requests
+                    own recordings, saved moments, requests, state of rules
     analysis        pure mathematics: transform tree, odometry, paths, intervals, conditions
     index           directory scan -> file state -> bag table -> timeline -> snapshot
     retention       garbage collection, latched carry-forward, repair, saved moments
+    triggers        rules that keep what was recorded around an event
     recorder        the recorder; recorder.process: the child; recorder.handover: rotation
     catalogue       SQLite digests of closed bags; derived, disposable
     history         one call's view across many bags

@@ -33,6 +33,7 @@ class TestDefaults:
                 "use_sim_time": False,
                 "clear_on_startup": False,
                 "topics_file": ROOT / "config/topics.yaml",
+                "keep_when": ROOT / "config/triggers.yaml",
             },
             "data": {
                 "max_array_length": 50,
