@@ -235,6 +235,7 @@ def test_every_yaml_is_what_its_reader_takes(block: Block, tmp_path: Path) -> No
         "topics": "topics.yaml",
         "schemas": "message_schemas.yaml",
         "labels": "labels.yaml",
+        "rules": "triggers.yaml",
     }[key]
     like = yaml.safe_load((ROOT / "config" / shipped).read_text(encoding="utf-8"))[key]
     assert type(value) is type(like)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -26,7 +27,7 @@ def published(at: int, value: bool, late: int) -> Msg:
 @settings(max_examples=15, deadline=None)
 @given(
     VALUES,
-    st.sampled_from([0, S, 3 * S]),
+    st.sampled_from([0, S * 3 // 2, S * 7 // 2]),
     st.lists(st.sampled_from(["split", "rotate", "look", "kill", ""]), min_size=24, max_size=24),
 )
 def test_a_rule_fires_at_the_times_of_the_uncut_stream(
@@ -68,4 +69,4 @@ def test_a_rule_fires_at_the_times_of_the_uncut_stream(
         fired = [each - T0 for each in robot.fired_at()]
     # Log times of the copies that count may be a millisecond late.
     wanted = [each - T0 for each in expected(stream, hold)]
-    assert [round(each / S) for each in fired] == [round(each / S) for each in wanted]
+    assert fired == pytest.approx(wanted, abs=2_000_000, rel=0)
