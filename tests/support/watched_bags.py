@@ -28,7 +28,7 @@ from tests.support.clocks import SettableClock
 from tests.support.memories import shipped_extractor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, MutableMapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.moment_file import StoredMoment
@@ -79,7 +79,7 @@ class WatchedBags:
         self.own = OwnRecordings(bag_dir)
         self.names: list[str] = []
         self._splits = 0
-        self.log: list[dict[str, Any]] = []
+        self.log: list[MutableMapping[str, Any]] = []
         self.house = self.new_house()
         self.beat()
         self.look()
@@ -136,7 +136,9 @@ class WatchedBags:
         path = self.bag_dir / recording / f"{recording}_{self._splits}.mcap"
         self._splits += 1
         written = write_mcap(path, messages, **layout)
-        self.own.adopt({recording: identity_of(path.parent)})
+        identity = identity_of(path.parent)
+        assert identity is not None
+        self.own.adopt({recording: identity})
         return written
 
     def hand_over(self, old: str, new: str, cut: int, last_of_old: str) -> None:
@@ -152,7 +154,7 @@ class WatchedBags:
             self.house.apply()
         self.log += log
 
-    def logged(self, event: str) -> list[dict[str, Any]]:
+    def logged(self, event: str) -> list[MutableMapping[str, Any]]:
         return [each for each in self.log if each["event"] == event]
 
     def fired_at(self) -> list[int]:
