@@ -26,7 +26,6 @@ def main(argv: list[str]) -> int:
         _record(options(distro, argv[2:]), distro, signals)
     except RefusedError as error:
         return _refusal(str(error))
-    signals.give_in()
     return 0
 
 

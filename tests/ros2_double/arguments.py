@@ -12,6 +12,29 @@ import yaml
 from tests.ros2_double.mcap_file import Layout
 
 DISTROS: Final = ("humble", "jazzy", "kilted", "lyrical")
+# What Jazzy's help lists besides; to use them is refused.
+_NOT_DONE: Final[dict[str, str | int | None]] = {
+    "--services": "+",
+    "--topic-types": "+",
+    "--all-topics": 0,
+    "--all-services": 0,
+    "--exclude-regex": None,
+    "--exclude-topic-types": "+",
+    "--exclude-topics": "+",
+    "--exclude-services": "+",
+    "--include-unpublished-topics": 0,
+    "--no-discovery": 0,
+    "-p, --polling-interval": None,
+    "--ignore-leaf-topics": 0,
+    "-f, --serialization-format": None,
+    "-b, --max-bag-size": None,
+    "--start-paused": 0,
+    "--snapshot-mode": 0,
+    "--log-level": None,
+    "--compression-queue-size": None,
+    "--compression-threads": None,
+    "--compression-threads-priority": None,
+}
 _LEVELS: Final = {"Fastest": -5, "Fast": -3, "Default": 1, "Slow": 5, "Slowest": 19}
 _PRESETS: Final = {
     "none": Layout(),
@@ -45,6 +68,13 @@ class Options:
     repeats: dict[str, int]
 
 
+class _Refused(argparse.Action):
+    """Refuses the option."""
+
+    def __call__(self, _parser: object, _given: object, _values: object, name: object = "") -> None:
+        raise RefusedError(f"the double does not do {name}")
+
+
 def parser(distro: str) -> argparse.ArgumentParser:
     """The model of one distro's options; an option that it lacks is unknown."""
     model = argparse.ArgumentParser(
@@ -58,7 +88,7 @@ def parser(distro: str) -> argparse.ArgumentParser:
     if distro != "humble":
         add("--topics", nargs="+", default=[], metavar="Topic", help="Topics to record.")
     add("-a", "--all", action="store_true", help="Record all topics.")
-    add("-e", "--regex", default="", help="Record only topics that the whole expression matches.")
+    add("-e", "--regex", default="", help="Record only topics that contain a match.")
     add("-o", "--output", help="Directory to create; it must not exist.")
     add("-s", "--storage", default="mcap", choices=("mcap", "sqlite3"))
     add("-d", "--max-bag-duration", type=int, default=0, help="Seconds after which to split.")
@@ -74,6 +104,9 @@ def parser(distro: str) -> argparse.ArgumentParser:
         add("--node-name", default="rosbag2_recorder")
         add("--custom-data", nargs="*", default=[], metavar="KEY=VALUE")
         add("--disable-keyboard-controls", action="store_true")
+    if distro == "jazzy":
+        for names, count in _NOT_DONE.items():
+            add(*names.split(", "), nargs=count, action=_Refused, help="The double refuses it.")
     if distro == "lyrical":
         add("--repeat-transient-local", nargs="+", default=[], metavar="Topic[=Depth]")
         add("--max-bag-files", type=int, default=0)

@@ -44,6 +44,10 @@ _BLOCK: Final = 4096
 DISK_FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
+_WORTH_COMPRESSING: Final = 1024  # bytes; both bounds are libmcap's
+_LEAST_RATIO: Final = 1.02
+
+
 @dataclass(frozen=True)
 class Layout:
     """How a file is written: the options of the storage plugin that the double knows."""
@@ -167,7 +171,7 @@ class McapFile:
         compression, data = "", content
         if self._layout.zstd_level is not None:
             packed = zstandard.ZstdCompressor(level=self._layout.zstd_level).compress(content)
-            if len(packed) < len(content):
+            if len(content) >= _LEAST_RATIO * len(packed):
                 compression, data = "zstd", packed
         times = [time for entries in self._index.values() for time, _ in entries]
         begin, end = min(times), max(times)

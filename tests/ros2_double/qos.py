@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
+from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    InvalidQoSProfileException,
     LivelinessPolicy,
     QoSProfile,
     ReliabilityPolicy,
@@ -23,20 +25,17 @@ _POLICIES: Final = {
     "durability": DurabilityPolicy,
     "liveliness": LivelinessPolicy,
 }
+_DURATIONS: Final = ("deadline", "lifespan", "liveliness_lease_duration")
 _DEPTH: Final = 10
-# Of volatile messages the real recorder's threads are never this far behind. One Python thread is,
-# on a busy machine, and what it then lost would be no behaviour of a recorder.
-_PATIENT_DEPTH: Final = 1000
 
 
 def offered(profile: Any) -> dict[str, str | int]:
     """One publisher's profile, as `metadata.qos_text` takes it."""
     policies = {name: getattr(profile, name).name.lower() for name in _POLICIES}
-    durations = ("deadline", "lifespan", "liveliness_lease_duration")
     return {
         **policies,
         "depth": profile.depth,
-        **{name: getattr(profile, name).nanoseconds for name in durations},
+        **{name: getattr(profile, name).nanoseconds for name in _DURATIONS},
     }
 
 
@@ -57,9 +56,7 @@ def adapted(topic: str, offers: Sequence[Any], warn: Callable[[str], None]) -> A
                 f"RMW_QOS_POLICY_{policy.upper()}_{fallback.name} "
                 "as it will connect to all publishers."
             )
-    latched = asked["durability"] == DurabilityPolicy.TRANSIENT_LOCAL
-    depth = _DEPTH if latched else _PATIENT_DEPTH
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, **asked)
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=_DEPTH, **asked)
 
 
 def refused(topic: str, offers: Sequence[Any], asked: Any) -> str | None:
@@ -72,9 +69,10 @@ def refused(topic: str, offers: Sequence[Any], asked: Any) -> str | None:
         for policy, promise, less in promises:
             if getattr(asked, policy) == promise and getattr(offer, policy) == less:
                 name = f"RMW_QOS_POLICY_{policy.upper()}"
+                itself = "rosbag" if policy == "reliability" else "rosbag2"
                 return (
                     f"A new publisher for subscribed topic {topic} was found offering "
-                    f"{name}_{less.name}, but rosbag already subscribed requesting "
+                    f"{name}_{less.name}, but {itself} already subscribed requesting "
                     f"{name}_{promise.name}. "
                     "Messages from this new publisher will not be recorded."
                 )
@@ -85,7 +83,7 @@ def overrides(text: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Profiles by topic.
 
     Raises:
-        RefusedError: a policy or a value that is not known, or no depth where one is needed.
+        RefusedError: as rosbag2 and rclpy refuse it, or a value that is not known.
     """
     return {topic: _override(topic, given) for topic, given in text.items()}
 
@@ -99,9 +97,16 @@ def _override(topic: str, given: dict[str, Any]) -> Any:
             except KeyError:
                 raise RefusedError(f"{topic}: {name} cannot be {value!r}") from None
         elif name == "depth":
-            values[name] = int(value)
+            if value < 0:
+                raise RefusedError("`depth` may not be a negative value.")
+            values[name] = value
+        elif name in _DURATIONS:
+            values[name] = Duration(seconds=value["sec"], nanoseconds=value["nsec"])
+        elif name == "avoid_ros_namespace_conventions":
+            values[name] = value
         else:
-            raise RefusedError(f"{topic}: the double knows no QoS policy {name!r}")
-    if values.get("history") == HistoryPolicy.KEEP_LAST and "depth" not in values:
-        raise RefusedError(f"{topic}: history keep_last needs a depth")
-    return QoSProfile(**{"history": HistoryPolicy.KEEP_LAST, "depth": _DEPTH, **values})
+            raise RefusedError(f"Unexpected key `{name}` for QoS profile.")
+    try:
+        return QoSProfile(**values)
+    except InvalidQoSProfileException as error:
+        raise RefusedError(str(error)) from None

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import re
 import sys
+import threading
 import time
+from contextlib import suppress
+from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any, Final
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.parameter import Parameter
+from rclpy.qos import qos_policy_name_from_kind
 from rclpy.signals import SignalHandlerOptions
 
 from tests.ros2_double.bag import Bag, Writing
@@ -65,6 +69,9 @@ class _Recorder:
         )
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
+        self._taken: Queue[tuple[str, bytes, dict[str, int], int]] = Queue()
+        # Finding topics and writing must not hold up what is received: the real one has threads.
+        self._receiver = threading.Thread(target=self._executor.spin, daemon=True)
 
     def run(self) -> None:
         self._greet()
@@ -73,6 +80,7 @@ class _Recorder:
         self._log("Listening for topics...")
         self._log("Event publisher thread: Starting")
         self._log("Recording...")
+        self._receiver.start()
         if self._options.use_sim_time:
             self._await_clock()
         due = 0.0
@@ -80,11 +88,13 @@ class _Recorder:
             if self._seeking and time.monotonic() >= due:
                 self._discover()
                 due = time.monotonic() + _POLLING_S
-            self._executor.spin_once(timeout_sec=_POLLING_S / 2)
+            self._write_taken(_POLLING_S / 2)
         self._end()
 
     def destroy(self) -> None:
         self._executor.shutdown()
+        if self._receiver.is_alive():
+            self._receiver.join()
         self._node.destroy_node()
 
     def _writing(self) -> Writing:
@@ -111,7 +121,7 @@ class _Recorder:
     def _await_clock(self) -> None:
         self._log("use_sim_time set, waiting for /clock before starting recording...")
         while not self._signals.received and not self._node.get_clock().now().nanoseconds:
-            self._executor.spin_once(timeout_sec=_POLLING_S / 2)
+            time.sleep(_POLLING_S / 2)
         if not self._signals.received:
             self._log("Sim time /clock found, starting recording.")
 
@@ -121,15 +131,20 @@ class _Recorder:
         self._bag.close()
         self._log("Event publisher thread: Exiting")
         self._log("Recording stopped")
-        _say("info", "rclcpp", f"signal_handler(signum={self._signals.received[0]})")
+        _say("info", "rclcpp", f"signal_handler(signum={self._signals.received[-1]})")
 
     def _drain(self) -> None:
-        """Takes what has already arrived: the real recorder's threads are never behind."""
+        """Writes what had already arrived."""
         until = time.monotonic() + _DRAINING_S
-        before = -1
-        while before < self._bag.count and time.monotonic() < until:
-            before = self._bag.count
-            self._executor.spin_once(timeout_sec=0)
+        while (left_s := until - time.monotonic()) > 0:
+            self._write_taken(left_s)
+
+    def _write_taken(self, patience_s: float) -> None:
+        """Writes what was received; waits so long for the first message."""
+        with suppress(Empty):
+            while True:
+                self._write(*self._taken.get(timeout=patience_s))
+                patience_s = 0.0
 
     def _discover(self) -> None:
         for topic, types in self._node.get_topic_names_and_types():
@@ -145,7 +160,7 @@ class _Recorder:
         options = self._options
         if options.topics and topic not in options.topics:
             return False
-        if not options.topics and not self._regex.fullmatch(topic):
+        if not options.topics and not self._regex.search(topic):
             return False
         if len(types) > 1:
             self._warn_once(
@@ -185,15 +200,22 @@ class _Recorder:
         self._asked[topic] = asked
 
         def take(payload: bytes, info: dict[str, int]) -> None:
-            self._take(topic, payload, info)
+            self._taken.put((topic, payload, info, self._node.get_clock().now().nanoseconds))
 
-        subscription(self._node, topic, (type_name, type_hash(type_name)), asked, take)
+        def warn(event: Any) -> None:
+            policy = f"{qos_policy_name_from_kind(event.last_policy_kind)}_QOS_POLICY"
+            text = (
+                f"New publisher discovered on topic '{topic}', offering incompatible QoS. "
+                f"No messages will be sent to it. Last incompatible policy: {policy}"
+            )
+            _say("warn", self._name, text)
+
+        kind = (type_name, type_hash(type_name))
+        subscription(self._node, topic, kind, asked, take, incompatible=warn)
         self._log(f"Subscribed to topic '{topic}'")
 
-    def _take(self, topic: str, payload: bytes, info: dict[str, int]) -> None:
-        log_time = info["received_timestamp"]
-        if self._options.use_sim_time:
-            log_time = self._node.get_clock().now().nanoseconds
+    def _write(self, topic: str, payload: bytes, info: dict[str, int], now: int) -> None:
+        log_time = now if self._options.use_sim_time else info["received_timestamp"]
         # Humble has one time for both.
         publish_time = log_time if self._distro == "humble" else info["source_timestamp"]
         self._bag.write(topic, payload, log_time, publish_time)

@@ -13,6 +13,8 @@ With T0 the clock's time (whole milliseconds) at the start and tick k at t = k /
   "table" always, "cup" for 5 <= t < 30, "scissors" for 12 <= t < 18.
 
 - `/clock` (rosgraph_msgs/Clock) each tick, t itself; only where it is asked for.
+- `/px4/position` (px4_msgs/VehicleLocalPosition) each tick, of a type that no recorder here knows;
+  only where it is asked for.
 
 Below 2 Hz every topic comes with every tick. Run as a program, it first waits for its subscribers,
 then writes T0 to the truth file, and at the end how many messages were published on each topic.
@@ -46,6 +48,7 @@ TURN_RATE: Final = 0.25  # rad/s
 SEEN: Final = {"table": (0.0, math.inf), "cup": (5.0, 30.0), "scissors": (12.0, 18.0)}
 TYPES: Final = {
     "/clock": "rosgraph_msgs/msg/Clock",
+    "/px4/position": "px4_msgs/msg/VehicleLocalPosition",
     "/odom": "nav_msgs/msg/Odometry",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -91,6 +94,7 @@ class Messages:
         """The message published on `topic` t seconds after T0, as CDR."""
         bodies = {
             "/clock": lambda t: _of("rosgraph_msgs/msg/Clock", clock=_time(round(t * 1e9))),
+            "/px4/position": self._local_position,
             "/odom": self._odometry,
             "/tf": self._transform,
             "/tf_static": self._sensors,
@@ -118,6 +122,11 @@ class Messages:
             pose=covariance(pose=place, covariance=zeros),
             twist=motion(twist=self._command(t), covariance=zeros),
         )
+
+    def _local_position(self, t: float) -> Any:
+        x, y, heading = pose(t)
+        values = {"x": x, "y": y, "z": 0.0, "heading": heading}
+        return _of(TYPES["/px4/position"], timestamp=round(t * 1e6), xy_valid=True, **values)
 
     def _stamped(self, t: float, frames: tuple[str, str], at: tuple[float, ...], yaw: float) -> Any:
         move = _of("geometry_msgs/msg/Vector3", x=at[0], y=at[1], z=at[2])
@@ -280,7 +289,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--duration", type=float, default=math.inf, help="s")
     parser.add_argument("--hz", type=float, default=20.0, help="ticks a second")
-    default = [topic for topic in TYPES if topic != "/clock"]
+    default = [topic for topic in TYPES if topic not in {"/clock", "/px4/position"}]
     parser.add_argument("--topics", nargs="+", default=default, choices=list(TYPES))
     parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--subscribers", type=int, default=0, help="to wait for, on each topic")

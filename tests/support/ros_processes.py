@@ -40,14 +40,16 @@ if TYPE_CHECKING:
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108
-ROS: Final = ROOT / "build" / "ros"
+ROS: Final = ROOT / "build" / os.environ.get("EPISODIC_ROS_WHEELS", "ros")
+"""The environment of the double: Jazzy's wheels, or the newest ones (ros-newest)."""
 RECORDERS: Final = ("real", "double")
 """What a test of recording is run with, by the names of parameters."""
 
 _HAS_ROS: Final = any(ROS.glob("lib/*/site-packages/rclpy"))
 _NO_ROS: Final = (
-    "build/ros has no rclpy (wheels: Linux, Python 3.11); to make it: "
-    "UV_PROJECT_ENVIRONMENT=build/ros uv sync --locked --inexact --no-default-groups --group ros"
+    f"build/{ROS.name} has no rclpy (wheels: Linux, Python 3.11); to make it: "
+    f"UV_PROJECT_ENVIRONMENT=build/{ROS.name} "
+    f"uv sync --locked --inexact --no-default-groups --group {ROS.name}"
 )
 needs_ros = pytest.mark.skipif(not _HAS_ROS, reason=_NO_ROS)
 

@@ -18,10 +18,14 @@ from importlib import import_module
 from typing import Any, Final
 
 from nav_msgs.msg import Path as Lender
+from rclpy.event_handler import SubscriptionEventCallbacks
 
 _SERIALIZER: Final = b"rosidl_typesupport_fastrtps_c"
-# The middleware also looks for a struct of another kind, goes on without it, and leaves an error
-# set, which the next one would be printed with.
+# What describes the fields. Jazzy's middleware refuses a type without it; of a type that has no
+# wheel it is told the lender's fields, which nobody reads.
+_DESCRIBER: Final = b"rosidl_typesupport_introspection_c"
+# Newer ones look for it too, go on without it, and leave an error set, which the next one would be
+# printed with.
 _reset_error = ctypes.CDLL("librcutils.so").rcutils_reset_error
 _KEPT: Final[list[object]] = []  # the middleware keeps pointers to these for ever
 
@@ -69,9 +73,18 @@ def publisher(node: Any, topic: str, kind: tuple[str, str], qos: Any) -> Any:
     return made
 
 
-def subscription(node: Any, topic: str, kind: tuple[str, str], qos: Any, take: Any) -> Any:
-    """An rclpy subscription; `take` is called with the bytes and with the info on each message."""
-    made = node.create_subscription(message_class(*kind), topic, take, qos, raw=True)
+def subscription(
+    node: Any, topic: str, kind: tuple[str, str], qos: Any, take: Any, *, incompatible: Any
+) -> Any:
+    """An rclpy subscription.
+
+    `take` is called with the bytes and with the info on each message, `incompatible` with the event
+    that a publisher offers less than `qos`.
+    """
+    events = SubscriptionEventCallbacks(incompatible_qos=incompatible)
+    made = node.create_subscription(
+        message_class(*kind), topic, take, qos, raw=True, event_callbacks=events
+    )
     _reset_error()
     return made
 
@@ -91,7 +104,7 @@ def message_class(type_name: str, type_hash: str) -> Any:
     try:
         return getattr(import_module(f"{package}.msg"), name)
     except ImportError:
-        support = _renamed(_lent(), package, name, bytes.fromhex(type_hash.removeprefix("RIHS01_")))
+        support = _renamed(package, name, bytes.fromhex(type_hash.removeprefix("RIHS01_")))
     # rclpy checks that these are set; they are for messages as objects.
     unused = dict.fromkeys(
         ("_CREATE_ROS_MESSAGE", "_CONVERT_FROM_PY", "_CONVERT_TO_PY", "_DESTROY_ROS_MESSAGE"),
@@ -100,22 +113,29 @@ def message_class(type_name: str, type_hash: str) -> Any:
     return type(f"Metaclass_{name}", (type,), {"_TYPE_SUPPORT": support, **unused})(name, (), {})
 
 
-def _lent() -> _TypeSupport:
-    """The serializer's struct of a type without a bound on its size."""
+def _lent(kind: bytes) -> int | None:
+    """The address of a struct of this kind, of a type without a bound on its size."""
     meta = type(Lender)
     if meta._TYPE_SUPPORT is None:
         meta.__import_type_support__()
     whole = _TypeSupport.from_address(_pointer_in(meta._TYPE_SUPPORT, None))
-    handle = _HandleFor(whole.handle_for)(ctypes.addressof(whole), _SERIALIZER)
-    return _TypeSupport.from_address(handle)
+    address: int | None = _HandleFor(whole.handle_for)(ctypes.addressof(whole), kind)
+    return address
 
 
-def _renamed(lent: _TypeSupport, package: str, name: str, type_hash: bytes) -> object:
+def _renamed(package: str, name: str, type_hash: bytes) -> object:
+    serializer = _lent(_SERIALIZER)
+    assert serializer is not None
+    lent, describer = _TypeSupport.from_address(serializer), _lent(_DESCRIBER)
+
+    def handle(asked: int, kind: bytes) -> int | None:
+        return {_SERIALIZER: asked, _DESCRIBER: describer}.get(kind)
+
     callbacks = _Callbacks.from_buffer_copy(_Callbacks.from_address(lent.data))
     callbacks.message_namespace = f"{package}::msg".encode()
     callbacks.message_name = name.encode()
     own_hash = _TypeHash(1, (ctypes.c_uint8 * 32)(*type_hash))
-    handle_for = _HandleFor(lambda handle, kind: handle if kind == _SERIALIZER else None)
+    handle_for = _HandleFor(handle)
     get_hash = _GetHash(lambda handle: ctypes.addressof(own_hash))
     support = _TypeSupport.from_buffer_copy(lent)
     support.data = ctypes.addressof(callbacks)
