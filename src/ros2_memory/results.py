@@ -7,10 +7,12 @@ only. `now` is what ages count from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
     from ros2_memory.analysis.silences import Silence
@@ -435,6 +437,7 @@ class Status(AnswerWithNotes):
         restarts: how often it had to restart `ros2 bag record`; 0 where there is none.
         missing: topics that it is to record by name, and that no publisher has offered to it.
         never_heard: topics it subscribed to that brought no message.
+        lost: how many messages of each topic are known to be missing of the recorder's last hour.
         fell_silent: topics that brought some, and none lately.
         silences: when topics with a usual rate were silent although the robot was on.
         clock_steps: when the clock was set by 2 s or more.
@@ -463,6 +466,7 @@ class Status(AnswerWithNotes):
     problems: tuple[str, ...]
     silences: tuple[Silence, ...] = ()
     clock_steps: tuple[ClockStep, ...] = ()
+    lost: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

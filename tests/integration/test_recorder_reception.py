@@ -16,6 +16,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
+from ros2_memory.bag_dir.lost_file import read_losses
 from tests.support.live_recorder import LiveRecorder, Machine, machine
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder
@@ -121,3 +122,22 @@ def test_a_publisher_that_comes_with_weaker_qos_is_recorded_at_once(site: Machin
                 alive=recorder.process,
             )
             recorder.stop()
+
+
+def test_what_was_lost_is_counted_to_the_message(site: Machine) -> None:
+    """A stall while the queue still is rosbag2's own, of ten messages."""
+    with publishing(site.env, "/odom:50:reliable"):
+        recorder = site.record("lossy", "recording.split_duration_s=3", topics=("/odom",))
+        recorder.wait_for("subscribed")
+        wait_for(lambda: recorder.heartbeat.heartbeat is not None, "a heartbeat")
+        stall(recorder, 1.0)
+        [missing] = recorder.wait_for("messages_missing")
+        recorder.stop()
+    found = numbers(recorder.bag_dir)["/odom"]
+    lost = sum(later - earlier - 1 for earlier, later in pairwise(found))
+    assert missing["lost"] == lost > 10
+    window = (0, time.time_ns())
+    assert sum(loss.lost for loss in read_losses(recorder.bag_dir, *window)) == lost
+    beat = recorder.heartbeat.heartbeat
+    assert beat is not None
+    assert beat.lost == {"/odom": lost}

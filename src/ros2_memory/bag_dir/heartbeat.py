@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
@@ -67,6 +67,9 @@ class Heartbeat:
         missing: topics configured by name that no publisher has offered since the start.
         age_held: which bags stay though their dates are too old, because the clock may be wrong;
             None where there are none.
+        lost: how many messages of each topic are known to be missing of the last hour; topics
+            without a counter, or a regular header stamp, are not in it.
+        cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.
     """
 
     pid: _Pid
@@ -79,10 +82,12 @@ class Heartbeat:
     silent: tuple[str, ...]
     last_error: str | None
     interval_s: _Interval
-    # Older recorders did not write these three.
+    # Older recorders did not write these.
     restarts: Count = 0
     missing: tuple[str, ...] = ()
     age_held: str | None = None
+    lost: dict[str, Count] = field(default_factory=dict)
+    cut_short: tuple[str, ...] = ()
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.

@@ -16,6 +16,7 @@
           moment.json                      its label and its time
           rec_20261120T043000Z/            hard links, under the names that the bags have above
       .episodic/recorded.jsonl     recorded time when each recording ended
+      .episodic/lost.jsonl         messages that are missing (see `lost_file`)
       .episodic/requests/          requests of the query server (see `request_queue`)
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
       .episodic/triggers.json      what rules found so far (see `trigger_file`)
@@ -52,6 +53,7 @@ MOMENT_FILE: Final = "moment.json"
 OWN_FOLDER: Final = ".episodic"
 RECORDED_FILE: Final = "recorded.jsonl"
 REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
+LOST_FILE: Final = f"{OWN_FOLDER}/lost.jsonl"
 LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
 TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
 

@@ -12,6 +12,7 @@ The first few of each kind are named, and the others counted:
   on disk of it answers, from the end of that on;
 - bags that a crash left open, up to the last time that their files were written to;
 - closed bags of which parts could not be read, or that contradict themselves;
+- messages that the recorder found to be missing (`bag_dir.lost_file`);
 - bags that a wrong clock dated, except where the answer is that there is nothing.
 """
 
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.lost_file import read_losses
 from ros2_memory.core.bag_summary import (
     DOUBTS,
     MESSAGES_MISSING,
@@ -39,6 +41,7 @@ from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -64,11 +67,25 @@ def note_unread(
         # No remark says that a crash left a bag open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
+    for sentence in describe_lost(view.memory.index.bag_dir, window):
+        view.notes.add(sentence)
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
         view.notes.add_remarks(odd)
+
+
+def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence on messages that are known to be missing of a window."""
+    topics: dict[str, int] = {}
+    for loss in read_losses(bag_dir, window.start, window.stop):
+        topics[loss.topic] = topics.get(loss.topic, 0) + loss.lost
+    if topics:
+        most = sorted(topics, key=lambda topic: (-topics[topic], topic))
+        named = listed([f"{topic} ({topics[topic]})" for topic in most])
+        messages = counted(sum(topics.values()), "message")
+        yield f"{messages} lost before they were recorded, or never published: {named}"
 
 
 def note_edges(view: View, window: TimeWindow) -> None:

@@ -59,6 +59,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
         never_heard=() if heartbeat is None else heartbeat.silent,
+        lost={} if heartbeat is None or not live else heartbeat.lost,
         fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
         silences=tuple(silences_of(snapshot, memory.limits.latching)),
         clock_steps=clock_steps(view),

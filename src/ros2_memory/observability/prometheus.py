@@ -206,6 +206,14 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
         "Topics that are subscribed to and brought no message.",
         len(heartbeat.silent),
     )
+    lost = GaugeMetricFamily(
+        "ros2_memory_recorder_lost_messages",
+        "Messages of the last hour that are known to be missing.",
+        labels=("topic",),
+    )
+    for topic, messages in heartbeat.lost.items():
+        lost.add_metric((topic,), messages)
+    yield lost
     yield CounterMetricFamily(
         "ros2_memory_recorder_written_bytes",
         "What the recorder has written since it started.",

@@ -27,6 +27,7 @@ _ADVICE = {
         "recorder.setup_files"
     ),
     LineKind.SEVERAL_TYPES: "the topic is not recorded: publishers disagree on its type",
+    LineKind.TOPIC_LOST: "messages were lost: the disk is too slow for what is recorded",
     LineKind.MESSAGES_LOST: "messages were lost: the disk is too slow for what is recorded",
 }
 

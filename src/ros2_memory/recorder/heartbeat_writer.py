@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.event_log import EventLog
+    from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.sessions import RecordingSessions
 
 
@@ -28,6 +29,7 @@ class HeartbeatWriter:
         events: where a heartbeat that cannot be written is reported.
         age_held: describes bags that are kept though their dates make them too old, or None.
         expected: gives the topics that are to be recorded by name.
+        reception: knows what was lost.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class HeartbeatWriter:
         *,
         age_held: Callable[[], str | None],
         expected: Callable[[], Sequence[str]],
+        reception: Reception,
     ) -> None:
         self._bag_dir = bag_dir
         self._interval_s = interval_s
@@ -46,6 +49,7 @@ class HeartbeatWriter:
         self._events = events
         self._age_held = age_held
         self._expected = expected
+        self._reception = reception
         self._offered = set[str]()
         self._state = RecorderState.STOPPED
         self._since = clock.now()
@@ -91,6 +95,8 @@ class HeartbeatWriter:
             restarts=sessions.restarts,
             missing=self._missing(sessions),
             age_held=self._age_held(),
+            lost=self._reception.lost_in_last_hour(now),
+            cut_short=tuple(sorted(self._reception.cut_short)),
         )
 
     def _missing(self, sessions: RecordingSessions) -> tuple[str, ...]:

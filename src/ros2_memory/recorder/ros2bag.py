@@ -101,7 +101,9 @@ class Ros2BagRecorder(Recorder):
         self._options: frozenset[str] = frozenset()
         self._queue_bytes = queue_mb * 2**20
         self._min_free_bytes = round(min_free_gb * GB)
-        self._reception = Reception(reader, self._queue_bytes, latched=latched_topics)
+        self._reception = Reception(
+            reader, self._queue_bytes, bag_dir=self._bag_dir, latched=latched_topics
+        )
         self._supervisor = Supervisor(
             Orders(
                 bag_dir=self._bag_dir,

@@ -278,6 +278,8 @@ class RecordingSessions:
         for line in lines:
             if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
                 self._reception.refused(session.name, line.topic)
+            elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
+                self._reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
         for fault in flush_bags(directory, names):

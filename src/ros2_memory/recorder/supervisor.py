@@ -95,6 +95,7 @@ class Supervisor:
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
         self._events = EventLog()
+        self._reception = reception or Reception(reader)
         self._heartbeat = HeartbeatWriter(
             orders.bag_dir,
             HEARTBEAT_S,
@@ -102,8 +103,8 @@ class Supervisor:
             self._events,
             age_held=housekeeper.age_held,
             expected=expected,
+            reception=self._reception,
         )
-        self._reception = reception or Reception(reader)
         self._sessions = RecordingSessions(
             orders,
             start_child,
@@ -175,6 +176,7 @@ class Supervisor:
         self.stopped = True
         self._write_heartbeat(RecorderState.STOPPING)
         self._sessions.stop(self._now())
+        self._reception.flush()
         self._paused = False
         self._write_heartbeat(RecorderState.STOPPED)
 

@@ -123,6 +123,7 @@ def _status(answer: results.Status) -> JsonObject:
         "recorder": answer.recorder,
         "recorder_alive": answer.live,
         "restarts": answer.restarts,
+        **({"lost_last_hour": dict(answer.lost)} if answer.lost else {}),
         "now": moment(answer.now),
         "earliest": moment(answer.earliest),
         "latest": moment(latest),

@@ -24,6 +24,7 @@ class LineKind(StrEnum):
     UNKNOWN_TYPE = "unknown_type"
     SEVERAL_TYPES = "several_types"
     MESSAGES_LOST = "messages_lost"
+    TOPIC_LOST = "topic_lost"  # one topic of MESSAGES_LOST
     WARNING = "warning"
     ERROR = "error"
     OTHER = "other"
@@ -31,11 +32,12 @@ class LineKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line: what it reports, its text, and the topic, where it names one."""
+    """One line: what it reports, its text, and the topic and a count, where it has them."""
 
     kind: LineKind
     text: str
     topic: str | None = None
+    count: int | None = None
 
 
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
@@ -60,6 +62,7 @@ _MEANINGS: Final = (
     (LineKind.UNKNOWN_TYPE, re.compile(r"Topic '(?P<topic>[^']+)' has unknown type")),
     (LineKind.SEVERAL_TYPES, re.compile(r"Topic '(?P<topic>[^']+)' has more than one type")),
     (LineKind.MESSAGES_LOST, re.compile(r"Cache buffers lost messages")),
+    (LineKind.TOPIC_LOST, re.compile(r"(?P<topic>/[A-Za-z0-9_/]+): (?P<count>[1-9]\d{0,9})$")),
     # The total is on a line of its own, below one line for each topic.
     (LineKind.MESSAGES_LOST, re.compile(r"Total lost: (?!0\b)\d+")),
 )
@@ -74,5 +77,7 @@ def parse_line(raw: str) -> Line:
     for kind, pattern in _MEANINGS:
         found = pattern.match(text)
         if found is not None:
-            return Line(kind, text, found.groupdict().get("topic"))
+            named = found.groupdict()
+            count = named.get("count")
+            return Line(kind, text, named.get("topic"), None if count is None else int(count))
     return Line(_BY_LEVEL.get(logged["level"] if logged else "", LineKind.OTHER), text)

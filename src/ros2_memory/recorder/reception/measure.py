@@ -1,11 +1,15 @@
-"""Measures how the topics of one closed split arrived: their QoS, bursts and sizes."""
+"""Measures how the topics of one closed split arrived: their QoS, bursts, sizes and holes."""
 
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
+from ros2_memory.recorder.reception.continuity import Position, reader_of
+from ros2_memory.recorder.reception.losses import Progress
 from ros2_memory.recorder.reception.profiles import HOLD_S, TopicFlow, offered_by_all
 
 if TYPE_CHECKING:
@@ -22,8 +26,23 @@ _FEWEST: Final = 5
 """Messages that show a rate, where a topic did not last for `HOLD_S`."""
 
 
-def measure_flows(reader: BagReader, path: Path) -> Mapping[str, TopicFlow]:
-    """Returns how each topic of a closed split arrived, of those whose offered QoS it states.
+@dataclass(frozen=True, slots=True)
+class SplitMeasure:
+    """How the topics of one split arrived.
+
+    Attributes:
+        flows: of those whose offered QoS the split states.
+        progress: of those with one publisher, whose messages show what is missing.
+        span: first and last log time; None for a split without a message.
+    """
+
+    flows: Mapping[str, TopicFlow]
+    progress: Mapping[str, Progress]
+    span: tuple[Ns, Ns] | None
+
+
+def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
+    """Returns how each topic of a closed split arrived.
 
     Raises:
         BagError: the split cannot be read.
@@ -40,16 +59,37 @@ def measure_flows(reader: BagReader, path: Path) -> Mapping[str, TopicFlow]:
             window = TimeWindow(summary.end - TAIL_NS, summary.end + 1)
     times: dict[str, list[Ns]] = {}
     largest: dict[str, int] = {}
+    readers = {
+        channel.topic: found
+        for channel in reader.channels(path)
+        if (found := reader_of(channel.schema)) is not None
+    }
+    positions: dict[str, list[Position]] = {}
+    span: tuple[Ns, Ns] | None = None
     for record in reader.records(path, offers, window):
         topic = record.channel.topic
         times.setdefault(topic, []).append(record.publish_time or record.log_time)
         largest[topic] = max(largest.get(topic, 0), len(record.payload))
+        span = (record.log_time if span is None else span[0], record.log_time)
+        known = readers.get(topic)
+        if known is not None:
+            try:
+                value = known[1](record.payload)
+            except struct.error:
+                del readers[topic]
+                continue
+            positions.setdefault(topic, []).append(Position(value, record.log_time))
     flows: dict[str, TopicFlow] = {}
     for topic, published in times.items():
         offered = offered_by_all(offers[topic])
         if offered is not None:
             flows[topic] = TopicFlow(offered, burst_of(published), largest[topic])
-    return flows
+    progress = {
+        topic: Progress(readers[topic][0], found)
+        for topic, found in positions.items()
+        if topic in readers and topic in flows and flows[topic].offered.publishers == 1
+    }
+    return SplitMeasure(flows, progress, span)
 
 
 def burst_of(published: Sequence[Ns]) -> int:

@@ -7,15 +7,18 @@ that came later, takes a rotation. What the splits show is measured beside the r
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
 from ros2_memory.bag_dir.layout import has_own_name
+from ros2_memory.bag_dir.lost_file import append_losses
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import listed
-from ros2_memory.recorder.reception.measure import measure_flows
+from ros2_memory.recorder.reception.losses import LossCounter
+from ros2_memory.recorder.reception.measure import measure_split
 from ros2_memory.recorder.reception.profiles import (
     QueuePlan,
     TopicFlow,
@@ -25,9 +28,11 @@ from ros2_memory.recorder.reception.profiles import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.lost_file import Loss
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader
 
 DEEPEN_EVERY_S: Final = 60.0
@@ -63,6 +68,7 @@ class Reception:
     Args:
         reader: reads splits that are closed.
         queue_bytes: what the queues of all topics together may take.
+        bag_dir: where losses are written; nowhere where None.
         latched: topics that count as latched, see `qos_overrides`.
         run: runs a task that takes a while; in a thread of its own where None.
     """
@@ -72,13 +78,17 @@ class Reception:
         reader: BagReader,
         queue_bytes: int = QUEUE_BYTES,
         *,
+        bag_dir: Path | None = None,
         latched: Collection[str] = (),
         run: Callable[[Callable[[], None]], None] | None = None,
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
         self._latched = tuple(latched)
-        self._run = run or _in_thread
+        self._run = run or _in_thread()
+        self._bag_dir = bag_dir
+        self._losses = LossCounter()
+        self._spans: dict[str, tuple[Ns, Ns]] = {}
         self._lock = threading.Lock()
         self._flows: dict[str, TopicFlow] = {}
         self._asked_anew: set[str] = set()
@@ -109,6 +119,51 @@ class Reception:
     def learn(self, recording: str, path: Path) -> None:
         """Measures a closed split of a recording, later."""
         self._run(lambda: self._measure(recording, path))
+
+    def flush(self) -> None:
+        """Counts what no further split can fill; called when nothing is recorded any more."""
+        self._run(self._flush)
+
+    def _flush(self) -> None:
+        with self._lock:
+            losses = self._losses.flush()
+        self._report(losses)
+
+    def lost(self, recording: str, topic: str, count: int) -> None:
+        """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
+
+        def count_them() -> None:
+            with self._lock:
+                start, stop = self._spans.get(recording, (0, 0))
+                losses = self._losses.reported(topic, start, stop, count)
+            self._report(losses)
+
+        self._run(count_them)
+
+    def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
+        """Returns how many messages of each topic are known to be missing of the last hour."""
+        with self._lock:
+            return self._losses.in_last_hour(now)
+
+    def _report(self, losses: Sequence[Loss]) -> None:
+        if not losses:
+            return
+        by_topic: dict[str, int] = {}
+        for loss in losses:
+            by_topic[loss.topic] = by_topic.get(loss.topic, 0) + loss.lost
+        for topic, lost in by_topic.items():
+            _log.warning(
+                "messages_missing",
+                topic=topic,
+                lost=lost,
+                reason=f"{topic}: {lost} messages are missing by its counter, its stamps or "
+                "rosbag2's count: lost on their way to the disk, or never published",
+            )
+        if self._bag_dir is not None:
+            try:
+                append_losses(self._bag_dir, losses)
+            except OSError as error:
+                _log.warning("losses_not_written", reason=str(error))
 
     def refused(self, recording: str, topic: str) -> None:
         """Notes that a publisher does not fit how a recording subscribed to the topic.
@@ -160,7 +215,7 @@ class Reception:
 
     def _measure(self, recording: str, path: Path) -> None:
         try:
-            flows = measure_flows(self._reader, path)
+            split = measure_split(self._reader, path)
         except (EpisodicError, OSError) as error:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
@@ -168,13 +223,21 @@ class Reception:
         with self._lock:
             before = plan_queues(self._planned_for(), self._queue_bytes).cut_short
             known = self._recordings.get(recording)
-            for topic, flow in flows.items():
+            for topic, flow in split.flows.items():
                 # A recording that refused a publisher does not state what that one offers.
                 if known is None or topic not in known.refused:
                     old = self._flows.get(topic)
                     self._flows[topic] = flow if old is None else old.joined(flow)
                     self._asked_anew.discard(topic)
             short = plan_queues(self._planned_for(), self._queue_bytes).cut_short
+            if split.span is not None:
+                begun = self._spans.pop(recording, split.span)
+                self._spans[recording] = (begun[0], split.span[1])
+                for name in [*self._spans][:-_PLANS_KEPT]:
+                    del self._spans[name]
+            # What an earlier run recorded was counted by that.
+            losses = self._losses.measured(recording, split.progress) if recording else []
+        self._report(losses)
         for topic in sorted(short - before):
             _log.warning(
                 "queue_cut_short",
@@ -198,8 +261,14 @@ def newest_split(bag_dir: Path) -> Path | None:
     return None
 
 
-def _in_thread(task: Callable[[], None]) -> None:
-    threading.Thread(target=task, name="reception", daemon=True).start()
+def _in_thread() -> Callable[[Callable[[], None]], None]:
+    """Returns what runs tasks one after the other in a thread, which begins with the first."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix="reception")
+
+    def run(task: Callable[[], None]) -> None:
+        pool.submit(task)
+
+    return run
 
 
 def _asking_again(topics: Collection[str]) -> str:

@@ -1,0 +1,88 @@
+"""`.episodic/lost.jsonl`: messages that were published and are in no bag, as far as is known.
+
+The recorder appends a line for each hole that it finds in a topic; the query server reads them, for
+the notes of answers. Lines of other versions, and a last line that a crash cut short, are ignored.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, Literal
+
+from pydantic import TypeAdapter
+
+from ros2_memory.bag_dir.durable_write import append_durably, open_plain, write_durably
+from ros2_memory.bag_dir.json_fields import Count, Int64, json_object, validated
+from ros2_memory.bag_dir.layout import LOST_FILE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.timebase import Ns
+
+MOST_BYTES: Final = 1 << 20
+"""A longer file loses its older half."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Messages of a topic that are missing between two log times.
+
+    `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
+    may never have been published either), or rosbag2's own count.
+    """
+
+    topic: str
+    start: Int64
+    stop: Int64
+    lost: Count
+    by: Literal["counter", "stamps", "rosbag2"]
+
+
+_LOSS: Final = TypeAdapter(Loss)
+
+
+def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
+    """Appends losses, and drops the oldest where the file is too long.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    target = bag_dir / LOST_FILE
+    target.parent.mkdir(exist_ok=True)
+    append_durably(target, "".join(f"{json.dumps(asdict(each))}\n" for each in losses))
+    if target.stat().st_size > MOST_BYTES:
+        with open_plain(target) as stream:
+            lines = stream.read().decode(errors="replace").splitlines(keepends=True)
+        write_durably(target, "".join(lines[len(lines) // 2 :]))
+
+
+def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
+    """Returns the losses that fall between two log times; none where there is no file."""
+    path = bag_dir / LOST_FILE
+    try:
+        status = path.stat()
+        return [
+            each
+            for each in _parsed(path, status.st_mtime_ns, status.st_size)
+            if each.start < stop and start < each.stop
+        ]
+    except (OSError, ValueError):
+        return ()
+
+
+# Asked for by every answer; the key says when the file has changed.
+@lru_cache(2)
+def _parsed(path: Path, _mtime_ns: int, _size: int) -> Sequence[Loss]:
+    with open_plain(path) as stream:
+        lines = stream.read(2 * MOST_BYTES).decode(errors="replace").splitlines()
+    losses: list[Loss] = []
+    for line in lines:
+        try:
+            losses.append(validated(_LOSS, json_object(line)))
+        except (ValueError, RecursionError):
+            continue
+    return losses

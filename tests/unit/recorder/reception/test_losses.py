@@ -1,0 +1,148 @@
+"""Holes in what was recorded, from counters and stamps, across splits and recordings."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir import lost_file
+from ros2_memory.bag_dir.lost_file import Loss, append_losses, read_losses
+from ros2_memory.recorder.reception.continuity import Position, holes, reader_of
+from ros2_memory.recorder.reception.losses import HOUR_NS, LossCounter, Progress
+from ros2_memory.storage.base import Schema
+
+NS = 10**9
+PERIOD = NS // 50
+T0 = 1_795_000_000 * NS
+HEADER = "std_msgs/Header header\nfloat64 x\n===\nMSG: std_msgs/Header\nstring frame_id\n"
+
+
+def at(ticks: list[int]) -> list[Position]:
+    return [Position(T0 + tick * PERIOD, T0 + tick * PERIOD + 1000) for tick in ticks]
+
+
+def progress(ticks: list[int]) -> dict[str, Progress]:
+    return {"/odom": Progress("stamps", at(ticks))}
+
+
+@given(missing=st.sets(st.integers(1, 498), max_size=40))
+def test_as_many_are_missing_as_were_taken_out(missing: set[int]) -> None:
+    kept = [tick for tick in range(500) if tick not in missing]
+    found = holes(at(kept), "stamps")
+    assert found is not None
+    assert sum(hole.missing for hole in found) == len(missing)
+
+
+def test_nothing_is_expected_of_what_has_no_cadence() -> None:
+    irregular = [0, 1, 5, 6, 15, 17, 30, 31, 50, 52, 80, 81]
+    assert holes(at(irregular), "stamps") is None
+    assert holes(at([0, 1, 3]), "stamps") is None
+    two_publishers = at(
+        [tick for pair in zip(range(50), range(20, 70), strict=True) for tick in pair]
+    )
+    assert holes(two_publishers, "stamps") is None
+
+
+def test_a_publisher_that_was_silent_for_long_lost_nothing() -> None:
+    assert holes(at([*range(100), *range(1000, 1100)]), "stamps") == []
+
+
+def test_a_hole_between_two_splits_counts_and_only_once() -> None:
+    counter = LossCounter()
+    assert counter.measured("a", progress([*range(100)])) == []
+    assert counter.measured("a", progress([*range(103, 200)])) == []
+    [loss] = counter.measured("a", progress([*range(200, 300)]))
+    assert (loss.topic, loss.lost, loss.by) == ("/odom", 3, "stamps")
+    assert loss.start == T0 + 99 * PERIOD + 1000
+    assert counter.measured("a", progress([*range(300, 400)])) == []
+    assert counter.in_last_hour(loss.stop) == {"/odom": 3}
+    assert counter.in_last_hour(loss.stop + HOUR_NS) == {}
+
+
+def test_what_the_other_recording_of_a_handover_has_is_not_lost() -> None:
+    old = progress([tick for tick in range(100) if not 40 <= tick < 50])
+    new = progress([tick for tick in range(20, 120) if tick != 70])
+    splits = {"old": old, "new": new}
+    for order in (("old", "new"), ("new", "old")):
+        counter = LossCounter()
+        losses = [loss for name in order for loss in counter.measured(name, splits[name])]
+        assert [*losses, *counter.flush()] == []
+
+
+def test_what_no_recording_has_is_lost_also_in_a_handover() -> None:
+    counter = LossCounter()
+    counter.measured("old", progress([tick for tick in range(100) if tick != 45]))
+    counter.measured("new", progress([*range(60, 160)]))
+    assert [loss.lost for loss in counter.flush()] == []
+    assert counter.in_last_hour(T0) == {"/odom": 1}
+
+
+def test_rosbags_own_count_counts_where_nothing_else_does() -> None:
+    counter = LossCounter()
+    counter.measured("a", progress([*range(100)]))
+    assert counter.reported("/odom", T0, T0 + NS, 5) == []
+    assert counter.reported("/image", T0, T0 + NS, 5) == [Loss("/image", T0, T0 + NS, 5, "rosbag2")]
+
+
+@pytest.mark.parametrize(
+    ("text", "payload", "kind", "value"),
+    [
+        (HEADER, struct.pack("<iIiI", 0, 7, 9, 2), "stamps", 7 + 9 * 0 + 0),
+        ("uint32 seq\nfloat64 x\n", struct.pack("<iI", 0, 41), "counter", 41),
+        (
+            "uint8 a\nuint64 sequence\n",
+            b"\0\0\0\0\1" + bytes(7) + struct.pack("<Q", 9),
+            "counter",
+            9,
+        ),
+        (
+            "std_msgs/Header header # when\nuint32 SIZE=3\nuint32 frame_number\n",
+            bytes(4) + struct.pack("<iII", 1, 2, 4) + b"map\0" + struct.pack("<I", 77),
+            "counter",
+            77,
+        ),
+        (
+            "string name\nuint16 counter\n",
+            bytes(4) + struct.pack("<I", 2) + b"a\0" + b"\5\0",
+            "counter",
+            5,
+        ),
+    ],
+)
+def test_counters_and_stamps_are_found_by_the_definition(
+    text: str, payload: bytes, kind: str, value: int
+) -> None:
+    found = reader_of(Schema("a/msg/B", "ros2msg", text.encode()))
+    assert found is not None
+    assert found[0] == kind
+    if kind == "stamps":
+        payload = struct.pack("<iiI", 0, 3, 5)
+        value = 3 * NS + 5
+    assert found[1](payload) == value
+
+
+@pytest.mark.parametrize(
+    "text", ["string data\n", "float64[] seq\n", "geometry_msgs/Pose p\nuint32 seq\n", ""]
+)
+def test_other_types_show_nothing(text: str) -> None:
+    assert reader_of(Schema("a/msg/B", "ros2msg", text.encode())) is None
+    assert reader_of(Schema("a/msg/B", "ros2idl", b"uint32 seq\n")) is None
+
+
+def test_losses_are_read_back_for_a_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    losses = [Loss("/odom", T0 + n * NS, T0 + n * NS + 5, 1, "stamps") for n in range(100)]
+    assert read_losses(tmp_path, T0, T0 + NS) == ()
+    append_losses(tmp_path, losses[:50])
+    with (tmp_path / ".episodic" / "lost.jsonl").open("a") as stream:
+        stream.write("[1]\nno json\n{}\n")
+    append_losses(tmp_path, losses[50:])
+    assert read_losses(tmp_path, T0, T0 + 200 * NS) == losses
+    assert read_losses(tmp_path, T0 + 3 * NS + 1, T0 + 5 * NS) == losses[3:5]
+    monkeypatch.setattr(lost_file, "MOST_BYTES", 8000)
+    append_losses(tmp_path, losses[:1])
+    assert read_losses(tmp_path, T0 + 90 * NS, T0 + 200 * NS) == losses[90:]
+    assert len(read_losses(tmp_path, 0, T0 + 200 * NS)) < 60
