@@ -44,6 +44,7 @@ class RecorderState(StrEnum):
 
     STARTING = "starting"
     RECORDING = "recording"
+    WAITING = "waiting"  # it would record, but nothing has come since it began
     PAUSED = "paused"  # running, but not recording: the disk is nearly full, or missing
     STOPPING = "stopping"
     STOPPED = "stopped"
@@ -70,6 +71,7 @@ class Heartbeat:
         lost: how many messages of each topic are known to be missing of the last hour; topics
             without a counter, or a regular header stamp, are not in it.
         cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.
+        waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
     """
 
     pid: _Pid
@@ -88,6 +90,7 @@ class Heartbeat:
     age_held: str | None = None
     lost: dict[str, Count] = field(default_factory=dict)
     cut_short: tuple[str, ...] = ()
+    waiting_for: str | None = None
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.

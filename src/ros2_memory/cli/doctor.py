@@ -347,6 +347,8 @@ def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
     elif heartbeat.state is RecorderState.PAUSED:
         why = heartbeat.last_error or "it does not say why"
         yield _error("recorder", f"it is paused: {why}", "see disk above")
+    elif heartbeat.state is RecorderState.WAITING:
+        yield _error("recorder", "it waits, and has recorded nothing", str(heartbeat.waiting_for))
     else:
         subscribed = counted(len(heartbeat.subscribed), "topic")
         yield _ok("recorder", f"{heartbeat.state}, {subscribed} subscribed")

@@ -8,6 +8,7 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.coverage import describe_lost
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.clock_steps import clock_steps
@@ -68,7 +69,11 @@ def memory_status(memory: Memory, call: Call) -> Status:
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         moments=moments,
-        problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
+        problems=(
+            *problems_of(snapshot, heartbeat, wall),
+            *lacking_in(view),
+            *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
+        ),
         notes=(*view.notes.sentences(), *filter(None, [held])),
     )
 
@@ -92,6 +97,8 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield "the recorder has stopped without saying so"
     elif heartbeat.state is RecorderState.PAUSED:
         yield f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}"
+    elif heartbeat.state is RecorderState.WAITING:
+        yield f"the recorder waits: {heartbeat.waiting_for or 'it does not say for what'}"
 
 
 def lacking_in(view: View) -> Iterator[str]:

@@ -96,6 +96,7 @@ class HeartbeatWriter:
             missing=self._missing(sessions),
             age_held=self._age_held(),
             lost=self._reception.lost_in_last_hour(now),
+            waiting_for=sessions.waiting_for if state is RecorderState.WAITING else None,
             cut_short=tuple(sorted(self._reception.cut_short)),
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -16,6 +17,8 @@ MAX_WAIT_S: Final = 60.0
 STABLE_S: Final = 60.0
 SILENT_SPLITS: Final = 3
 """Splits without growth after which a robot counts as silent."""
+WAITING_S: Final = 30.0
+"""A recorder that has recorded nothing for so long, and for a split, waits for something."""
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""
 SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
@@ -131,15 +134,36 @@ def space_action(
     return SpaceAction.WAIT if waits else SpaceAction.PAUSE
 
 
-def describe_silent_topics(subscribed: Collection[str], received: Collection[str]) -> str | None:
+def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: str) -> str:
+    """Describes what a recorder waits for that has received nothing.
+
+    `advice` is on publishers that are subscribed to and not heard.
+    """
+    if simulated:
+        return (
+            "nothing has been recorded: recording.use_sim_time is on, and nothing is written "
+            "before /clock arrives"
+        )
+    if not subscribed:
+        return (
+            "nothing has been recorded: no publisher offers any of the listed topics in this "
+            "ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and topics.yaml with the "
+            "robot's"
+        )
+    topics = counted(len(subscribed), "topic")
+    return f"nothing has been recorded, although {topics} are subscribed to; {advice}"
+
+
+def describe_silent_topics(
+    subscribed: Collection[str], received: Collection[str], advice: str
+) -> str | None:
     """Describes the topics that brought nothing in a whole recording; None where all did."""
     silent = sorted(set(subscribed) - set(received))
     if not silent:
         return None
     if not received:
         return (
-            f"subscribed to {len(silent)} topics and received nothing from any of them; "
-            "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
-            "for the recorder: Fast DDS does not share memory between users"
+            f"subscribed to {counted(len(silent), 'topic')} and received nothing from any of them; "
+            f"{advice}"
         )
     return f"subscribed, and no message in the whole recording: {', '.join(silent)}"

@@ -24,7 +24,11 @@ from ros2_memory.recorder.process.command import (
     record_argv,
     storage_config,
 )
-from ros2_memory.recorder.process.environment import find_ros2, robot_environment
+from ros2_memory.recorder.process.environment import (
+    advice_on_silence,
+    find_ros2,
+    robot_environment,
+)
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.recorder.reception.reception import Reception, newest_split
 from ros2_memory.recorder.sessions import Orders
@@ -111,6 +115,7 @@ class Ros2BagRecorder(Recorder):
                 session_duration_s=session_duration_s,
                 min_free_bytes=self._min_free_bytes,
                 simulated=use_sim_time,
+                advice=lambda: advice_on_silence(self._env),
             ),
             self._start_child,
             reader,

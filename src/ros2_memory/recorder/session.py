@@ -165,6 +165,7 @@ class RecordingSession:
         has_recorded: whether its child ever reported that it records.
         subscribed: the topics that its child reported as subscribed, which does not mean that it
             receives any of them.
+        of_unknown_type: the topics that its child reported as of an unknown type: one of each type.
     """
 
     def __init__(self, name: str, child: Child, splits: Splits, began: ClockReading) -> None:
@@ -176,6 +177,7 @@ class RecordingSession:
         self.is_listed = False
         self.has_recorded = False
         self.subscribed: set[str] = set()
+        self.of_unknown_type: set[str] = set()
         self._reported: set[tuple[str | None, str]] = set()
         self._last_lines: deque[str] = deque(maxlen=_LAST_LINES)
 
@@ -220,6 +222,8 @@ class RecordingSession:
                 self.subscribed.add(line.topic)
                 lines.append(line)
             elif line.kind in _REPORTED and self._is_new(line):
+                if line.kind is LineKind.UNKNOWN_TYPE and line.topic is not None:
+                    self.of_unknown_type.add(line.topic)
                 lines.append(line)
         return lines
 

@@ -20,7 +20,11 @@ from ros2_memory.recorder.handover.plan import (
 )
 from ros2_memory.recorder.handover.recovery import settle_handover
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
-from ros2_memory.recorder.policies import describe_silent_topics
+from ros2_memory.recorder.policies import (
+    WAITING_S,
+    describe_silent_topics,
+    describe_waiting,
+)
 from ros2_memory.recorder.process.child import end_all
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
@@ -46,7 +50,8 @@ WHOLE_RECORDING_S: Final = 15.0
 class Orders:
     """What to record and for how long. Durations are in seconds.
 
-    `simulated`: log times come from a simulated clock. `subscribe_timeout_s` is how long a handover
+    `simulated`: log times come from a simulated clock. `advice` says what to do where publishers
+    are subscribed to and not heard. `subscribe_timeout_s` is how long a handover
     waits for the new recorder (see `handover.plan`).
     """
 
@@ -55,6 +60,7 @@ class Orders:
     session_duration_s: float
     min_free_bytes: int
     simulated: bool = False
+    advice: Callable[[], str] = str
     subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
 
 
@@ -75,6 +81,7 @@ class RecordingSessions:
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None mostly.
         restarts: how often a recording had to be started again.
+        waiting_for: why nothing has come since recording was begun, as a sentence; else None.
     """
 
     def __init__(
@@ -105,6 +112,8 @@ class RecordingSessions:
         self._unsettled: list[tuple[Path, Path]] = []
         self._ended_bytes = 0
         self.restarts = 0
+        self.waiting_for: str | None = None
+        self._silent_since_s: float | None = None
 
     @property
     def bytes_written(self) -> int:
@@ -118,6 +127,7 @@ class RecordingSessions:
             RecorderError: it cannot be started.
         """
         self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
+        self._silent_since_s = now.monotonic_s
 
     def begin_handover(self, now: ClockReading) -> None:
         """Starts a recording that is to take over from the current one.
@@ -151,7 +161,26 @@ class RecordingSessions:
                 self._handle_vanished(session)
         if closed:
             self._settle_handovers()
+        self._check_waiting(now)
         return closed
+
+    def _check_waiting(self, now: ClockReading) -> None:
+        """Finds out whether anything has come since recording was begun.
+
+        What was heard once is silent later, and not waited for.
+        """
+        if any(each.splits.messages or each.splits.bytes_written for each in self.running):
+            self._silent_since_s = None
+        since_s, current = self._silent_since_s, self.current
+        patience_s = max(WAITING_S, self._orders.split_duration_s)
+        if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
+            self.waiting_for = None
+            self._events.resolve("recording_waits", "")
+            return
+        self.waiting_for = describe_waiting(
+            current.subscribed, simulated=self._orders.simulated, advice=self._orders.advice()
+        )
+        self._events.fail_once("recording_waits", "", self.waiting_for, recording=current.name)
 
     def advance_handover(self, now: ClockReading) -> Step:
         """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
@@ -367,7 +396,7 @@ class RecordingSessions:
         self._flush(session, splits.directory, (METADATA_FILE,))
         self._flush(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
-        silent = describe_silent_topics(session.subscribed, splits.received)
+        silent = describe_silent_topics(session.subscribed, splits.received, self._orders.advice())
         lived_s = session.age_s(now)
         if silent is not None and lived_s >= WHOLE_RECORDING_S:
             self._events.warn("topics_silent", silent, recording=session.name)

@@ -50,6 +50,8 @@ RETENTION_S: Final = 10.0
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags grow old all the same."""
 HEARTBEAT_S: Final = 5.0
+TYPES_S: Final = 15.0
+"""By then a recording has subscribed to all topics of known types that are offered."""
 
 
 class Supervisor:
@@ -119,6 +121,8 @@ class Supervisor:
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
+        self._expected = expected
+        self._unknown = frozenset[str]()
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
@@ -190,6 +194,7 @@ class Supervisor:
             "takeover": self._check_handover,
             "rotation": self._check_rotation,
             "restart": self._check_restart,
+            "types": self._check_types,
             "reap": self._sessions.collect_ended,
             "recorded": self._note_recorded,
             "house": self._apply_retention,
@@ -334,6 +339,25 @@ class Supervisor:
             self._events.fail("recorder_not_started", str(error))
             self._postpone("restart", self._backoff.failed(0.0), now)
 
+    def _check_types(self, now: ClockReading) -> None:
+        """Names every topic that is not recorded, where some are of a type that is not known.
+
+        `ros2 bag record` names the first topic of each unknown type, and no other.
+        """
+        current = self._sessions.current
+        if current is None or not current.of_unknown_type or current.age_s(now) < TYPES_S:
+            return
+        unknown = frozenset({*self._expected(), *current.of_unknown_type} - current.subscribed)
+        if unknown != self._unknown:
+            self._unknown = unknown
+            self._events.warn(
+                "topics_not_recorded",
+                f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
+                "type of all or some of these: name the workspace that defines it in "
+                "recorder.setup_files",
+                recording=current.name,
+            )
+
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
         self._sessions.begin(now)
@@ -372,7 +396,10 @@ class Supervisor:
     def _state(self) -> RecorderState:
         if self._paused or self._disk.away:
             return RecorderState.PAUSED
-        return RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
+        if not self.is_recording:
+            return RecorderState.STARTING
+        waits = self._sessions.waiting_for is not None
+        return RecorderState.WAITING if waits else RecorderState.RECORDING
 
     def _free_bytes(self) -> int | None:
         try:

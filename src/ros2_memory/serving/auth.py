@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 HEALTH_PATH: Final = "/health"
+RECORDING_PATH: Final = "/health/recording"
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 AUTHENTICATED: Final = "ros2_memory.authenticated"
 """The key in the scope of a request to `/health`: whether it showed the token."""
@@ -102,7 +103,7 @@ class TokenGate:
         if len(shown) == 1 and self._is_right(shown[0]):
             admit(scope)
             await self._app({**scope, AUTHENTICATED: True}, receive, send)
-        elif not shown and scope["path"] == HEALTH_PATH:
+        elif not shown and scope["path"] in {HEALTH_PATH, RECORDING_PATH}:
             await self._app({**scope, AUTHENTICATED: False}, receive, send)
         else:
             self._log_refused(scope, is_wrong=bool(shown))

@@ -145,13 +145,14 @@ def _catalogue(backfill: Backfill) -> JsonObject:
 
 
 def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
-    error, held = heartbeat.last_error, heartbeat.age_held
+    error, held, waits = heartbeat.last_error, heartbeat.age_held, heartbeat.waiting_for
     shown: JsonObject = {
         "state": str(heartbeat.state),
         "live": heartbeat.is_live(now),
         "heartbeat_age_s": seconds(now - heartbeat.updated),
         "restarts": heartbeat.restarts,
         "last_error": None if error is None else _short(error),
+        "waiting_for": None if waits is None else _short(waits),
         "age_held": None if held is None else _short(held),
     }
     for kind, topics, most in (

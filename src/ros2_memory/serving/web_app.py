@@ -1,4 +1,7 @@
-"""The web application: `/sse` with `/messages/`, `/mcp`, `/health`, `/metrics` and a page."""
+"""The web application: `/sse` with `/messages/`, `/mcp`, `/health`, `/metrics` and a page.
+
+`/health` is 200 while the server answers; `/health/recording` is 503 unless the recorder records.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,7 @@ from ros2_memory.serving.auth import (
     AUTHENTICATED,
     HEALTH_PATH,
     LOOPBACK_NAMES,
+    RECORDING_PATH,
     ForgeryGuard,
     TokenGate,
 )
@@ -48,6 +52,20 @@ _MCP_PATH: Final = "/mcp"
 _SESSION_HEADER: Final = "mcp-session-id"
 _INITIALIZE: Final = b'"initialize"'
 _OK: Final = 200
+_UNAVAILABLE: Final = 503
+
+
+def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
+    """Returns whether the recorder records, by what `/health` shows: 200, else 503."""
+    found = report.get("recorder")
+    recorder = found if isinstance(found, dict) else {}
+    recording = recorder.get("live") is True and recorder.get("state") == "recording"
+    shown: JsonObject = {"recording": recording}
+    if all_of_it:
+        shown["recorder"] = recorder.get("state")
+        shown["recorder_alive"] = recorder.get("live", False)
+        shown["waiting_for"] = recorder.get("waiting_for")
+    return JSONResponse(shown, _OK if recording else _UNAVAILABLE)
 
 
 def web_app(
@@ -84,6 +102,10 @@ def web_app(
             report = {"status": report["status"]}
         return JSONResponse(report)
 
+    async def show_recording(request: Request) -> JSONResponse:
+        known = api_token is None or request.scope.get(AUTHENTICATED, False)
+        return _recording(await health(), all_of_it=known)
+
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
@@ -93,6 +115,7 @@ def web_app(
             tasks.cancel_scope.cancel()
 
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
+    routes.append(Route(RECORDING_PATH, show_recording, methods=["GET"]))
     if metrics is not None:
 
         async def show_metrics(_request: Request) -> Response:

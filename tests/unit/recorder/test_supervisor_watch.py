@@ -91,7 +91,7 @@ class TestWatch:
     def test_subscribed_to_all_and_hearing_nothing_points_at_the_transport(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
+        world = World(tmp_path, session_duration_s=20, advice=lambda: "set UDPv4")
         world.silent = True
         world.supervisor.start()
         with capture_logs() as logs:
@@ -174,3 +174,69 @@ class TestHeartbeat:
         on_disk = sum(path.stat().st_size for path in tmp_path.glob("*/*.mcap"))
         assert abs(int(str(sizes[-1])) - on_disk) < 20_000
         assert world.heartbeat()["interval_s"] == 5.0
+
+
+class TestWaiting:
+    def test_a_recorder_that_never_received_anything_says_what_it_waits_for(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, advice=lambda: "look at the network")
+        world.silent = True
+        world.supervisor.start()
+        world.run(29)
+        assert world.heartbeat()["state"] == "recording"
+        with capture_logs() as logs:
+            world.run(30)
+        (reported,) = events(logs, "recording_waits")
+        beat = world.heartbeat()
+        assert beat["state"] == "waiting"
+        assert beat["waiting_for"] == reported["reason"]
+        assert "2 topics are subscribed to; look at the network" in beat["waiting_for"]
+        world.silent = False
+        world.run(10)
+        assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
+
+    def test_what_fell_silent_later_is_not_waited_for(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(12)
+        world.silent = True
+        world.run(120)
+        assert len(world.recorders) > 2
+        assert world.heartbeat()["state"] == "recording"
+
+    def test_a_recording_of_long_splits_waits_for_one_of_them(self, tmp_path: Path) -> None:
+        world = World(tmp_path, split_duration_s=60)
+        world.silent = True
+        world.supervisor.start()
+        world.run(58)
+        assert world.heartbeat()["state"] == "recording"
+        world.run(10)
+        assert world.heartbeat()["state"] == "waiting"
+
+    @pytest.mark.parametrize(
+        ("simulated", "topics", "expected"),
+        [(True, ("/odom",), "/clock"), (False, (), "no publisher offers")],
+    )
+    def test_simulated_time_and_a_wrong_domain_are_told_apart(
+        self, tmp_path: Path, simulated: bool, topics: tuple[str, ...], expected: str
+    ) -> None:
+        world = World(tmp_path, simulated=simulated)
+        world.defaults = {"topics": topics, "heard": ()}
+        world.silent = True
+        world.supervisor.start()
+        world.run(40)
+        assert expected in world.heartbeat()["waiting_for"]
+
+
+def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> None:
+    world = World(tmp_path, expected=("/bumper", "/door", "/grip", "/arm"))
+    world.supervisor.start()
+    world.run(2)
+    world.recorders[0].lines.append(
+        "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
+    )
+    with capture_logs() as logs:
+        world.run(30)
+    (reported,) = events(logs, "topics_not_recorded")
+    assert "not recorded: /arm, /grip;" in reported["reason"]

@@ -35,6 +35,7 @@ def app(
     host: str = "127.0.0.1",
     background: Any = anyio.sleep_forever,
     api_token: str | None = None,
+    recorder: dict[str, Any] | None = None,
 ) -> WebApp:
     schema: dict[str, Any] = {"type": "object", "properties": {}}
     reply = results.TopicValue("/a", "a/msg/A", Sample(0, 7))
@@ -47,7 +48,8 @@ def app(
     server = EpisodicServer(dispatcher, name="episodic", version="1", instructions="")
 
     async def health() -> Any:
-        return {"status": "ok", "bags": 3}
+        known = {} if recorder is None else {"recorder": recorder}
+        return {"status": "ok", "bags": 3, **known}
 
     return web_app(server, host=host, health=health, background=background, api_token=api_token)
 
@@ -86,6 +88,30 @@ async def test_health_is_json() -> None:
         response = await http.get("/health")
     assert response.status_code == 200
     assert response.json() == {"status": "ok", "bags": 3}
+
+
+@pytest.mark.parametrize(
+    ("recorder", "status"),
+    [
+        ({"state": "recording", "live": True}, 200),
+        ({"state": "recording", "live": False}, 503),
+        ({"state": "waiting", "live": True, "waiting_for": "/clock"}, 503),
+        ({"state": "paused", "live": True}, 503),
+        (None, 503),
+    ],
+)
+async def test_whether_it_records_is_a_status_of_its_own(
+    recorder: dict[str, Any] | None, status: int
+) -> None:
+    async with client(app(recorder=recorder)) as http:
+        assert (await http.get("/health")).status_code == 200
+        shown = await http.get("/health/recording")
+    assert shown.status_code == status
+    assert shown.json()["recording"] is (status == 200)
+    assert shown.json()["waiting_for"] == (recorder or {}).get("waiting_for")
+    async with client(app(recorder=recorder, api_token=GOOD)) as http:
+        hidden = await http.get("/health/recording")
+    assert (hidden.status_code, hidden.json()) == (status, {"recording": status == 200})
 
 
 async def test_health_shows_its_status_alone_to_whoever_shows_no_token() -> None:

@@ -105,6 +105,30 @@ def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
     return env
 
 
+def advice_on_silence(env: Mapping[str, str]) -> str:
+    """Returns what to do where publishers are subscribed to and not heard, by the environment.
+
+    rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
+    FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
+    """
+    if "fastrtps" not in env.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"):
+        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall lie between?"
+    local = env.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
+    if local or env.get("ROS_LOCALHOST_ONLY") == "1":
+        return (
+            "if the publishers run under another user: in the discovery range LOCALHOST Fast DDS "
+            "uses shared memory, which users do not share, and FASTDDS_BUILTIN_TRANSPORTS changes "
+            "nothing; run the recorder as the robot's user, or see docs/how-to/systemd.md for what "
+            "a wider range takes and exposes"
+        )
+    if env.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4":
+        return (
+            "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
+            "for the recorder: Fast DDS does not share memory between users"
+        )
+    return "do the publishers publish, and does a firewall lie between?"
+
+
 def find_ros2(env: Mapping[str, str]) -> str:
     """Returns the path of the `ros2` program.
 
