@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from ros2_memory.analysis.conditions import positions
+from ros2_memory.analysis.field_ranges import joined
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, CdrLayout, Record
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Block: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 Times: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 Bytes: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.uint8]]"
 
@@ -80,7 +82,10 @@ class PayloadTemplate:
         fixed: for each byte of the payload whether it is common to all.
         layout: where the numbers are.
         numbers: offsets of the numbers that are in the value unchanged.
-        names: the field of each of these.
+        names: the key of each of these.
+        fields: the offsets of the numbers of each field, which is a dot-path.
+        constants: fields of other numbers, which are in every value.
+        computed: fields of times and angles.
         times: offsets of the times that are in it, in seconds.
         angles: whether angles in degrees are in it.
         points: the positions that `near_position` tests.
@@ -97,6 +102,9 @@ class PayloadTemplate:
     layout: CdrLayout
     numbers: tuple[int, ...]
     names: tuple[str, ...]
+    fields: tuple[tuple[str, tuple[int, ...]], ...]
+    constants: tuple[tuple[str, tuple[int, ...]], ...]
+    computed: tuple[str, ...]
     times: tuple[int, ...]
     angles: bool
     points: tuple[PointOffsets, ...]
@@ -161,6 +169,15 @@ class PayloadTemplate:
         part = np.ascontiguousarray(rows[:, offset : offset + size])
         column: Numbers = part.view(number)[:, 0].astype(np.float64)
         return column
+
+    def block(self, rows: Bytes, offsets: Sequence[int]) -> Block:
+        """Returns the numbers at some offsets, as a row for each row."""
+        step = 8 if offsets[0] in self.layout.doubles else 4
+        if len(offsets) > 1 and [*offsets] == [*range(offsets[0], offsets[-1] + 1, step)]:
+            part = np.ascontiguousarray(rows[:, offsets[0] : offsets[-1] + step])
+            block: Block = part.view("<f8" if step == 8 else "<f4").astype(np.float64)
+            return block
+        return np.stack([self.column(rows, offset) for offset in offsets], axis=1)
 
     def seconds(self, rows: Bytes, offset: int) -> list[float]:
         """Returns the time at an offset, of each row, as the extracted value has it."""
@@ -266,7 +283,14 @@ def template_for(
 def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -> PayloadTemplate:
     if depends_on_numbers(one.value):
         raise _NoTemplateError
-    numbers, names, times, angles = _numbers_in_value(one, other)
+    found = _numbers_in_value(one, other)
+    angles = any(path.rpartition(".")[2] in ANGLES for path in found.computed)
+    by_field: dict[str, list[int]] = {}
+    for offset, path in found.numbers:
+        by_field.setdefault(path, []).append(offset)
+    constants: dict[str, list[int]] = {}
+    for path, number in found.constants:
+        constants.setdefault(path, []).append(number)
     points, orientation = one.points(), one.orientation()
     if points != other.points() or orientation != other.orientation():
         raise _NoTemplateError
@@ -282,9 +306,12 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
         type_name=type_name,
         fixed=fixed,
         layout=layout,
-        numbers=tuple(numbers),
-        names=tuple(names),
-        times=tuple(times),
+        numbers=tuple(offset for offset, _ in found.numbers),
+        names=tuple(path.rpartition(".")[2] for _, path in found.numbers),
+        fields=tuple((path, tuple(offsets)) for path, offsets in by_field.items()),
+        constants=tuple((path, tuple(some)) for path, some in constants.items()),
+        computed=tuple(dict.fromkeys(found.computed)),
+        times=tuple(found.times),
         angles=angles,
         points=points,
         position=None if one.pose is None else one.offsets(one.pose.position),
@@ -296,42 +323,50 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
     )
 
 
-def _numbers_in_value(one: _Marked, other: _Marked) -> tuple[list[int], list[str], list[int], bool]:
-    """Returns offsets and fields of numbers, offsets of times, and whether there are angles.
+class _Found(NamedTuple):
+    """The numbers in a value: offset and field, field and number, offsets of times, fields."""
+
+    numbers: list[tuple[int, str]]
+    constants: list[tuple[str, int]]
+    times: list[int]
+    computed: list[str]
+
+
+def _numbers_in_value(one: _Marked, other: _Marked) -> _Found:
+    """Returns which numbers of the payload, and which others, are in the value.
 
     Raises:
         _NoTemplateError: something else differs.
     """
-    numbers: list[int] = []
-    names: list[str] = []
-    times: list[int] = []
-    angles = False
-    for (key, leaf), (_, again) in zip(_leaves(one.value), _leaves(other.value), strict=True):
+    found = _Found([], [], [], [])
+    for (path, leaf), (_, again) in zip(_leaves(one.value), _leaves(other.value), strict=True):
         if not isinstance(leaf, float) or not isinstance(again, float):
             if leaf != again:
                 raise _NoTemplateError
+            if isinstance(leaf, int) and not isinstance(leaf, bool):
+                found.constants.append((path, leaf))
         elif leaf in one.offset_of and other.offset_of.get(again) == one.offset_of[leaf]:
-            numbers.append(one.offset_of[leaf])
-            names.append(key)
+            found.numbers.append((one.offset_of[leaf], path))
         elif leaf in one.time_of and other.time_of.get(again) == one.time_of[leaf]:
-            times.append(one.time_of[leaf])
-        elif key in ANGLES:
-            angles = True
+            found.times.append(one.time_of[leaf])
+            found.computed.append(path)
+        elif path.rpartition(".")[2] in ANGLES:
+            found.computed.append(path)
         else:
             raise _NoTemplateError
-    return numbers, names, times, angles
+    return found
 
 
-def _leaves(value: JsonValue, key: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yields everything that is neither list nor object, with the name of its field."""
+def _leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yields everything that is neither list nor object, with its field."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _leaves(inner, name)
+            yield from _leaves(inner, joined(path, name))
     elif isinstance(value, list):
         for inner in value:
-            yield from _leaves(inner, key)
+            yield from _leaves(inner, path)
     else:
-        yield key, value
+        yield path, value
 
 
 class BulkDecoder(Generic[T]):

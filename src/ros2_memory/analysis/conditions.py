@@ -14,6 +14,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+from ros2_memory.analysis.zone_map import rounded
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
@@ -42,6 +43,8 @@ _EXAMPLES: Final = {
     "below": 'condition_type "below", value 0.2, field "percentage"',
     "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
 }
+_EXACT_BELOW: Final = 2**53
+"""Whole numbers below this are floats."""
 _SIDES: Final = {"above": True, "below": False}
 """Conditions on a number, and whether it is to be above the limit."""
 
@@ -132,6 +135,14 @@ class Equals:
         if self._boolean is not None and zone_map.can_contain_boolean(self._boolean):
             return True
         return any(zone_map.can_contain_number(number) for number in self._numbers)
+
+    @property
+    def number_bounds(self) -> tuple[float, float] | None:
+        """Between which numbers (inclusive) a leaf must be; None where it may be no number."""
+        if isinstance(self.value, str) or self._boolean is not None:
+            return None
+        least, most = min(self._numbers), max(self._numbers)
+        return rounded(least, up=False), rounded(most, up=True)
 
     def is_leaf(self, leaf: JsonValue) -> bool:
         """Returns whether this leaf is equal."""
@@ -258,6 +269,22 @@ class Condition:
             or isinstance(test, NearPosition)
             or (isinstance(test, Contains) and test.is_number)
         )
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Between which numbers (inclusive) the field must be, where its numbers alone decide."""
+        if self.field is None:
+            return None
+        if isinstance(self.test, Beyond):
+            limit, above = self.test.limit, self.test.above
+            nearest = rounded(limit, up=not above)
+            # Greater numbers are rounded, and may be rounded to the limit.
+            if abs(limit) < _EXACT_BELOW:
+                nearest = math.nextafter(nearest, math.inf if above else -math.inf)
+            return (nearest, math.inf) if above else (-math.inf, nearest)
+        if isinstance(self.test, Equals):
+            return self.test.number_bounds
+        return None
 
     @property
     def place(self) -> NearPosition | None:

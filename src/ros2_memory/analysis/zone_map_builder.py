@@ -75,7 +75,9 @@ class ZoneMapBuilder:
         for offset in template.numbers:
             column = template.column(rows, offset)
             numbers = column[~np.isnan(column)]
-            if numbers.size:
+            if numbers.size and self._numbers is None:
+                self._add_numbers([float(numbers.min()), float(numbers.max())])
+            elif numbers.size:
                 self._add_numbers(np.unique(numbers).tolist())
         for offset in template.times:
             self._add_numbers(template.seconds(rows, offset))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-VERSION: Final = 5
+VERSION: Final = 6
 """Version of the tables below and of their content; a file of any other version is set aside."""
 
 BUSY_S: Final = 1.0
@@ -43,7 +43,7 @@ _SUFFIXES: Final = ("-wal", "-shm")
 _FIRST_ROWS: Final = """
 SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
   (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes),
-  (SELECT 1 FROM maps)
+  (SELECT 1 FROM maps), (SELECT 1 FROM ranges), (SELECT 1 FROM fields)
 """
 _TABLES: Final = """
 CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
@@ -61,6 +61,9 @@ CREATE TABLE tales (topic INTEGER NOT NULL, bag INTEGER NOT NULL, rests BLOB, st
   PRIMARY KEY (topic, bag)) WITHOUT ROWID;
 CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
   sights BLOB NOT NULL);
+CREATE TABLE ranges (topic INTEGER NOT NULL, bag INTEGER NOT NULL, fields INTEGER NOT NULL,
+  numbers BLOB NOT NULL, PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE fields (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
   log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,

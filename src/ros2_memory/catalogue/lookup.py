@@ -12,6 +12,8 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, TypeVar, cast
 from weakref import WeakKeyDictionary
 
+import numpy as np
+
 from ros2_memory.analysis.zone_map import UNBOUNDED, Boxes, united
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.model import BagState
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.zone_map import ZoneMap
+    from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.catalogue.topic_digest import EdgeDigest
     from ros2_memory.core.model import BagFile
@@ -31,8 +34,27 @@ T = TypeVar("T")
 
 _MAX_WITH_MESSAGES: Final = 64
 """Segments whose stored messages stay in memory: two days of 10 s splits."""
+_MAX_BOUNDS: Final = 8
+"""Fields whose bounds stay in memory."""
 _UNKNOWN_STATE: Final = -1
 """Stands for the state of a catalogue that could not be read."""
+
+
+class FieldBounds:
+    """Between which bounds the numbers of a field are, in each of some entries."""
+
+    def __init__(self, numbers: Sequence[int], column: FieldColumn) -> None:
+        self._numbers = np.array(numbers, np.int64)
+        # An entry without a range may hold anything.
+        self._low = np.full(len(numbers), -np.inf)
+        self._high = np.full(len(numbers), np.inf)
+        order = np.argsort(self._numbers)
+        at = order[np.searchsorted(self._numbers, column.numbers, sorter=order)]
+        self._low[at], self._high[at] = column.low, column.high
+
+    def between(self, least: float, most: float) -> set[int]:
+        """Returns the entries that may have a number between two, inclusive."""
+        return {*self._numbers[(self._low <= most) & (self._high >= least)].tolist()}
 
 
 class SegmentDigests:
@@ -69,6 +91,7 @@ class SegmentDigests:
         }
         self._zone_map: dict[str, ZoneMap] = {}
         self._boxes: dict[str, Boxes] = {}
+        self._bounds: dict[str, FieldBounds] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
@@ -94,6 +117,20 @@ class SegmentDigests:
     def boxes(self, topic: str) -> Boxes:
         """Returns the boxes of the zone maps; cached, since they are small and often asked for."""
         return self._cached(self._boxes, topic, lambda: Boxes(self.zone_maps(topic)))
+
+    def field_bounds(self, topic: str, field: str) -> FieldBounds:
+        """Returns between which bounds the numbers of a field are, for all entries at once.
+
+        Cached for the fields that were asked for last.
+        """
+        name = f"{topic} {field}"
+        if name not in self._bounds and len(self._bounds) >= _MAX_BOUNDS:
+            self._bounds = {}
+        return self._cached(self._bounds, name, lambda: self._field_bounds(topic, field))
+
+    def _field_bounds(self, topic: str, field: str) -> FieldBounds:
+        numbers = self._entries_with(topic)
+        return FieldBounds(numbers, self.catalogue.field_column(topic, field, numbers))
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
         """Returns the frame edges, for each entry that has them."""

@@ -18,6 +18,7 @@ from ros2_memory.catalogue.codec import (
     encode_standstills,
     encode_topic_events,
 )
+from ros2_memory.catalogue.field_columns import encode_field_ranges
 from ros2_memory.catalogue.map_digest import encode_map_track
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
     listed = json.dumps(row_ids)
     # Topic by topic: the primary keys begin with the topic.
     for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
-        for table in ("held", "tales", "kept"):
+        for table in ("held", "tales", "ranges", "kept"):
             connection.execute(
                 f"DELETE FROM {table} WHERE topic = ? AND bag {_AMONG}", (topic, listed)
             )
@@ -111,6 +112,7 @@ def insert_entry(
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
         _insert_events(connection, (number, bag), topic, digest.summary)
+        _insert_ranges(connection, (number, bag), topic)
         for nth, record in enumerate(topic.kept or ()):
             _insert_record(connection, (bag, number, nth), record)
 
@@ -176,6 +178,31 @@ def _insert_events(
             None if topic.events == quiet else encode_topic_events(topic.events),
         ),
     )
+
+
+def _insert_ranges(
+    connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest
+) -> None:
+    """Inserts the ranges of the topic's fields; no row where it has no number."""
+    if topic.fields is None or topic.fields:
+        text, packed = encode_field_ranges(topic.fields)
+        fields = _id_of(connection, "fields", "text", text)
+        connection.execute("INSERT INTO ranges VALUES (?, ?, ?, ?)", (*key, fields, packed))
+
+
+def range_rows(
+    connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
+) -> list[sqlite3.Row]:
+    """Returns row id, text of the fields and numbers of the ranges of a topic in entries.
+
+    NULL for entries of bags in which it has no number; none for those that were deleted.
+    """
+    return connection.execute(
+        "SELECT bags.id, text, numbers FROM json_each(?) JOIN bags ON bags.id = value"
+        f" LEFT JOIN ranges ON topic = {_TOPIC} AND bag = bags.id"
+        " LEFT JOIN fields ON fields.id = ranges.fields",
+        (json.dumps(row_ids), topic),
+    ).fetchall()
 
 
 def _insert_record(

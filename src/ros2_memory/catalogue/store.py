@@ -24,6 +24,7 @@ from ros2_memory.catalogue.codec import (
     decode_topic_events,
 )
 from ros2_memory.catalogue.database import CatalogueDatabase
+from ros2_memory.catalogue.field_columns import field_column
 from ros2_memory.catalogue.map_digest import decode_map_track
 from ros2_memory.catalogue.sql import (
     EDGES,
@@ -37,6 +38,7 @@ from ros2_memory.catalogue.sql import (
     insert_entry,
     map_rows,
     message_rows,
+    range_rows,
     topic_rows,
     zone_map,
 )
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.timebase import Ns
@@ -203,6 +206,16 @@ class Catalogue(CatalogueDatabase):
             return EdgeDigest(pairs[text], first, last)
 
         return self._of_topic(topic, numbers, EDGES, decode)
+
+    def field_column(self, topic: str, field: str, numbers: Sequence[int]) -> FieldColumn:
+        """Returns the numbers of a field of the topic; not of entries where they are not known."""
+
+        def ask(connection: sqlite3.Connection) -> FieldColumn:
+            offset = self.offset
+            rows = range_rows(connection, topic, self.row_ids(numbers))
+            return field_column([(offset + row[0], row[1], row[2]) for row in rows], field)
+
+        return self.read(ask, field_column([], field))
 
     def maps(self, numbers: Sequence[int]) -> dict[int, MapDigest]:
         """Returns the map digests of entries, without their sights."""

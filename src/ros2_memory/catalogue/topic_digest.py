@@ -7,6 +7,7 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
+from ros2_memory.analysis.field_ranges import FieldRangesBuilder
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
 from ros2_memory.analysis.motion.trajectory import PoseCollector
@@ -16,9 +17,10 @@ from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.analysis.field_ranges import FieldRange
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import State, TopicEvents
@@ -61,6 +63,7 @@ class TopicDigest:
         events: on the topic; None where no message can be decoded.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
+        fields: the range of each field with numbers; None where they are not known.
         undecodable: by type, why none of its messages can be decoded; mostly empty.
     """
 
@@ -71,6 +74,7 @@ class TopicDigest:
     events: TopicEvents | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
+    fields: Mapping[str, FieldRange] | None = None
     undecodable: tuple[tuple[str, str], ...] = ()
 
 
@@ -117,6 +121,7 @@ class TopicCollector:
         self._extractor = extractor
         self._latched = latched
         self._zone_map = ZoneMapBuilder()
+        self._fields = FieldRangesBuilder()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
         self._standstills = StandstillCollector()
         self._events = TopicEventsBuilder()
@@ -149,6 +154,7 @@ class TopicCollector:
             events=self._events.events(MAX_PER_BAG),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
+            fields=self._fields.ranges(),
             undecodable=tuple(undecodable.items()),
         )
 
@@ -183,6 +189,7 @@ class TopicCollector:
         for record, sample in zip(batch, self._decoder.decode(batch), strict=True):
             if isinstance(sample, UndecodableError):
                 self._zone_map.give_up()
+                self._fields.give_up()
                 self._pairs = self._poses = None
                 self._events.add_undecodable()
                 continue
@@ -215,6 +222,7 @@ class TopicCollector:
         message = self._reader.decode(record)
         value = self._extractor.exact(message, type_name)
         self._zone_map.add(value)
+        self._fields.add(value)
         if self._pairs is not None or self._map_transforms:
             self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
@@ -241,6 +249,7 @@ class TopicCollector:
         self, template: PayloadTemplate, first: _Sample, records: Sequence[Record], rows: Bytes
     ) -> Iterable[_Sample]:
         self._zone_map.add_rows(template, rows)
+        self._fields.add_rows(template, rows)
         if self._map is not None and self._map_transforms:
             self._map.add_rows(template, records, rows)
         return map(

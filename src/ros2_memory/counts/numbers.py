@@ -10,10 +10,10 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
+from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.view import open_span
-from ros2_memory.insights.field_extremes import numbers_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -23,34 +23,15 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
+    from ros2_memory.counts.field_numbers import FieldNumbers, Numbers, NumberTable
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.results import BinColumn, Bins
 
     Times: TypeAlias = NDArray[np.int64]
 
-MOST_READ: Final = 4_000
-"""Messages that are read; where there are more, as many evenly spaced ones."""
-
-
-class _Numbers:
-    """The numbers of one field in one bin."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.sums: list[float] = []
-        self.least = (math.inf, 0)
-        self.most = (-math.inf, 0)
-
-    def add(self, at: Ns, numbers: Sequence[float]) -> None:
-        """Adds the numbers of the next message; of equal ones the first counts."""
-        self.count += len(numbers)
-        self.sums.append(math.fsum(numbers))
-        low, high = min(numbers), max(numbers)
-        if low < self.least[0]:
-            self.least = (low, at)
-        if high > self.most[0]:
-            self.most = (high, at)
+_MEAN_DIGITS: Final = 12
+"""What rounding of sums cannot change, however a window is cut into bags."""
 
 
 def count_range(
@@ -127,41 +108,94 @@ def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times
 
 
 def _add_numbers(view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]) -> None:
-    bins = range(len(binned.bins.names))
-    cells = {field: [_Numbers() for _ in (*bins, "all")] for field in fields}
-    total, chosen = view.pick(topic, binned.asked, MOST_READ)
-    if len(chosen) < total:
-        view.notes.add(
-            f"min, max and mean are of {len(chosen)} of {total} messages, evenly spaced over the "
-            "window: ask about a shorter one for all"
+    reader = FieldReader(view, topic, fields)
+    folded = reader.over(binned.asked, binned.bins.edges[1:-1].tolist())
+    binned.note_since(folded.since)
+    if reader.failures:
+        view.notes.complete = False
+        reason = reader.failures[0].reason
+        view.notes.add(f"messages left out, since they cannot be decoded: {reason}")
+    firsts = [at for part in folded.parts for at in part.first]
+    among = binned.bins.among(firsts)
+    rows = [np.flatnonzero(each) for each in (*among.T, np.ones(len(firsts), np.bool_))]
+    extremes = _Extremes(reader, folded.parts)
+    for at, field in enumerate(fields):
+        _add_columns(binned, field, [extremes.cell(at, each.tolist()) for each in rows])
+
+
+class _Cell:
+    """The numbers of one field in one bin: the mean, and least and greatest with their times."""
+
+    def __init__(self, mean: float, least: tuple[float, Ns], most: tuple[float, Ns]) -> None:
+        self.mean, self.least, self.most = mean, least, most
+
+
+class _Extremes:
+    """Finds the least and the greatest number of many short times, and reads only what it must."""
+
+    def __init__(self, reader: FieldReader, parts: Sequence[NumberTable]) -> None:
+        self._reader = reader
+        self._first = [at for part in parts for at in part.first]
+        self._last = [at for part in parts for at in part.last]
+        self._numbers = [each for part in parts for each in part.numbers]
+        self._read: dict[int, Numbers | None] = {}
+
+    def cell(self, field: int, rows: Sequence[int]) -> _Cell | None:
+        """Returns the numbers of a field in some of the times; None where there are none."""
+        some = [row for row in rows if self._numbers[row][field].size]
+        count = sum(self._numbers[row][field].size for row in some)
+        if not count:
+            return None
+        total = math.fsum(self._numbers[row][field].total for row in some)
+        least = self._furthest(field, some, 1)
+        most = self._furthest(field, some, -1)
+        # Plus 0.0: digests do not know -0.0.
+        mean = float(f"{total / count:.{_MEAN_DIGITS}g}")
+        return _Cell(mean, (least[0] + 0.0, least[1]), (0.0 - most[0], most[1]))
+
+    def _furthest(self, field: int, rows: Sequence[int], sign: int) -> tuple[float, Ns]:
+        """Returns the least number times `sign`, and when it was first."""
+        bounds = sorted(
+            (_end(self._numbers[row][field], sign)[0], self._first[row], row) for row in rows
         )
-    for each in chosen:
-        message = view.bags.decode(each)
-        if message is None:
-            continue
-        [among] = binned.bins.among([each.time])
-        for field in fields:
-            value = view.memory.extractor.exact_at(message, each.record.channel.type, field)
-            numbers = [*numbers_in(value)]
-            if numbers:
-                for number in (*np.flatnonzero(among).tolist(), -1):
-                    cells[field][number].add(each.time, numbers)
-    for field in fields:
-        _add_columns(binned, field, cells[field])
+        best = (math.inf, 0)
+        for bound, first, row in bounds:
+            if (bound, first) > best:
+                break
+            number, at = _end(self._exact(field, row, sign), sign)
+            if at is not None:
+                best = min(best, (number, at))
+        return best
+
+    def _exact(self, field: int, row: int, sign: int) -> FieldNumbers:
+        """Returns the numbers of a time, read where the catalogue has bounds alone."""
+        known = self._numbers[row][field]
+        if _end(known, sign)[1] is not None:
+            return known
+        if row not in self._read:
+            self._read[row] = self._reader.between(self._first[row], self._last[row])
+        read = self._read[row]
+        return known if read is None else read[field]
 
 
-def _add_columns(binned: BinnedWindow, field: str, cells: Sequence[_Numbers]) -> None:
+def _end(numbers: FieldNumbers, sign: int) -> tuple[float, Ns | None]:
+    if sign > 0:
+        return numbers.low, numbers.low_at
+    return -numbers.high, numbers.high_at
+
+
+def _add_columns(binned: BinnedWindow, field: str, cells: Sequence[_Cell | None]) -> None:
     """Adds the columns of a field; the last cell is that of all bins together."""
-    if not cells[-1].count:
+    if cells[-1] is None:
         binned.view.notes.add(f"{field} holds no number in the window")
         return
-    columns: tuple[tuple[str, BinColumn, Callable[[_Numbers], float]], ...] = (
+    columns: tuple[tuple[str, BinColumn, Callable[[_Cell], float]], ...] = (
         ("min", "number", lambda cell: cell.least[0]),
         ("min_at", "time", lambda cell: cell.least[1]),
         ("max", "number", lambda cell: cell.most[0]),
         ("max_at", "time", lambda cell: cell.most[1]),
-        ("mean", "number", lambda cell: math.fsum(cell.sums) / cell.count),
+        ("mean", "number", lambda cell: cell.mean),
     )
     for name, kind, of in columns:
-        *each, whole = [of(cell) if cell.count else None for cell in cells]
+        *each, whole = [None if cell is None else of(cell) for cell in cells]
         binned.add(f"{field}.{name}", kind, each, whole)

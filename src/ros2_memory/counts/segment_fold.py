@@ -32,9 +32,7 @@ R = TypeVar("R")
 
 READING_S: Final = 4.0
 """How long bags without a digest are read before the answer is partial."""
-_SHORT_NS: Final[Ns] = 300 * NS_PER_S
-"""A longer group that lies in several pieces is read, since its digest does not show what is in
-which."""
+_CUT_NS: Final[Ns] = 300 * NS_PER_S
 
 
 class Digested(NamedTuple, Generic[T]):
@@ -62,7 +60,9 @@ class SegmentFold(Generic[T, R]):
         collect: makes a digest of messages, if they amount to one; with their times.
         reduce: joins digests in order; called with one at least.
         name: of what `reduce` returns; another one for everything that it depends on.
-        edges: times at which long groups are cut, since `reduce` needs to know what is where.
+        edges: times at which groups are cut, since `reduce` needs to know what is where.
+        cut_ns: how long a group is cut at least: it is read, since a digest does not show what of
+            it is where.
         failures: where `collect` puts messages that cannot be decoded.
         leaves_out: whether a digest lacks something, since there is too much of it.
         collect_all: makes one that lacks nothing, which is not stored.
@@ -73,6 +73,7 @@ class SegmentFold(Generic[T, R]):
     reduce: Callable[[Sequence[Digested[T]]], R]
     name: str
     edges: Sequence[Ns] = ()
+    cut_ns: Ns = _CUT_NS
     failures: Sequence[UndecodableError] = ()
     leaves_out: Callable[[T], bool] | None = None
     collect_all: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]] | None = None
@@ -168,7 +169,7 @@ class SegmentFold(Generic[T, R]):
     def _is_cut(self, group: Group) -> bool:
         first = min(each.first for each in group.bags)
         last = max(each.last for each in group.bags)
-        return last - first > _SHORT_NS and self._piece(first) != self._piece(last)
+        return last - first > self.cut_ns and self._piece(first) != self._piece(last)
 
     def _piece(self, at: Ns) -> int:
         return bisect_right(self.edges, at)

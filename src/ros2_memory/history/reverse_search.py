@@ -11,6 +11,7 @@ import heapq
 from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.analysis.conditions import parse_condition, refusal_for
+from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
@@ -288,6 +289,10 @@ class CandidateBags:
         place = self._condition.place
         if place is not None:
             return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
+        bounds = self._condition.bounds
+        if bounds is not None and self._condition.field is not None:
+            field = field_named(self._condition.field)
+            return digests.field_bounds(topic, field).between(*bounds)
         maps = digests.zone_maps(topic)
         return {number for number, each in maps.items() if self._condition.can_match(each)}
 

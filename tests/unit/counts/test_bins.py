@@ -236,7 +236,12 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
             ("find_matches", {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}),
             ("find_matches", {"topic": "/bumper", "condition_type": "equals", "value": True}),
             ("trajectory_summary", {}),
-            ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"]}),
+            ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x", "position.z"]}),
+            ("get_topic_in_range", {"topic": OBJECTS, "fields": ["objects.score"]}),
+            (
+                "get_topic_in_range",
+                {"topic": "/battery_state", "fields": ["percentage", "voltage"]},
+            ),
         ]
         for name, question in questions:
             given_ = {**question, "start": start, "end": end, "by": by}

@@ -1,0 +1,180 @@
+"""What numbers the fields of a topic held: how many, between which bounds, and their sum.
+
+A field is a dot-path in the extracted value. Over a list it goes on in every element, so
+`detections.score` holds the scores of all detections; indices and keys that look like one are no
+part of it. Ranges never leave out a number, so they rule conditions out; where they are exact they
+answer what the mean is, and which bags have to be read for the least number of many.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.core.model import JsonValue
+
+MAX_FIELDS: Final = 48
+"""Fields of one topic of which ranges are kept; where there are more, none are."""
+_SUMMARY: Final = frozenset({"bytes", "numbers"})
+"""The keys of a summary in place of numbers that are too many to show."""
+
+
+class FieldRange(NamedTuple):
+    """The numbers of one field in some messages.
+
+    Attributes:
+        low: none is less.
+        high: none is greater.
+        size: how many there are; None where only the bounds are known.
+        total: their sum; 0 where only the bounds are known.
+        each: how many every single message has; 0 where that differs, or is not known.
+    """
+
+    low: float
+    high: float
+    size: int | None = None
+    total: float = 0.0
+    each: int = 0
+
+
+ANYTHING: Final = FieldRange(-math.inf, math.inf)
+
+
+@dataclass(slots=True)
+class _Numbers:
+    low: float = math.inf
+    high: float = -math.inf
+    count: int = 0
+    parts: list[float] = field(default_factory=list)
+    each: int = 0
+    messages: int = 0
+    bounded_only: bool = False
+
+    def add(self, low: float, high: float, total: float, count: int, messages: int) -> None:
+        """Adds the numbers of some messages, each of which has equally many."""
+        self.low, self.high = min(self.low, low), max(self.high, high)
+        if not math.isfinite(total):
+            self.bounded_only = True
+            return
+        each = count // messages
+        self.each = each if self.messages == 0 or self.each == each else 0
+        self.count += count
+        self.messages += messages
+        self.parts.append(total)
+
+    def range(self, messages: int) -> FieldRange:
+        if self.bounded_only or not math.isfinite(total := math.fsum(self.parts)):
+            return FieldRange(self.low, self.high)
+        each = self.each if self.messages == messages else 0
+        return FieldRange(self.low, self.high, self.count, total, each)
+
+
+class FieldRangesBuilder:
+    """Takes extracted values, and keeps the range of each field."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, _Numbers] | None = {}
+        self._messages = 0
+
+    def give_up(self) -> None:
+        """Takes a message whose value is not known: no field is known any more."""
+        self._found = None
+
+    def add(self, value: JsonValue) -> None:
+        """Takes the exact value of one message."""
+        if self._found is None:
+            return
+        numbers: dict[str, list[float]] = {}
+        for path, number in numbers_by_field(value):
+            numbers.setdefault(path, []).append(number)
+        self._messages += 1
+        for path, some in numbers.items():
+            self._add(path, np.array(some, np.float64), 1)
+
+    def add_rows(self, template: PayloadTemplate, rows: Bytes) -> None:
+        """Takes many messages of a template, the first of which was added as a value."""
+        if self._found is None or not len(rows):
+            return
+        messages = len(rows)
+        self._messages += messages
+        for path, offsets in template.fields:
+            self._add(path, template.block(rows, offsets), messages)
+        for path, constant in template.constants:
+            count, total = len(constant) * messages, math.fsum(constant) * messages
+            self._numbers(path).add(min(constant), max(constant), total, count, messages)
+        for path in template.computed:
+            numbers = self._numbers(path)
+            numbers.low, numbers.high, numbers.bounded_only = -math.inf, math.inf, True
+
+    def ranges(self) -> dict[str, FieldRange] | None:
+        """Returns the range of each field that has a number; None where they are not known."""
+        if self._found is None:
+            return None
+        return {
+            path: self._found[path].range(self._messages)
+            for path in sorted(self._found)
+            if self._found[path].low <= self._found[path].high
+        }
+
+    def _numbers(self, path: str) -> _Numbers:
+        found = self._found if self._found is not None else {}
+        if path not in found:
+            found[path] = _Numbers()
+            if len(found) > MAX_FIELDS:
+                self._found = None
+        return found[path]
+
+    def _add(
+        self, path: str, numbers: np.ndarray[tuple[int, ...], np.dtype[np.float64]], messages: int
+    ) -> None:
+        with np.errstate(invalid="ignore", over="ignore"):
+            total = float(numbers.sum())
+        if math.isfinite(total):
+            low, high = float(numbers.min()), float(numbers.max())
+            self._numbers(path).add(low, high, total, numbers.size, messages)
+            return
+        rest = numbers[~np.isnan(numbers)]
+        if rest.size:
+            found = self._numbers(path)
+            found.add(float(rest.min()), float(rest.max()), math.nan, 0, messages)
+        elif path in (self._found or {}):
+            self._numbers(path).bounded_only = True
+
+
+def numbers_by_field(value: JsonValue, path: str = "") -> Iterator[tuple[str, float]]:
+    """Yields the field and the value of each number, rounded to a float; NaN too."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from numbers_by_field(inner, joined(path, name))
+    elif isinstance(value, list):
+        for inner in value:
+            yield from numbers_by_field(inner, path)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            yield path, float(value)
+        except OverflowError:  # JSON may hold whole numbers of any length
+            yield path, math.inf if value > 0 else -math.inf
+
+
+def joined(path: str, name: str) -> str:
+    """Returns the dot-path of a key below another."""
+    if _is_index(name):
+        return path
+    plain = name.replace(".", "\0")  # no dot-path leads there
+    return f"{path}.{plain}" if path else plain
+
+
+def field_named(dot_path: str) -> str:
+    """Returns the field whose numbers a dot-path leads to, or that it leads into."""
+    return ".".join(each for each in dot_path.split(".") if not _is_index(each))
+
+
+def _is_index(name: str) -> bool:
+    return name.removeprefix("-").isdecimal()

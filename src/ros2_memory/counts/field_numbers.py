@@ -1,0 +1,221 @@
+"""The numbers of fields of a topic in a window: how many, their sum, the least and the greatest.
+
+Whole bags count by their digests, which know the sum exactly and bounds that nothing exceeds. The
+least number of many bags, and when it was, is in one of the few whose bound is as low: these are
+read.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from itertools import islice
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.analysis.bulk_decode import BulkDecoder, template_for
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.counts.segment_fold import SegmentFold
+from ros2_memory.history.bag_groups import DigestKind
+from ros2_memory.insights.field_extremes import numbers_in
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.counts.segment_fold import Digested, Folded
+    from ros2_memory.history.bag_groups import Span
+    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.view import View
+    from ros2_memory.storage.base import Record
+
+Floats: TypeAlias = "NDArray[np.float64]"
+_Sample: TypeAlias = tuple[list[float], ...]
+"""The numbers of each field in one message."""
+
+_MOST_AT_ONCE: Final = 1024
+
+
+class FieldNumbers(NamedTuple):
+    """The numbers of one field in some messages.
+
+    Attributes:
+        size: how many.
+        total: their sum.
+        low: the least; where `low_at` is None, only a bound.
+        low_at: when it was first.
+        high: the greatest; where `high_at` is None, only a bound.
+        high_at: when it was first.
+    """
+
+    size: int
+    total: float
+    low: float = math.inf
+    low_at: Ns | None = None
+    high: float = -math.inf
+    high_at: Ns | None = None
+
+
+Numbers: TypeAlias = tuple[FieldNumbers, ...]
+"""Of each field that is asked for."""
+
+
+class NumberTable(NamedTuple):
+    """The numbers of each field in many short times, in order.
+
+    Attributes:
+        first: log times of the first message of each time.
+        last: of the last.
+        numbers: of each time those of each field.
+    """
+
+    first: list[Ns]
+    last: list[Ns]
+    numbers: list[Numbers]
+
+
+class FieldReader:
+    """Reads the numbers of some fields (dot-paths) of a topic.
+
+    Attributes:
+        failures: of messages that cannot be decoded.
+    """
+
+    def __init__(self, view: View, topic: str, fields: Sequence[str]) -> None:
+        self._view = view
+        self._topic = topic
+        self._fields = tuple(fields)
+        self.failures: list[UndecodableError] = []
+        self._decoder = BulkDecoder(self._decode, self._template, self._apply)
+
+    def over(self, window: TimeWindow, edges: Sequence[Ns]) -> Folded[NumberTable]:
+        """Returns the numbers in a window, of times that no edge cuts.
+
+        Raises:
+            QueryTimeoutError: the call's time is over before anything is known.
+        """
+        kind = DigestKind(f"numbers {json.dumps(self._fields)}", self._look_up, _encoded, _decoded)
+        fold = SegmentFold(
+            kind,
+            self.numbers,
+            _table,
+            name=kind.name,
+            edges=edges,
+            cut_ns=0,
+            failures=self.failures,
+        )
+        return fold.over(self._view, self._topic, window)
+
+    def between(self, first: Ns, last: Ns) -> Numbers | None:
+        """Returns the numbers between two log times (inclusive); None without a message."""
+        messages = self._view.stream.messages([self._topic], TimeWindow(first, last + 1))
+        return self.numbers(messages)[0]
+
+    def numbers(self, messages: Iterable[StoredMessage]) -> tuple[Numbers | None, Span | None]:
+        """Returns the numbers of messages in order, and the first and the last of their times."""
+        times: list[Ns] = []
+        samples: list[_Sample] = []
+        rest = iter(messages)
+        while some := list(islice(rest, _MOST_AT_ONCE)):
+            decoded = self._decoder.decode([each.record for each in some])
+            for found, sample in zip(some, decoded, strict=True):
+                if isinstance(sample, UndecodableError):
+                    self.failures.append(sample)
+                else:
+                    times.append(found.time)
+                    samples.append(sample)
+        if not times:
+            return None, None
+        fields = range(len(self._fields))
+        numbers = tuple(_numbers(times, [each[at] for each in samples]) for at in fields)
+        return numbers, (times[0], times[-1])
+
+    def _decode(self, record: Record) -> _Sample:
+        message = self._view.memory.reader.decode(record)
+        at = partial(self._view.memory.extractor.exact_at, message, record.channel.type)
+        return tuple([*numbers_in(at(field))] for field in self._fields)
+
+    def _template(self, record: Record) -> PayloadTemplate | None:
+        """Returns the template of a message, where it has all fields."""
+        template = template_for(self._view.memory.reader, self._view.memory.extractor, record)
+        if template is None or not {*self._fields} <= {path for path, _ in template.fields}:
+            return None
+        return template
+
+    def _apply(
+        self, template: PayloadTemplate, _: _Sample, _records: Sequence[Record], rows: Bytes
+    ) -> Iterator[_Sample]:
+        offsets = dict(template.fields)
+        blocks = [template.block(rows, offsets[field]) for field in self._fields]
+        if all(np.isfinite(each).all() for each in blocks):
+            return zip(*(each.tolist() for each in blocks), strict=True)
+        found = (
+            [[each for each in row if math.isfinite(each)] for row in block.tolist()]
+            for block in blocks
+        )
+        return zip(*found, strict=True)
+
+    def _look_up(
+        self, digests: SegmentDigests, topic: str, among: Sequence[int]
+    ) -> Mapping[int, Numbers]:
+        """Returns the numbers of bags whose digests have the sums of all fields."""
+        columns = [digests.catalogue.field_column(topic, field, among) for field in self._fields]
+        found: dict[int, list[FieldNumbers]] = {}
+        for column in columns:
+            known = (column.size >= 0) & np.isfinite(column.total)
+            rows = zip(*(each[known].tolist() for each in column), strict=True)
+            for number, low, high, count, total, each in rows:
+                # Of one number in every message the first message is the first that has it.
+                exact = low == high and each > 0
+                one = (
+                    FieldNumbers(count, total, low, _AT_FIRST, high, _AT_FIRST)
+                    if exact
+                    else FieldNumbers(count, total, low, None, high, None)
+                )
+                found.setdefault(number, []).append(one)
+        whole = len(self._fields)
+        return {number: tuple(each) for number, each in found.items() if len(each) == whole}
+
+
+_AT_FIRST: Final[Ns] = -1
+"""Stands for the time of the first message."""
+
+
+def _numbers(times: Sequence[Ns], samples: Sequence[Sequence[float]]) -> FieldNumbers:
+    """Returns the numbers of one field, of which each message has some."""
+    count = sum(map(len, samples))
+    if not count:
+        return FieldNumbers(0, 0.0)
+    low, low_at = min((min(some), at) for some, at in zip(samples, times, strict=True) if some)
+    high, later = max((max(some), -at) for some, at in zip(samples, times, strict=True) if some)
+    total = math.fsum(number for some in samples for number in some)
+    return FieldNumbers(count, total, low, low_at, high, -later)
+
+
+def _table(found: Sequence[Digested[Numbers]]) -> NumberTable:
+    table = NumberTable([], [], [])
+    for numbers, first, last in found:
+        table.first.append(first)
+        table.last.append(last)
+        table.numbers.append(
+            tuple(
+                each._replace(low_at=first, high_at=first) if each.low_at == _AT_FIRST else each
+                for each in numbers
+            )
+        )
+    return table
+
+
+def _encoded(numbers: Numbers) -> bytes:
+    return json.dumps(numbers).encode()
+
+
+def _decoded(text: bytes) -> Numbers:
+    return tuple(FieldNumbers(*each) for each in json.loads(text))
