@@ -346,7 +346,7 @@ class Event:
     """Something that happened at `start`, and went on until `end` where it took time.
 
     With `goes_on`, `end` is only as far as is known. `before`: what changed before, nearest first.
-    `place`: the named place that the robot was in.
+    `place`: the named place that the robot was in. `score`: the best one of a thing in view.
     """
 
     kind: str
@@ -356,6 +356,7 @@ class Event:
     goes_on: bool = False
     before: tuple[PastChange, ...] = ()
     place: str | None = None
+    score: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ farther apart than `USUAL_PERIODS` times their mean distance, or `SHORT_NS`.
 
 from __future__ import annotations
 
-from itertools import pairwise
+import math
+from itertools import pairwise, repeat
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -39,21 +40,29 @@ ROW: Final = np.dtype(
         ("ends", "u1"),
         ("count", "<u4"),
         ("longest", "<i8"),
+        ("best", "<i4"),
     ]
 )
 """A row of an `IntervalTable`."""
 Rows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
 
+_NO_SCORE: Final = -(2**31)
+_SCORES: Final = 10_000
+"""What scores are multiplied with, and rounded."""
 _FROM_START: Final = 1
 _TO_END: Final = 2
 
 
 class VisibleInterval(NamedTuple):
-    """An object in view: log times of the first and last message that contain it (inclusive)."""
+    """An object in view: log times of the first and last message that contain it (inclusive).
+
+    `best` is the highest score among its detections; None where none has one.
+    """
 
     label: str
     first: Ns
     last: Ns
+    best: float | None = None
 
 
 class IntervalTable(NamedTuple):
@@ -64,8 +73,8 @@ class IntervalTable(NamedTuple):
     Attributes:
         labels: the labels, sorted.
         rows: of each interval its first and last time, the index of its label, whether the first
-            and the last message of all contain it, how many messages do, and the longest time
-            between two of these.
+            and the last message of all contain it, how many messages do, the longest time between
+            two of these, and its best score.
     """
 
     labels: tuple[str, ...] = ()
@@ -87,7 +96,10 @@ class IntervalTable(NamedTuple):
         """Returns each of them."""
         rows = _rows(self.rows).tolist()
         return tuple(
-            VisibleInterval(self.labels[label], first, last) for first, last, label, *_ in rows
+            VisibleInterval(
+                self.labels[label], first, last, None if best == _NO_SCORE else best / _SCORES
+            )
+            for first, last, label, *_, best in rows
         )
 
     def most_lasting(self, at_most: int) -> IntervalTable:
@@ -122,6 +134,12 @@ class IntervalTable(NamedTuple):
             return self
         rows = _rows(self.rows)
         return IntervalTable(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
+
+    def scoring(self, least: float) -> IntervalTable:
+        """Returns the intervals with a best score of so much at least, or without any."""
+        best = _rows(self.rows)["best"]
+        chosen = (best == _NO_SCORE) | (best >= _stored_score(least))
+        return IntervalTable(self.labels, _rows(self.rows)[chosen].tobytes())
 
     def during(self, spans: Iterable[tuple[Ns, Ns]]) -> IntervalTable:
         """Returns the intervals some of which is in one of these times (inclusive)."""
@@ -170,26 +188,27 @@ class IntervalBuilder:
         self._open: dict[str, _Open] = {}
         self._over: list[tuple[str, _Open]] = []
 
-    def add(self, time: Ns, labels: Iterable[str]) -> None:
-        """Takes the next message, with the labels in it."""
+    def add(self, time: Ns, labels: Sequence[str], scores: Sequence[float | None] = ()) -> None:
+        """Takes the next message, with the labels in it, and their scores where there are any."""
         if self._first is None:
             self._first = time
         elif time - self._last > SILENCE_NS:
             self._nth += 1  # as if an empty message came between
         self._nth += 1
         self._last = time
-        for label in labels:
+        for label, score in zip(labels, scores or repeat(None)):  # noqa: B905 - no scores
+            best = _stored_score(score)
             known = self._open.get(label)
             if known is None:
-                self._open[label] = _Open(time, self._nth)
+                self._open[label] = _Open(time, self._nth, best)
             elif known.nth >= self._nth - 1 or time - known.last <= FLICKER_NS:
-                known.add(time, self._nth)
+                known.add(time, self._nth, best)
             else:
                 if len(self._over) < self._at_most:
                     self._over.append((label, known))
                 else:
                     self.left_out += 1
-                self._open[label] = _Open(time, self._nth)
+                self._open[label] = _Open(time, self._nth, best)
 
     def part(self) -> IntervalPart | None:
         """Returns what was visible so far; None without a message."""
@@ -207,6 +226,7 @@ class IntervalBuilder:
                 (each.began == 1) * _FROM_START | (each.nth == self._nth) * _TO_END,
                 each.count,
                 each.longest,
+                each.best,
             )
             for label, each in every
         ]
@@ -218,18 +238,28 @@ class IntervalBuilder:
 class _Open:
     """An interval that may go on; `began` and `nth` number its first and last message."""
 
-    __slots__ = ("began", "count", "first", "last", "longest", "nth")
+    __slots__ = ("began", "best", "count", "first", "last", "longest", "nth")
 
-    def __init__(self, time: Ns, nth: int) -> None:
+    def __init__(self, time: Ns, nth: int, best: int) -> None:
         self.first = self.last = time
         self.began = self.nth = nth
         self.count = 1
         self.longest = 0
+        self.best = best
 
-    def add(self, time: Ns, nth: int) -> None:
+    def add(self, time: Ns, nth: int, best: int) -> None:
+        self.best = max(self.best, best)
         self.longest = max(self.longest, time - self.last)
         self.last, self.nth = time, nth
         self.count += 1
+
+
+def _stored_score(score: float | None) -> int:
+    if score is None or math.isnan(score):
+        return _NO_SCORE
+    # The least number stands for no score.
+    most = -_NO_SCORE - 1
+    return round(min(max(score * _SCORES, -most), most))
 
 
 def joined(parts: Sequence[IntervalPart]) -> IntervalPart:
@@ -266,6 +296,7 @@ def _merged(tables: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Inter
     # Times below may be as far apart as any two can be: only those of one interval are subtracted.
     pauses = np.append(0, np.where(goes_on, np.maximum(first[1:] - reach[:-1], 0), 0))
     found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
+    found["best"] = np.maximum.reduceat(rows["best"], begins)
     found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
     found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(tables) - 1)
     return IntervalTable(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())

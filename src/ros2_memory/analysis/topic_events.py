@@ -57,7 +57,7 @@ class State(NamedTuple):
     """What one message states: labels of objects, booleans by dot-path, errors as sentences.
 
     `beyond` is how many more labels and booleans it has; `levels` and `reports` are those of
-    `state_changes`.
+    `state_changes`. `scores` has the best one of each label, or is empty where none has one.
     """
 
     labels: tuple[str, ...] = ()
@@ -66,6 +66,7 @@ class State(NamedTuple):
     beyond: int = 0
     levels: tuple[StateLevel, ...] = ()
     reports: tuple[str, ...] = ()
+    scores: tuple[float | None, ...] = ()
 
     @property
     def is_empty(self) -> bool:
@@ -159,12 +160,26 @@ def state_of(value: JsonValue, type_name: str) -> State:
         reports = reports_of(value, type_name)
         state = State(errors=errors, levels=levels, reports=reports)
         return EMPTY_STATE if state.is_empty else state
-    labels = tuple(dict.fromkeys(detection.label for detection in detections_of(value)))
+    best = _best_scores(value)
+    labels = tuple(best)
     flags = tuple(_flags_in(value, ""))
     if not (labels or flags or levels):
         return EMPTY_STATE
     beyond = len(labels[MAX_LABELS:]) + len(flags[MAX_FLAGS:])
-    return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond, levels)
+    scores = tuple(best.values())[:MAX_LABELS]
+    if all(score is None for score in scores):
+        scores = ()
+    return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond, levels, scores=scores)
+
+
+def _best_scores(value: JsonValue) -> dict[str, float | None]:
+    """Returns the labels that a message has, in order, with the best score of each."""
+    best: dict[str, float | None] = {}
+    for each in detections_of(value):
+        known = best.get(each.label)
+        if known is None or (each.score is not None and each.score > known):
+            best[each.label] = each.score
+    return best
 
 
 class TopicEventsBuilder:
@@ -190,7 +205,7 @@ class TopicEventsBuilder:
         """Takes the next message."""
         if self._builder is None:
             self._builder = IntervalBuilder(MAX_SEEN)
-        self._builder.add(time, state.labels)
+        self._builder.add(time, state.labels, state.scores)
         self._beyond = max(self._beyond, state.beyond)
         for path, value in state.flags:
             self._add_flag(KnownFlag(path, time, value, value))

@@ -23,6 +23,7 @@ from ros2_memory.analysis.motion.odometry import (
     TimedPosition,
 )
 from ros2_memory.analysis.motion.path_length import Creep, End
+from ros2_memory.analysis.motion.speed_drops import SpeedDrop, SpeedDropDigest
 from ros2_memory.analysis.motion.standstills import ChainDigest, StandstillDigest
 from ros2_memory.analysis.state_changes import (
     NO_CHANGES,
@@ -83,9 +84,11 @@ def decode_poses(packed: bytes) -> PoseDigest:
 def encode_standstills(digest: StandstillDigest) -> bytes:
     """Encodes a digest of standstills."""
     chains = [[each.start, each.end, len(each.blocks)] for each in digest.chains]
-    head, tail = digest.head, digest.tail
-    sizes = json.dumps([len(head), digest.head_until, len(tail), digest.tail_since, chains])
-    parts = (sizes.encode(), b"\n", head, tail, *(each.blocks for each in digest.chains))
+    head, tail, slowed = digest.head, digest.tail, digest.drops
+    drops = [len(slowed.head), len(slowed.tail), slowed.drops]
+    sizes = json.dumps([len(head), digest.head_until, len(tail), digest.tail_since, chains, drops])
+    blocks = (each.blocks for each in digest.chains)
+    parts = (sizes.encode(), b"\n", head, tail, *blocks, slowed.head, slowed.tail)
     return zlib.compress(b"".join(parts))
 
 
@@ -97,18 +100,25 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     """
     try:
         sizes, _, body = zlib.decompress(packed).partition(b"\n")
-        head, head_until, tail, tail_since, chains = json.loads(sizes)
+        head, head_until, tail, tail_since, chains, drops = json.loads(sizes)
         at = head + tail
         unpacked = []
         for start, end, size in chains:
             unpacked.append(ChainDigest(start, end, body[at : at + size]))
             at += size
+        first, last, found = drops
+        slowed = SpeedDropDigest(
+            body[at : at + first],
+            body[at + first : at + first + last],
+            tuple(SpeedDrop(*each) for each in found),
+        )
+        at += first + last
     except (TypeError, zlib.error) as error:
         raise ValueError(f"not a digest of standstills: {error}") from error
     if at != len(body):
         raise ValueError("not a digest of standstills: some of it is missing")
     return StandstillDigest(
-        body[:head], head_until, body[head : head + tail], tail_since, tuple(unpacked)
+        body[:head], head_until, body[head : head + tail], tail_since, tuple(unpacked), slowed
     )
 
 

@@ -202,7 +202,7 @@ class TopicCollector:
             elif self._poses is not None:
                 self._poses.add(record.log_time, pose, sample.speed_mps)
                 if is_place(pose.position):
-                    self._standstills.add(record.log_time, pose.position)
+                    self._standstills.add(record.log_time, pose.position, pose.orientation)
 
     def _add_to_map(self, to: MapCollector, record: Record, sample: _Sample) -> None:
         if self._map_poses and sample.pose is not None:
@@ -238,8 +238,12 @@ class TopicCollector:
                 self._pairs = None
 
     def _template(self, record: Record) -> PayloadTemplate | None:
+        message = self._reader.decode(record)
+        value = self._extractor.exact(message, record.channel.type)
+        if state_of(value, record.channel.type).scores:
+            return None  # they differ from message to message
         template = template_for(self._reader, self._extractor, record)
-        valid = self._transforms(self._reader.decode(record), record)
+        valid = self._transforms(message, record)
         # A transform that is invalid in this message may be valid in others of the template.
         if template is None or template.pairs != {(each.parent, each.child) for each in valid}:
             return None

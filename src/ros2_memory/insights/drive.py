@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.speed_drops import SLOT_NS
 from ros2_memory.analysis.motion.standstills import (
     CONTEXT_NS,
     CREEP_MPS,
@@ -19,6 +21,7 @@ from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    NS_PER_S,
     START_SLACK_NS,
     ns_from_unix,
     unix_from_ns,
@@ -31,6 +34,7 @@ from ros2_memory.history.robots import note_robots
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow
@@ -41,12 +45,20 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 
+_BRAKING_NS: Final[Ns] = 4 * NS_PER_S
+"""A standstill that begins so soon after a loss of speed is what that led to."""
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """How the robot moved: its path, and its standstills with whether each goes on afterwards."""
+    """How the robot moved: its path, and its standstills with whether each goes on afterwards.
+
+    `drops` are sudden losses of speed that no standstill follows.
+    """
 
     path: DrivenPath | None = None
     standstills: tuple[tuple[Standstill, bool], ...] = ()
+    drops: tuple[SpeedDrop, ...] = ()
 
     @property
     def known(self) -> Trajectory | None:
@@ -85,13 +97,13 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         topic = resolve_pose_topic(view)
         path = driven_path(view, topic, window)
         note_robots(view, topic, window)
-        standstills = _standstills_in(view, topic, window)
+        standstills, drops = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"nothing is known of the way: {error}")
         return Drive()
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
-    return Drive(path, standstills)
+    return Drive(path, standstills, drops)
 
 
 _STANDSTILLS: Final = DigestKind(
@@ -104,8 +116,10 @@ _STANDSTILLS: Final = DigestKind(
 
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
-) -> tuple[tuple[Standstill, bool], ...]:
+) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
     """Returns where the poses of a topic stand still, in order, as far as it is in a window.
+
+    And where they lose speed suddenly without standing still next.
 
     With each comes whether it goes on after the window, or up to the last pose that is known.
 
@@ -125,7 +139,7 @@ def _standstills_in(
     ) -> Span | None:
         def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
             if is_place(pose.position):
-                to.add(time, pose.position)
+                to.add(time, pose.position, pose.orientation)
 
         return add_poses(view, add_place, decoder, messages, failures)
 
@@ -143,11 +157,20 @@ def _standstills_in(
         join=lambda digest, _span: builder.join(digest),
         failures=failures,
     ).over(view, topic, window.widened(CONTEXT_NS))
-    return tuple(
+    found = builder.standstills()
+    begins = [each.start for each in found]
+    standstills = tuple(
         (
             each._replace(start=max(each.start, start), end=min(each.end, end)),
             each.end > end or each.end == builder.last,
         )
-        for each in builder.standstills()
+        for each in found
         if each.start < end and each.end > start
     )
+    drops = tuple(
+        each
+        for each in builder.drops
+        if start <= each.time <= end
+        and bisect_left(begins, each.time - SLOT_NS) == bisect_left(begins, each.time + _BRAKING_NS)
+    )
+    return standstills, drops

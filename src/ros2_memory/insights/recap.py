@@ -74,11 +74,12 @@ _PLURALS: Final = {
     "error": "errors",
     "stop": "stops",
     "flip": "flips",
+    "drop": "speed drops",
     "thing": "sights of things",
 }
 """The kinds of events, the most important first, and the words for several of each."""
 _KINDS: Final = tuple(_PLURALS)
-_OF_ROBOT: Final = frozenset({"error", "stop", "flip"})
+_OF_ROBOT: Final = frozenset({"error", "stop", "flip", "drop"})
 """The kinds of which matters in which place the robot was."""
 
 
@@ -89,6 +90,7 @@ def recap_or_before(
     *,
     where: JsonValue = None,
     frame_id: str | None = None,
+    min_score: float | None = None,
 ) -> Recap | Before:
     """Returns what happened in a window, or what changed before a moment; see both.
 
@@ -100,7 +102,7 @@ def recap_or_before(
     if is_bounded + (span.last_s is not None) + (span.around_s is not None) > 1:
         raise InvalidArgumentsError("last_s, around, or start and end: give one of the three")
     if span.around_s is None:
-        return recap(memory, call, span, where=where, frame_id=frame_id)
+        return recap(memory, call, span, where=where, frame_id=frame_id, min_score=min_score)
     if where is not None:
         raise InvalidArgumentsError("where bounds a time, and around is a moment: give one of them")
     return before(memory, call, span.around_s, span.before_s, frame_id)
@@ -113,10 +115,12 @@ def recap(
     *,
     where: JsonValue = None,
     frame_id: str | None = None,
+    min_score: float | None = None,
 ) -> Recap:
     """Returns what happened in a window; with `where` only while the robot was in that region.
 
-    Places are in the map where transforms lead there at their time, or in `frame_id`.
+    Places are in the map where transforms lead there at their time, or in `frame_id`. Things in
+    view count where their best score is `min_score` or more, or where they have none.
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
@@ -131,8 +135,9 @@ def recap(
     there = None if region is None else _There(times_in_region(view, region, window))
     drive = drive_in(view, window)
     found = found_events(view, window)
-    reported, things, throughout = _topic_events(view, window, found, there)
-    events = [*_stops(drive, places), *reported]
+    least = memory.limits.min_score if min_score is None else min_score
+    reported, things, throughout = _topic_events(view, window, found, there, least)
+    events = [*_stops(drive, places), *_drops(drive), *reported]
     events += [
         Event("gap", begin, until, "nothing was recorded")
         for begin, until in recording_gaps(view, window)
@@ -258,6 +263,7 @@ def _topic_events(
     window: TimeWindow,
     found_of: Mapping[str, TopicEvents | None],
     there: _There | None,
+    min_score: float,
 ) -> tuple[list[Event], int, set[str]]:
     """Returns events that messages report, the number of things seen, and those seen throughout.
 
@@ -270,14 +276,20 @@ def _topic_events(
     visible: list[IntervalTable] = []
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
+    below = 0
     for topic, found in found_of.items():
         if found is None or found.is_empty:
             continue
+        seen = found.visible.scoring(min_score) if min_score else found.visible
+        below += found.visible.size - seen.size
         events += [*_flips(topic, found), *map(_error, _errors(view, topic, found, there))]
-        visible.append(found.visible)
-        throughout.update(found.visible.throughout(start, end))
-        last_seen |= dict.fromkeys(found.visible.at_end(found.last, known_to), found.last)
+        visible.append(seen)
+        throughout.update(seen.throughout(start, end))
+        last_seen |= dict.fromkeys(seen.at_end(found.last, known_to), found.last)
         _note_limits(view, topic, found)
+    if below:
+        sights = counted(below, "sight of a thing", "sights of things")
+        view.notes.add(f"{sights} left out: no score in it reaches min_score {min_score:g}")
     things = united(visible)
     if there is None:
         things = things.without(throughout)
@@ -291,6 +303,7 @@ def _topic_events(
             each.last,
             f"{each.label} in view",
             goes_on=each.last == last_seen.get(each.label),
+            score=each.best,
         )
         for each in things.longest(MOST_EVENTS)
     ]
@@ -319,6 +332,12 @@ def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:
             frame = "" if point else f" in {places.pose_frame}"
         # z: a rounded -0.00 reads as 0.00.
         yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}{frame}", goes_on)
+
+
+def _drops(drive: Drive) -> Iterator[Event]:
+    for time, before_mps, after_mps in drive.drops:
+        text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
+        yield Event("drop", time, None, text)
 
 
 def _errors(
@@ -371,10 +390,10 @@ def _error(error: ReportedError) -> Event:
 
 
 def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event]:
-    """Returns the events, and with each stop and toggle what changed before."""
+    """Returns the events, and with each stop, speed drop and toggle what changed before."""
     found: dict[Event, tuple[PastChange, ...]] = {}
     for each in events:
-        if each.kind == "stop":
+        if each.kind in {"stop", "drop"}:
             found[each] = changes.before(each.start, slack=SLACK_NS)
         elif each.kind == "flip":
             found[each] = changes.before(each.start, without=each.text.rpartition(" ")[0])

@@ -435,6 +435,7 @@ class RecapArguments(Arguments):
     span: TimeRange
     where: _Where | None = None
     frame_id: _FrameId | None = None
+    min_score: _Score | None = None
 
 
 class SaveMomentArguments(Arguments):

@@ -300,6 +300,8 @@ def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
         reply["duration_s"] = seconds(event.end - event.start)
     if event.place is not None:
         reply["in"] = event.place
+    if event.score is not None:
+        reply["score"] = rounded(event.score, 4)
     if event.before:
         reply["before"] = _changes(event.before)
     return with_notes(reply, (), goes_on=event.goes_on)

@@ -109,7 +109,7 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
             and interval.first <= one.first
             and one.last <= interval.last
         ]
-        assert (min(one.first for one in mine), max(one.last for one in mine)) == interval[1:]
+        assert (min(one.first for one in mine), max(one.last for one in mine)) == interval[1:3]
         mine.sort(key=lambda one: one.first)
         for nth in range(1, len(mine)):
             assert mine[nth].first - max(one.last for one in mine[:nth]) <= FLICKER_NS
@@ -238,3 +238,40 @@ def test_intervals_beyond_the_limit_are_counted() -> None:
 def test_rows_without_a_label_are_recognised(seen: IntervalTable) -> None:
     assert not seen.is_sound
     assert watched([(0, ("a", "b"))]).visible.is_sound
+
+
+@given(
+    messages=st.lists(
+        st.tuples(st.integers(1, 6), st.sampled_from([None, -0.5, 0.2, 0.7, 0.71234, 88.0])),
+        min_size=1,
+        max_size=20,
+    ),
+    cuts=st.sets(st.integers(0, 20)),
+)
+def test_the_best_score_of_an_interval_is_the_same_however_a_history_is_cut(
+    messages: list[tuple[int, float | None]], cuts: set[int]
+) -> None:
+    parts: list[IntervalPart] = []
+    builder, time, times = IntervalBuilder(100), 0, []
+    for nth, (seconds, score) in enumerate(messages):
+        part = builder.part()
+        if nth in cuts and part is not None:
+            parts.append(part)
+            builder = IntervalBuilder(100)
+        time += seconds * NS_PER_S
+        times.append(time)
+        builder.add(time, ["a"], [score])
+    last = builder.part()
+    assert last is not None
+    whole = joined([*parts, last]).visible
+    for each in whole.intervals():
+        scores = [
+            score
+            for at, (_, score) in zip(times, messages, strict=True)
+            if each.first <= at <= each.last and score is not None
+        ]
+        assert each.best == (round(max(scores), 4) if scores else None)
+    kept = whole.scoring(0.7).intervals()
+    assert kept == tuple(
+        each for each in whole.intervals() if each.best is None or each.best >= 0.7
+    )

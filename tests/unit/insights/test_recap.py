@@ -555,7 +555,8 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     assert [each.start for each in answer.events] == sorted(each.start for each in answer.events)
     reply = Replies(tmp_path, 24_000).answer(answer).text
     assert len(reply) < 3_500
-    assert set(json.loads(reply)["events"][0]) == {"timestamp", "ago_s", "text", "duration_s"}
+    keys = {"timestamp", "ago_s", "text", "duration_s", "score"}
+    assert set(json.loads(reply)["events"][0]) == keys
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -723,3 +724,63 @@ def test_a_recap_of_a_place_is_the_same_whatever_the_catalogue_knows(
             arguments = {"start": 0, "end": 4e9, **given}
             one = asked(memory, bag_dir, "recap", **arguments)
             assert one == asked(known, bag_dir, "recap", **arguments)
+
+
+@each_way
+def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
+    tmp_path: Path, recalls: bool
+) -> None:
+    for nth in range(3):
+        messages = []
+        for second in range(nth * 10, nth * 10 + 10):
+            at = BEGIN + second * S
+            cup = 0.62 if second == 14 else 0.3
+            messages.append(detections(at, ["cup"], score=cup, topic="/front/detections"))
+            messages.append(detections(at, ["ghost"] if second % 7 < 3 else [], score=0.4))
+            messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
+    memory = memory_of(tmp_path)
+    memory = recalling(memory, tmp_path) if recalls else memory
+
+    def things(**given: float) -> tuple[list[tuple[str, float]], list[str], list[str]]:
+        span = {"start": BEGIN / S - 20, "end": BEGIN / S + 60}
+        reply = asked(memory, tmp_path, "recap", **span, **given)
+        rows = {(each["text"], each["score"]) for each in reply["events"] if "score" in each}
+        notes = [each for each in reply.get("notes", ()) if "min_score" in each]
+        return sorted(rows), reply.get("seen_throughout", []), notes
+
+    assert things() == ([("cup in view", 0.62), ("ghost in view", 0.4)], [], [])
+    assert things(min_score=0.4)[0] == [("cup in view", 0.62), ("ghost in view", 0.4)]
+    found, _, [note] = things(min_score=0.55)
+    assert found == [("cup in view", 0.62)]
+    assert "no score in it reaches min_score 0.55" in note
+    assert things(min_score=0.7)[0] == []
+    memory = replace(memory, limits=replace(memory.limits, min_score=0.7))
+    assert things()[0] == []
+
+
+@each_way
+def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Drives 0.5 m/s, crawls from 12 s on for 3 s, drives, and brakes to stand at 30 s."""
+    messages: list[Msg] = []
+    x = 0.0
+    for step in range(800):
+        at, seconds = BEGIN + step * S // 20, step / 20
+        messages.append(odom(at, x, 0.0))
+        x += (0.05 if 12 <= seconds < 15 else 0.0 if seconds >= 30 else 0.5) / 20
+        if step % 20 == 0:
+            messages.append(boolean(at, int(seconds) in {11, 12, 13}, topic="/blocked"))
+    for nth in range(4):
+        inside = [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth]
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", inside)
+    memory = memory_of(tmp_path)
+    memory = recalling(memory, tmp_path) if recalls else memory
+    answer = over(memory, 0, 40)
+    [drop] = [each for each in answer.events if each.kind == "drop"]
+    assert drop.text == "slowed down suddenly from 0.50 to 0.05 m/s"
+    assert (drop.start - BEGIN) / S == pytest.approx(12, abs=0.6)
+    assert drop.before[0].text == "/blocked became true"
+    assert [each.kind for each in answer.events if each.kind == "stop"] == ["stop"]
+    assert ("speed drops", 1) in answer.counts

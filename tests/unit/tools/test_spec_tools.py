@@ -89,7 +89,7 @@ OPTIONAL = {
         "by",
         "limit",
     },
-    "recap": {"start", "end", "around", "seconds_before", "where", "frame_id"},
+    "recap": {"start", "end", "around", "seconds_before", "where", "frame_id", "min_score"},
     "compare": {"where"},
     "find_things": {"label", "where", "start", "end", "min_score", "limit"},
     "list_recorded_topics": {"pattern"},

@@ -34,6 +34,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import TimedPosition
+from ros2_memory.analysis.motion.speed_drops import (
+    NO_DROPS,
+    SpeedDropBuilder,
+    SpeedDropCollector,
+    SpeedDropDigest,
+)
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -41,7 +47,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.model import Vector3
+    from ros2_memory.analysis.motion.speed_drops import SpeedDrop
+    from ros2_memory.core.model import Quaternion, Vector3
 
 SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that is still for less is turning, or driving with care."""
@@ -154,6 +161,7 @@ class StandstillDigest:
         tail_since: the log time of the first of these.
         chains: in order. The first one's start is None where it includes the second slot, the last
             one's end where it includes the last slot but one.
+        drops: of speed, among the same poses.
     """
 
     head: bytes
@@ -161,6 +169,7 @@ class StandstillDigest:
     tail: bytes = b""
     tail_since: Ns = 0
     chains: tuple[ChainDigest, ...] = ()
+    drops: SpeedDropDigest = NO_DROPS
 
 
 class _Slot:
@@ -398,9 +407,11 @@ class StandstillCollector:
         self._linking = _Linking()
         self._chains: list[_Chain] = []
         self._first: _Chain | None = None  # holds the second slot
+        self._drops = SpeedDropCollector()
 
-    def add(self, time: Ns, position: Vector3) -> None:
-        """Takes the next pose (m), which must be finite."""
+    def add(self, time: Ns, position: Vector3, turn: Quaternion | None = None) -> None:
+        """Takes the next pose (m), which must be finite; `turn` is its orientation."""
+        self._drops.add(time, position, turn)
         pose = TimedPosition(time, _rounded(position))
         if self._slots and time // SLOT_NS == self._slots[-1].number:
             self._slots[-1].add(pose)
@@ -417,13 +428,14 @@ class StandstillCollector:
         if not slots:
             return None
         if len(slots) < _EDGE_SLOTS + 2:
-            return StandstillDigest(encode_positions(_poses(slots)), slots[-1].last)
+            head, drops = encode_positions(_poses(slots)), self._drops.digest()
+            return StandstillDigest(head, slots[-1].last, drops=drops)
         under_way = self._linking.chain
         chains = self._chains if under_way is None else [*self._chains, under_way]
-        head, tail = slots[:_EDGE_SLOTS], slots[-_EDGE_SLOTS:]
+        first, tail = slots[:_EDGE_SLOTS], slots[-_EDGE_SLOTS:]
         return StandstillDigest(
-            encode_positions(_poses(head)),
-            head[-1].last,
+            encode_positions(_poses(first)),
+            first[-1].last,
             encode_positions(_poses(tail)),
             tail[0].first,
             tuple(
@@ -435,6 +447,7 @@ class StandstillCollector:
                 for chain in chains
                 if chain is self._first or chain.is_long
             ),
+            self._drops.digest(),
         )
 
     def _take(self, slot: _Slot) -> None:
@@ -455,14 +468,17 @@ class StandstillBuilder:
         self._open: _Slot | None = None
         self._tail: tuple[bytes, Ns] | None = None
         self._done: list[Standstill] = []
+        self._drops = SpeedDropBuilder()
 
-    def add(self, time: Ns, position: Vector3) -> None:
-        """Takes the next pose (m), which must be finite."""
+    def add(self, time: Ns, position: Vector3, turn: Quaternion | None = None) -> None:
+        """Takes the next pose (m), which must be finite; `turn` is its orientation."""
+        self._drops.add(time, position, turn)
         self._decode_tail()
         self._add(TimedPosition(time, _rounded(position)))
 
     def join(self, bag: StandstillDigest) -> None:
         """Takes all poses of a bag that come next, as if they were added one by one."""
+        self._drops.join(bag.drops)
         if not bag.tail:
             self._decode_tail()
             for pose in decode_positions(bag.head):
@@ -487,6 +503,11 @@ class StandstillBuilder:
             self._close(self._linking.take(self._open))
         self._close(self._linking.end(None))
         return tuple(self._done)
+
+    @property
+    def drops(self) -> Sequence[SpeedDrop]:
+        """Where the robot slowed down suddenly, in order; standstills may follow."""
+        return self._drops.drops
 
     @property
     def last(self) -> Ns | None:

@@ -1,0 +1,124 @@
+"""Sudden losses of speed, and that cuts into bags change none."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.motion.speed_drops import (
+    NO_DROPS,
+    SLOT_NS,
+    SpeedDrop,
+    SpeedDropBuilder,
+    SpeedDropCollector,
+)
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+Pose = tuple[int, tuple[float, float, float], tuple[float, float, float, float]]
+
+
+def driven(*legs: tuple[float, float, float], rate: int = 20) -> list[Pose]:
+    """Poses of a robot that goes for so many seconds at a speed (m/s), and turns by a rate (rad/s).
+
+    Heading and speed change at once.
+    """
+    poses: list[Pose] = []
+    x = y = heading = 0.0
+    at = BEGIN
+    for lasts_s, speed, turn in legs:
+        for _ in range(round(lasts_s * rate)):
+            rotation = (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+            poses.append((at, (x, y, 0.0), rotation))
+            at += S // rate
+            x += speed / rate * math.cos(heading)
+            y += speed / rate * math.sin(heading)
+            heading += turn / rate
+    return poses
+
+
+def found(poses: list[Pose], cuts: tuple[int, ...] = ()) -> list[SpeedDrop]:
+    """The drops, of whole bags where there are cuts."""
+    builder = SpeedDropBuilder()
+    if not cuts:
+        for pose in poses:
+            builder.add(*pose)
+    for start, stop in pairwise((0, *sorted(cuts), len(poses)) if cuts else ()):
+        collector = SpeedDropCollector()
+        for pose in poses[start:stop]:
+            collector.add(*pose)
+        builder.join(collector.digest())
+    return builder.drops
+
+
+def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
+    [drop] = found(driven((5.2, 0.5, 0), (2.5, 0.05, 0), (5, 0.5, 0)))
+    assert (drop.time - BEGIN) / S == pytest.approx(5.2, abs=0.6)
+    assert drop.before_mps == pytest.approx(0.5, abs=0.01)
+    assert drop.after_mps == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "legs",
+    [
+        ((5, 0.5, 0), (5, 0.4, 0), (5, 0.3, 0), (5, 0.25, 0)),  # slower, not much at a time
+        ((5, 0.5, 0), (2, 0.0, 0.8), (5, 0.5, 0)),  # to turn
+        ((5, 0.1, 0), (2, 0.0, 0), (5, 0.1, 0)),  # hardly moved
+        ((5, 0.5, 0), (0.6, 0.0, 0), (5, 0.5, 0)),  # for a moment
+        ((5, 0.0, 0), (0.5, 0.5, 0), (5, 0.0, 0)),  # moved for a moment
+    ],
+)
+def test_what_is_no_sudden_loss_of_speed(legs: tuple[tuple[float, float, float], ...]) -> None:
+    assert found(driven(*legs)) == []
+
+
+def test_a_position_that_jumps_back_is_no_loss_of_speed() -> None:
+    poses = driven((10, 0.4, 0))
+    jumped = [
+        (at, (x - 0.2, y, z) if at >= BEGIN + 5.2 * S else (x, y, z), turn)
+        for at, (x, y, z), turn in poses
+    ]
+    assert found(jumped) == []
+
+
+def test_poses_that_come_too_seldom_show_none() -> None:
+    assert found(driven((20, 0.5, 0), (20, 0.0, 0), rate=1)) == []
+
+
+def test_poses_without_orientation_show_some() -> None:
+    builder = SpeedDropBuilder()
+    for at, place, _ in driven((5, 0.5, 0), (2, 0.0, 0.8)):
+        builder.add(at, place)
+    assert len(builder.drops) == 1
+
+
+@given(
+    legs=st.lists(
+        st.tuples(
+            st.floats(0.3, 6), st.sampled_from([0.0, 0.05, 0.2, 0.5]), st.sampled_from([0.0, 0.5])
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    shares=st.lists(st.floats(0, 1), min_size=1, max_size=12),
+    silent=st.booleans(),
+)
+def test_cuts_into_bags_change_nothing(
+    legs: list[tuple[float, float, float]], shares: list[float], silent: bool
+) -> None:
+    poses = driven(*legs, rate=10)
+    if silent:
+        poses = [each for each in poses if (each[0] - BEGIN) // SLOT_NS % 17 > 1]
+    cuts = tuple(int(share * len(poses)) for share in shares)
+    assert found(poses, cuts) == found(poses)
+
+
+def test_a_bag_without_a_pose_changes_nothing() -> None:
+    assert SpeedDropCollector().digest() == NO_DROPS
+    builder = SpeedDropBuilder()
+    builder.join(NO_DROPS)
+    assert builder.drops == []
