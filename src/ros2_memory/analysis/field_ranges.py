@@ -96,7 +96,11 @@ class FieldRangesBuilder:
             numbers.setdefault(path, []).append(number)
         self._messages += 1
         for path, some in numbers.items():
-            self._add(path, np.array(some, np.float64), 1)
+            total = sum(some)
+            if math.isfinite(total):
+                self._numbers(path).add(min(some), max(some), total, len(some), 1)
+            else:
+                self._add(path, np.array(some, np.float64), 1)
 
     def add_rows(self, template: PayloadTemplate, rows: Bytes) -> None:
         """Takes many messages of a template, the first of which was added as a value."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from functools import partial
+from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
     from ros2_memory.counts.field_numbers import FieldNumbers, Numbers, NumberTable
+    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.results import BinColumn, Bins
@@ -83,9 +87,9 @@ def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times
     Messages are read where recordings overlap; the times of messages where a bag lies in several
     pieces.
     """
+    edges = binned.bins.edges[1:-1].tolist()
     size = len(binned.bins.member)
-    counts = np.zeros(size, np.int64)
-    first, last = np.full(size, MAX_NS), np.full(size, MIN_NS)
+    counts, first, last = [0] * size, [MAX_NS] * size, [MIN_NS] * size
 
     def add(piece: int, count: int, begin: Ns, end: Ns) -> None:
         counts[piece] += count
@@ -95,16 +99,27 @@ def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times
     for group in groups_of(view.stream, topic, binned.asked):
         begin = min(each.first for each in group.bags)
         end = max(each.last for each in group.bags)
-        pieces = binned.bins.pieces([begin, end])
-        if group.is_inside and pieces[0] == pieces[1]:
-            add(int(pieces[0]), group.count(), begin, end)
+        piece = bisect_right(edges, begin)
+        if group.is_inside and (piece == len(edges) or end < edges[piece]):
+            add(piece, _count(view, topic, group), begin, end)
             continue
-        times = np.array(group.times(), np.int64)
-        where = binned.bins.pieces(times)
-        for piece in np.unique(where).tolist():
-            here = times[where == piece]
-            add(piece, len(here), int(here.min()), int(here.max()))
-    return counts, first, last
+        for piece, times in groupby(group.times(), key=partial(bisect_right, edges)):
+            here = [*times]
+            add(piece, len(here), here[0], here[-1])
+    return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
+
+
+def _count(view: View, topic: str, group: Group) -> int:
+    """Returns how many messages a whole group holds; remembered where that takes reading."""
+    if len(group.bags) == 1 or group.may_be_relatched:
+        return group.count()
+    question = f"count {topic}"
+    known = view.bags.cached_answer(question, group.bags, int) if group.is_whole else None
+    if known is None:
+        known = group.count()
+        if group.is_whole:
+            view.bags.cache_answer(question, group.bags, str(known))
+    return known
 
 
 def _add_numbers(view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]) -> None:
