@@ -359,7 +359,8 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.silent:
         do = (
             "is their publisher running? Under another user it is heard over the network alone: "
-            "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder"
+            "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the discovery range LOCALHOST "
+            "that does nothing, and docs/how-to/systemd.md says what does"
         )
         yield _warning("recorder", f"subscribed and never heard: {listed(heartbeat.silent)}", do)
     if heartbeat.age_held:
