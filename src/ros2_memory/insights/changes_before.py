@@ -33,6 +33,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import ns_argument, open_view
+from ros2_memory.insights.goals import GOAL_WORDS, action_of
 from ros2_memory.insights.topic_events import add_events, events_in, toggled
 from ros2_memory.places.pose_frames import placed, with_place
 from ros2_memory.results import Before, PastChange
@@ -63,9 +64,7 @@ _MOST_CHANGES: Final = 20
 _MAX_LOG_CHARS: Final = 100
 
 _LEVELS: Final = ("ok", "warning", "error", "stale")
-_GOAL_WORDS: Final = {3: "canceling", 4: "succeeded", 5: "canceled", 6: "aborted"}
 _ROUTINE: Final = ("goal accepted", "goal succeeded")
-_STATUS_TOPIC: Final = "/_action/status"
 _NO_INTERVALS: Final = IntervalTable()
 
 
@@ -227,8 +226,8 @@ def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
         if known.at == events.first:
             continue
         if known.name.startswith(GOAL):
-            word = _GOAL_WORDS.get(known.first, "accepted")
-            yield _Change(known.at, known.at, f"{_action(topic)} goal {word}")
+            word = GOAL_WORDS.get(known.first, "accepted")
+            yield _Change(known.at, known.at, f"{action_of(topic)} goal {word}")
         elif known.name.startswith(STATUS) and known.first:
             yield _Change(known.at, known.at, _status(known.name, known.first, known.text))
 
@@ -237,8 +236,8 @@ def _changed(topic: str, change: LevelChange, charge: int) -> str:
     """Returns a sentence for a change of level; empty for one that is not reported."""
     if change.name.startswith(STATUS):
         return _status(change.name, change.value, change.text)
-    if change.name.startswith(GOAL) and change.value in _GOAL_WORDS:
-        return f"{_action(topic)} goal {_GOAL_WORDS[change.value]}"
+    if change.name.startswith(GOAL) and change.value in GOAL_WORDS:
+        return f"{action_of(topic)} goal {GOAL_WORDS[change.value]}"
     if change.name == CHARGE and change.value > charge:
         return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
     return ""
@@ -248,10 +247,6 @@ def _status(name: str, level: int, text: str) -> str:
     word = _LEVELS[level] if 0 <= level < len(_LEVELS) else f"level {level}"
     more = f": {text}" if text else ""
     return f"status of {name.removeprefix(STATUS)} became {word}{more}"[:_MAX_LOG_CHARS]
-
-
-def _action(topic: str) -> str:
-    return topic.removesuffix(_STATUS_TOPIC)
 
 
 def _reported(report: Report) -> str:
@@ -310,7 +305,7 @@ def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]
         goals = [each for each in events.changes.known if each.name.startswith(GOAL)]
         if goals:
             newest = max(goals, key=lambda each: each.at)
-            yield f"{_action(topic)} goal", _GOAL_WORDS.get(newest.last, "active")
+            yield f"{action_of(topic)} goal", GOAL_WORDS.get(newest.last, "active")
         for level in events.changes.known:
             if level.name.startswith(STATUS) and level.last:
                 word = _LEVELS[level.last] if 0 < level.last < len(_LEVELS) else str(level.last)

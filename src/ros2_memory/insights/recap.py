@@ -31,6 +31,7 @@ from ros2_memory.insights.changes_before import (
 )
 from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.drive import drive_in
+from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in
 from ros2_memory.insights.topic_events import events_in, toggled
 from ros2_memory.places.driven_inside import driven_way
@@ -72,9 +73,11 @@ _PLURALS: Final = {
     "clock step": "clock steps",
     "silence": "silences",
     "error": "errors",
+    "failed goal": "failed goals",
     "stop": "stops",
     "flip": "flips",
     "drop": "speed drops",
+    "goal": "goals",
     "thing": "sights of things",
 }
 """The kinds of events, the most important first, and the words for several of each."""
@@ -143,6 +146,7 @@ def recap(
         for begin, until in recording_gaps(view, window)
     ]
     events += [*_clock_steps(view, window), *_silences(view, window)]
+    events += [_goal(each, start) for each in goals_in(view, window, found)]
     if there is not None:
         events = [each for each in events if there.has(each)]
     note_unread(view, window)
@@ -353,6 +357,19 @@ def _errors(
             builder.join(events)
     inside = builder.events()
     return () if inside is None else inside.errors
+
+
+def _goal(goal: GoalRun, start: Ns) -> Event:
+    """Returns a goal from when it was accepted; one from before the window, from when it ended."""
+    kind = "failed goal" if goal.outcome in FAILURES else "goal"
+    if goal.accepted is None:
+        text = f"{goal.action} goal {goal.outcome or 'active'}, accepted before"
+        at = start if goal.ended is None else goal.ended
+        return Event(kind, at, None, text, goes_on=goal.ended is None)
+    if goal.ended is None:
+        return Event(kind, goal.accepted, None, f"{goal.action} goal accepted", goes_on=True)
+    after = f"after {seconds(goal.ended - goal.accepted)}"
+    return Event(kind, goal.accepted, goal.ended, f"{goal.action} goal {goal.outcome} {after}")
 
 
 def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:

@@ -6,6 +6,8 @@ from contextlib import suppress
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
+import structlog
+
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.layout import (
     QOS_FILE,
@@ -20,6 +22,7 @@ from ros2_memory.recorder.base import Housekeeper, Recorder
 from ros2_memory.recorder.process.child import Child, run_bounded
 from ros2_memory.recorder.process.command import (
     HELP_ARGV,
+    SERVICES,
     options_in_help,
     record_argv,
     storage_config,
@@ -45,6 +48,8 @@ __all__ = ["Ros2BagRecorder", "record_argv"]
 
 HELP_TIMEOUT_S: Final = 60.0
 LOGS_KEPT: Final = 20
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 class Ros2BagRecorder(Recorder):
@@ -132,6 +137,12 @@ class Ros2BagRecorder(Recorder):
         self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
         self._ros2 = find_ros2(self._env)
         self._options = self._known_options()
+        if self._topics.services and SERVICES not in self._options:
+            _log.warning(
+                "services_not_recorded",
+                topics=list(self._topics.services),
+                reason="this ros2 bag record has no --services: Jazzy and later have it",
+            )
         self._checked = True
 
     def start(self) -> None:

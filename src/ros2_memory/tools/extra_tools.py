@@ -40,8 +40,8 @@ _SIGHTINGS = ToolDeclaration(
 )
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
-    "What happened {when}: way, stops, speed drops, things in view, flips of booleans, errors, "
-    "gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
+    "What happened {when}: way, stops, speed drops, things in view, flips of booleans, goals, "
+    "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
     "duration_s, text, in, score, before: what changed in the 10 s before}}], counts}}. With "
     "around: {{before: [{{text, s_before}}], nearest first, recorded, robot, state}}.",
     RecapArguments,

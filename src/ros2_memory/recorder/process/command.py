@@ -25,6 +25,7 @@ KEYBOARD: Final = "--disable-keyboard-controls"
 NODE_NAME: Final = "--node-name"
 REPEAT: Final = "--repeat-transient-local"
 CUSTOM_DATA: Final = "--custom-data"
+SERVICES: Final = "--services"
 CACHE: Final = "--max-cache-size"
 MIN_FREE: Final = "--min-free-space"
 

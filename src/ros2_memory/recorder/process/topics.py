@@ -3,10 +3,13 @@
     topics:
       - /odom
       - /vision/*/detections_meta
+      - /drive/_action/status
+      - /set_mode/_service_event
 
 An entry is a fully qualified topic name, or a glob: `*` matches one or more characters other than
 `/`, inside one part of the name. Names follow the ROS 2 design article "Topic and Service name
-mapping to DDS".
+mapping to DDS". Events of a service are recorded where the distribution can (Jazzy and later), and
+the service publishes them (service introspection).
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ MAX_NAME: Final = 247
 MAX_REGEX: Final = 60_000
 """Characters in the regular expression: the C++ library fails on patterns not much larger."""
 
+SERVICE_EVENT: Final = "/_service_event"
 _PART = re.compile(r"[A-Za-z_*][A-Za-z0-9_*]*")
 
 
@@ -48,6 +52,11 @@ class TopicSelection:
         The recorder leaves those out without `--include-hidden-topics`.
         """
         return any("/_" in entry for entry in self.entries)
+
+    @property
+    def services(self) -> tuple[str, ...]:
+        """The entries that are events of services."""
+        return tuple(entry for entry in self.entries if entry.endswith(SERVICE_EVENT))
 
     @property
     def regex(self) -> str:
@@ -129,4 +138,7 @@ def _fault_of_part(part: str) -> str | None:
 
 
 def _pattern(entry: str) -> str:
-    return "[^/]+".join(re.escape(literal) for literal in entry.split("*"))
+    service = entry.removesuffix(SERVICE_EVENT)
+    pattern = "[^/]+".join(re.escape(literal) for literal in service.split("*"))
+    # `ros2 bag record` compares the name of the service, not of the topic of its events.
+    return pattern if service == entry else f"{pattern}({re.escape(SERVICE_EVENT)})?"

@@ -96,6 +96,16 @@ def test_hidden_topics_are_looked_at_only_when_one_is_named() -> None:
     assert not TopicSelection(("/odom", "/vision/*/x_y")).hidden
 
 
+def test_events_of_a_service_are_selected_by_the_name_of_the_service_too() -> None:
+    # `ros2 bag record` of Jazzy compares that name with the pattern.
+    topics = TopicSelection(("/odom", "/set_mode/_service_event"))
+    assert topics.services == ("/set_mode/_service_event",)
+    assert topics.matches("/set_mode")
+    assert topics.matches("/set_mode/_service_event")
+    assert not topics.matches("/set_mode/_service_event_2")
+    assert topics.hidden
+
+
 @pytest.mark.parametrize(
     ("entry", "reason"),
     [

@@ -1,0 +1,119 @@
+"""What became of the goals of actions, in recaps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import TimeRange
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.results import Event
+from tests.support.bags import Msg, goals, write_mcap
+from tests.support.memories import memory_of, recalling
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+TOPIC = "/drive/_action/status"
+
+Told = tuple[str, str, float, float | None, bool]
+History = list[tuple[int, Mapping[int, int]]]
+
+
+def told(
+    bag_dir: Path, messages: list[Msg], begin: float, end: float, cut: int = 10**9, *, recalls: bool
+) -> list[Told]:
+    for number, at in enumerate(range(0, len(messages), cut)):
+        write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages[at : at + cut])
+    memory = memory_of(bag_dir)
+    if recalls:
+        memory = recalling(memory, bag_dir)
+    found = recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
+    return [row(each) for each in found.events if "goal" in each.kind]
+
+
+def row(event: Event) -> Told:
+    until = None if event.end is None else (event.end - BEGIN) / S
+    return event.kind, event.text, (event.start - BEGIN) / S, until, event.goes_on
+
+
+def history(*statuses: tuple[int, Mapping[int, int]]) -> list[Msg]:
+    return [goals(BEGIN + at * S, listed) for at, listed in statuses]
+
+
+DAY = history(
+    (10, {1: 1}),
+    (11, {1: 2}),
+    (20, {1: 4}),
+    (30, {1: 4, 2: 2}),
+    (42, {1: 4, 2: 6}),
+    (50, {2: 6, 3: 2}),
+    (55, {2: 6, 3: 3}),
+    (56, {2: 6, 3: 5}),
+    (60, {3: 5, 4: 2}),
+)
+
+
+@pytest.mark.parametrize("recalls", [False, True])
+def test_each_goal_is_told_with_how_it_ended(tmp_path: Path, *, recalls: bool) -> None:
+    assert told(tmp_path, DAY, 0, 70, cut=2, recalls=recalls) == [
+        ("goal", "/drive goal succeeded after 10 s", 10, 20, False),
+        ("failed goal", "/drive goal aborted after 12 s", 30, 42, False),
+        ("failed goal", "/drive goal canceled after 6 s", 50, 56, False),
+        ("goal", "/drive goal accepted", 60, None, True),
+    ]
+
+
+def test_what_ended_before_a_window_is_not_told_and_what_began_before_is(tmp_path: Path) -> None:
+    assert told(tmp_path, DAY, 35, 52, recalls=False) == [
+        ("failed goal", "/drive goal aborted, accepted before", 42, None, False),
+        ("goal", "/drive goal accepted", 50, None, True),
+    ]
+
+
+def test_the_first_message_of_all_tells_nothing_of_what_ended(tmp_path: Path) -> None:
+    assert told(tmp_path, history((10, {1: 6, 2: 2}), (15, {2: 4})), 0, 20, recalls=False) == [
+        ("goal", "/drive goal succeeded after 5 s", 10, 15, False)
+    ]
+
+
+def test_a_search_finds_when_goals_were_aborted(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    found = find_matches(
+        memory_of(tmp_path), Call(), TOPIC, "equals", 6, field="status_list.status"
+    )
+    assert [(each.first - BEGIN) / S for each in found.sightings] == [42]
+
+
+ENDS = st.sampled_from([4, 5, 6])
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), ENDS), min_size=1, max_size=4),
+    st.integers(1, 5),
+    st.booleans(),
+)
+def test_however_the_history_is_cut_the_same_is_told(
+    runs: list[tuple[int, int, int]], cut: int, recalls: bool
+) -> None:
+    at, expected, statuses = 5, [], dict[int, int]()
+    messages: History = [(1, {})]
+    words = {4: "succeeded", 5: "canceled", 6: "aborted"}
+    for goal, (pause, length, end) in enumerate(runs):
+        at += pause
+        begun, at = at, at + length
+        statuses = {**statuses, goal: 2}
+        messages.append((begun, statuses))
+        statuses = {**statuses, goal: end}
+        messages.append((at, statuses))
+        expected.append((f"/drive goal {words[end]} after {length} s", begun, at))
+    with TemporaryDirectory() as folder:
+        found = told(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
+    assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
