@@ -7,9 +7,10 @@ window.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,9 +134,11 @@ def _shares(digest: PoseDigest, cuts: Sequence[Ns]) -> list[float]:
     """Returns which share of a drawn path lies before, between and after some times."""
     if not cuts or len(digest.vertices) < 2:
         return [1.0]
-    times = [each[0] for each in digest.vertices]
     steps = [distance(here[1], there[1]) for here, there in pairwise(digest.vertices)]
-    along = np.concatenate(([0.0], np.cumsum(steps)))
+    # Nothing is driven to and from what parts two pieces of the path, which has no time either.
+    is_vertex = [not math.isnan(position[0]) for _, position, _ in digest.vertices]
+    along = np.concatenate(([0.0], np.cumsum(np.nan_to_num(steps))))[is_vertex]
+    times = [each[0] for each in compress(digest.vertices, is_vertex)]
     if along[-1] <= 0:
         return [1.0]
     at = np.interp([each - times[0] for each in cuts], [each - times[0] for each in times], along)
