@@ -7,7 +7,6 @@ and reported.
 
 from __future__ import annotations
 
-import time
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Deadline, Ns
 from ros2_memory.history.bag_groups import DigestKind, Group, StoredDigests, groups_of
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 
@@ -141,8 +140,7 @@ class SegmentFold(Generic[T, R]):
             if reading.is_over:
                 since = max(each.last for each in group.bags) + 1
                 break
-            with reading:
-                found.extend(reversed([*self._made(view, group, stored)]))
+            found.extend(reversed([*self._made(view, group, stored)]))
         return (self.reduce(found[::-1]) if found else None), since
 
     def _made(self, view: View, group: Group, stored: StoredDigests[T]) -> Iterator[Digested[T]]:
@@ -178,23 +176,18 @@ class SegmentFold(Generic[T, R]):
 
 
 class _Reading:
-    """For how long bags have been read, and no more than that: a busy machine takes its time."""
+    """How long bags have been read; counted from the first one on."""
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._spent_s = 0.0
-        self._begun_s = 0.0
-
-    def __enter__(self) -> None:
-        self._begun_s = time.monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self._spent_s += time.monotonic() - self._begun_s
+        self._deadline: Deadline | None = None
 
     @property
     def is_over(self) -> bool:
         """Whether no more bags are to be read."""
-        return self._spent_s > READING_S or self._view.call.deadline.expired()
+        if self._deadline is None:
+            self._deadline = Deadline.after(READING_S)
+        return self._deadline.expired() or self._view.call.deadline.expired()
 
 
 class _Completeness:
