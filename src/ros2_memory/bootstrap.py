@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -57,13 +58,15 @@ if TYPE_CHECKING:
 _Port = TypeVar("_Port")
 
 
-def build_reader(settings: Settings) -> BagReader:
-    """Returns the bag reader that the configuration chooses.
+def build_reader(settings: Settings, *, cache_mb: int | None = None) -> BagReader:
+    """Returns the bag reader that the configuration chooses, with `cache_mb` if that is given.
 
     Raises:
         ConfigError: it cannot be built.
     """
-    return _instantiated("storage", settings.storage, BagReader)  # type: ignore[type-abstract]  # only compared with
+    storage = settings.storage
+    node = storage if cache_mb is None else replace(storage, cache_mb=cache_mb)
+    return _instantiated("storage", node, BagReader)  # type: ignore[type-abstract]  # only compared with
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:

@@ -47,6 +47,8 @@ FAILED: Final = 1
 INTERRUPTED: Final = 130
 TICK_S: Final = 0.2
 RECOVER_EVERY_S: Final = 60.0
+CACHE_MB: Final = 2
+"""Every bag is read once: a cache of chunks would only take memory."""
 ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -83,7 +85,8 @@ def _record(settings: Settings) -> None:
     # Nothing is deleted before the list of topics and the environment proved fit for recording.
     load_topics(settings.recording.topics_file)
     bag_dir = settings.recording.bag_dir.absolute()
-    reader = BagDirReader(build_reader(settings), bag_dir, every_message=True)
+    reader = build_reader(settings, cache_mb=CACHE_MB)
+    reader = BagDirReader(reader, bag_dir, every_message=True)
     own = OwnRecordings(bag_dir)
     housekeeper = build_housekeeper(settings, bag_dir, reader, own)
     clear = settings.recording.clear_on_startup

@@ -129,6 +129,7 @@ class Housekeeping(Housekeeper):
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._over_budget = False
+        self._out_of_reach = False
         self._collected = Collected()
 
     def repair(self) -> None:
@@ -160,6 +161,17 @@ class Housekeeping(Housekeeper):
             OSError: the free space cannot be measured.
         """
         self._apply(free_bytes_wanted)
+        most_free = self._collected.most_free
+        if most_free is not None and not self._out_of_reach:
+            _log.error(
+                "room_out_of_reach",
+                free_bytes_wanted=free_bytes_wanted,
+                most_free_bytes=most_free,
+                reason="deleting every bag that may be deleted would not free enough of the disk, "
+                "so none was deleted for it: delete other files there, or lower "
+                "retention.min_free_gb",
+            )
+        self._out_of_reach = most_free is not None
 
     def apply(self) -> None:
         """Deletes what exceeds the budget or is too old; repairs what nothing writes any more."""

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 60.0
-STABLE_S: Final = 60.0
 SILENT_SPLITS: Final = 3
 """Splits without growth after which a robot counts as silent."""
 WAITING_S: Final = 30.0
@@ -32,18 +31,22 @@ waited out.
 class Backoff:
     """How long to wait before the next attempt: twice as long each time, up to a cap.
 
-    An attempt that lasted at least `STABLE_S` ends a series of failures: the wait after it is the
-    first again.
+    What shows that an attempt was good ends a series of failures: the wait after it is the first
+    again. How long it lasted shows nothing: a recorder may live for minutes and write nothing.
     """
 
     def __init__(self) -> None:
         self._wait_s = FIRST_WAIT_S
 
-    def failed(self, lasted_s: float) -> float:
-        """Returns the wait in seconds after an attempt that ended after `lasted_s`."""
-        wait_s = FIRST_WAIT_S if lasted_s >= STABLE_S else self._wait_s
+    def failed(self) -> float:
+        """Returns the wait in seconds after an attempt that failed."""
+        wait_s = self._wait_s
         self._wait_s = min(2 * wait_s, MAX_WAIT_S)
         return wait_s
+
+    def succeeded(self) -> None:
+        """Notes that an attempt was good."""
+        self._wait_s = FIRST_WAIT_S
 
 
 class SilenceWatch:

@@ -197,22 +197,24 @@ class RecordingSessions:
             self._abandon(handover)
         return step
 
-    def handle_exits(self, now: ClockReading) -> list[float]:
-        """Handles children that ended by themselves; returns how long each had lived, in seconds.
+    def handle_exits(self, now: ClockReading) -> int:
+        """Handles children that ended by themselves; returns how many.
 
         If the current one died during a handover, the new one becomes the current one.
         """
-        lived: list[float] = []
+        deaths = 0
         handover = self.handover
         if handover is not None and handover.new.child.exit_status() is not None:
-            lived.append(self._report_death(handover.new, now))
+            deaths += 1
+            self._report_death(handover.new, now)
             self._abandon(handover)
         current = self.current
         if current is not None and current.child.exit_status() is not None:
-            lived.append(self._report_death(current, now))
+            deaths += 1
+            self._report_death(current, now)
             self._finalize(current, now)
             self._replace_current()
-        return lived
+        return deaths
 
     def end_unready(self, now: ClockReading) -> bool:
         """Ends the current session if it does not begin to record; returns whether it did."""
@@ -371,14 +373,13 @@ class RecordingSessions:
             session.end()
             self._replace_current()
 
-    def _report_death(self, session: RecordingSession, now: ClockReading) -> float:
+    def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
         self._report_output(session)
         lived_s = session.age_s(now)
         status = session.child.exit_status()
         sentence = f"ros2 bag record ended by itself with status {status}: {session.last_output}"
         self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
         self.restarts += 1
-        return lived_s
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""

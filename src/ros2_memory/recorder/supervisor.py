@@ -211,6 +211,9 @@ class Supervisor:
     def _observe(self, now: ClockReading) -> None:
         if self._is_due("observe", OBSERVE_S, now):
             self._splits_closed |= self._sessions.observe(now)
+            current = self._sessions.current
+            if current is not None and current.splits.messages:
+                self._backoff.succeeded()
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
@@ -225,17 +228,17 @@ class Supervisor:
                 "the other one, start the recorder anew)",
             )
         elif was_away and not is_away:
-            self._postpone("restart", self._backoff.failed(0.0), now)
+            self._postpone("restart", self._backoff.failed(), now)
             self._events.info("disk_back", bag_dir=str(self._bag_dir))
 
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
-        for lived_s in self._sessions.handle_exits(now):
+        for _ in range(self._sessions.handle_exits(now)):
             self._housekeeper.note_restart()
-            self._postpone("rotate", self._rotation_backoff.failed(lived_s), now)
-            self._postpone("restart", self._backoff.failed(lived_s), now)
+            self._postpone("rotate", self._rotation_backoff.failed(), now)
+            self._postpone("restart", self._backoff.failed(), now)
         if self._sessions.end_unready(now):
-            self._postpone("restart", self._backoff.failed(0.0), now)
+            self._postpone("restart", self._backoff.failed(), now)
         current = self._sessions.current
         if current is not None and current is not before:
             self._silence.began(now.monotonic_s, SETTLE_S)
@@ -291,10 +294,11 @@ class Supervisor:
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
         if step is Step.COMPLETE:
+            self._rotation_backoff.succeeded()
             self._silence.rotated(for_silence=self._rotating_for_silence)
             self._silence.began(now.monotonic_s, SETTLE_S)
         elif step is Step.ABANDON:
-            self._postpone("rotate", self._rotation_backoff.failed(0.0), now)
+            self._postpone("rotate", self._rotation_backoff.failed(), now)
 
     def _check_rotation(self, now: ClockReading) -> None:
         current = self._sessions.current
@@ -321,7 +325,7 @@ class Supervisor:
             self._sessions.begin_handover(now)
         except RecorderError as error:
             self._events.fail("rotation_failed", str(error), recording=current.name)
-            self._postpone("rotate", self._rotation_backoff.failed(0.0), now)
+            self._postpone("rotate", self._rotation_backoff.failed(), now)
             return
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
@@ -337,7 +341,7 @@ class Supervisor:
             self._begin(now)
         except RecorderError as error:
             self._events.fail("recorder_not_started", str(error))
-            self._postpone("restart", self._backoff.failed(0.0), now)
+            self._postpone("restart", self._backoff.failed(), now)
 
     def _check_types(self, now: ClockReading) -> None:
         """Names every topic that is not recorded, where some are of a type that is not known.

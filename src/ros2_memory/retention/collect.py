@@ -54,6 +54,8 @@ class Collected:
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
         needed: how many of the deleted bags rules may still have needed.
+        most_free: how much of the disk would be free if all bags were deleted that may be, where
+            that was too little; then none was deleted for it.
     """
 
     bags: int = 0
@@ -66,6 +68,7 @@ class Collected:
     fits: bool = True
     held: int = 0
     needed: int = 0
+    most_free: int | None = None
 
 
 @dataclass(slots=True)
@@ -165,6 +168,7 @@ class GarbageCollector:
             plan = plan_deletions(stock, limits)
             run.result.foreign_bytes = stock.foreign_bytes
             run.result.total_bytes, run.result.fits = plan.total_bytes, plan.fits
+            run.result.most_free = plan.most_free
             to_delete = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
                 saved = {file.inode for file in stock.saved}

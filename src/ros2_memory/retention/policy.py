@@ -21,7 +21,7 @@ while the clock is there as well, is being recorded now and goes last. The newes
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -127,12 +127,15 @@ class DeletionPlan(NamedTuple):
     """What the limits require.
 
     `to_delete` has the oldest bag first. `total_bytes` is what the budget counted, each file once.
-    `fits`: whether the limits are kept once those bags are deleted.
+    `fits`: whether the limits are kept once those bags are deleted. `most_free`: how much of the
+    disk would be free if all bags were deleted that may be, where that is too little; then none is
+    deleted for it.
     """
 
     to_delete: tuple[StoredBag, ...]
     total_bytes: int
     fits: bool
+    most_free: int | None = None
 
 
 def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
@@ -141,14 +144,27 @@ def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
 
 
 def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPlan:
-    """Plans which bags to delete: all that are too old, then no more than the budget needs."""
+    """Plans which bags to delete: all that are too old, then no more than the limits need.
+
+    Where deleting everything that may go would not free enough of the disk, nothing is deleted for
+    that: it would cost all history, and recording would have to pause all the same.
+    """
+    found, free = _planned(stock, limits)
+    if found.fits or free is None or free >= limits.min_free_bytes:
+        return found
+    within, _ = _planned(replace(stock, free_bytes=None), limits)
+    return within._replace(fits=False, most_free=free)
+
+
+def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPlan, int | None]:
+    """Returns a plan, and how much of the disk is free after it."""
     plan = _Plan(stock)
     total = plan.total
     eras = _eras(stock, limits)
     old = _ages(stock, eras, limits.max_age_ns)
     aged = (old.by_dates if stock.synchronised else old.by_recording) - stock.needed
     if not aged and plan.fits(limits):
-        return DeletionPlan((), total, fits=True)
+        return DeletionPlan((), total, fits=True), plan.free
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
     # Deleting a bag that shares a file with the one that stays would free nothing.
     staying = _inodes(_newest(order, eras))
@@ -163,9 +179,8 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
         if bag.path not in aged and staying.isdisjoint(_inodes(bag)) and plan.frees(bag):
             to_delete.add(bag.path)
             plan.delete(bag)
-    return DeletionPlan(
-        tuple(bag for bag in order if bag.path in to_delete), total, fits=plan.fits(limits)
-    )
+    deleted = tuple(bag for bag in order if bag.path in to_delete)
+    return DeletionPlan(deleted, total, fits=plan.fits(limits)), plan.free
 
 
 class _Plan:
@@ -182,7 +197,7 @@ class _Plan:
         self._bags_in = Counter(bag.recording for bag in stock.bags)
         self._sidecars = stock.sidecars
         self.total = stock.other_bytes + sum(sizes.values()) + sum(stock.sidecars.values())
-        self._free = stock.free_bytes
+        self.free = stock.free_bytes
 
     def delete(self, bag: StoredBag) -> None:
         """Takes one bag away."""
@@ -201,13 +216,13 @@ class _Plan:
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""
-        enough = self._free is None or self._free >= limits.min_free_bytes
+        enough = self.free is None or self.free >= limits.min_free_bytes
         return enough and self.total <= limits.max_total_bytes
 
     def _release(self, size: int, disk: int) -> None:
         self.total -= size
-        if self._free is not None:
-            self._free += disk
+        if self.free is not None:
+            self.free += disk
 
 
 _Era: TypeAlias = "list[tuple[Span, StoredBag]]"

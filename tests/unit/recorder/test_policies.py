@@ -22,25 +22,18 @@ from ros2_memory.recorder.policies import (
 class TestBackoff:
     def test_doubles_up_to_its_cap(self) -> None:
         backoff = Backoff()
-        waits = [backoff.failed(0.1) for _ in range(9)]
+        waits = [backoff.failed() for _ in range(9)]
         assert waits == [1, 2, 4, 8, 16, 32, 60, 60, 60]
 
-    def test_starts_again_after_a_stable_minute(self) -> None:
+    def test_starts_again_after_a_success(self) -> None:
         backoff = Backoff()
-        assert [backoff.failed(59.9) for _ in range(3)] == [1, 2, 4]
-        assert backoff.failed(60.0) == 1
-        assert backoff.failed(0.0) == 2
-
-    @given(st.lists(st.floats(0, 100), max_size=60))
-    def test_never_waits_for_less_than_the_first_nor_more_than_the_cap(
-        self, lives: list[float]
-    ) -> None:
-        backoff = Backoff()
-        assert all(1 <= backoff.failed(lived) <= 60 for lived in lives)
+        assert [backoff.failed() for _ in range(3)] == [1, 2, 4]
+        backoff.succeeded()
+        assert [backoff.failed() for _ in range(2)] == [1, 2]
 
     def test_a_recorder_that_died_for_days_still_has_a_wait(self) -> None:
         backoff = Backoff()
-        assert {backoff.failed(0) for _ in range(5000)} >= {60}
+        assert {backoff.failed() for _ in range(5000)} >= {60}
 
 
 def silent_at(watch: SilenceWatch, written: dict[float, int], until_s: float) -> float | None:

@@ -38,6 +38,20 @@ class TestDeath:
             waits.append(round(world.mono - before))
         assert waits == [1, 2, 4, 8]
 
+    def test_waits_grow_until_a_good_split_was_written(self, tmp_path: Path) -> None:
+        world = World(tmp_path, split_duration_s=100)
+        world.supervisor.start()
+        waits = []
+        # Each of the first lives for longer than a minute and closes nothing.
+        for lives_s in (70, 70, 70, 110, 70):
+            world.run(lives_s)
+            world.running[0].die()
+            count, before = len(world.recorders), world.mono
+            while len(world.recorders) == count:
+                world.run(0.25)
+            waits.append(round(world.mono - before))
+        assert waits == [1, 2, 4, 1, 2]
+
     def test_it_is_reported_with_its_last_words(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()

@@ -192,6 +192,13 @@ class TestBudget:
         assert names(expired(stock(*hourly(10), free_bytes=85), limits)) == ["h9", "h8"]
         assert expired(stock(*hourly(10), free_bytes=None), limits) == ()
 
+    def test_for_free_space_that_cannot_be_reached_nothing_is_deleted(self) -> None:
+        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=100)
+        found = plan_deletions(stock(*hourly(10), free_bytes=9), limits)
+        assert (found.to_delete, found.fits, found.most_free) == ((), False, 99)
+        found = plan_deletions(stock(*hourly(170), free_bytes=-2000), limits)
+        assert (names(found.to_delete), found.fits) == (["h169"], False)
+
 
 class TestSharedFiles:
     def test_two_names_of_one_file_count_once(self) -> None:
@@ -294,8 +301,19 @@ class TestAlways:
     ) -> None:
         left = without(held, expired(held, limits))
         files = {each.files for each in left.bags}
-        assert fits(left, limits) or len(files) <= 1
+        out_of_reach = plan_deletions(held, limits).most_free is not None
+        assert fits(left, limits) or len(files) <= 1 or out_of_reach
         assert plan_deletions(held, limits).fits == fits(left, limits)
+
+    @given(stocks(), all_limits)
+    def test_what_cannot_be_reached_costs_no_bag(
+        self, held: RetentionStock, limits: RetentionLimits
+    ) -> None:
+        found = plan_deletions(held, limits)
+        if found.most_free is not None:
+            assert held.free_bytes is not None
+            assert found.most_free < limits.min_free_bytes
+            assert found.to_delete == expired(held, replace(limits, min_free_bytes=0))
 
     @given(stocks(), all_limits)
     def test_something_is_left_where_there_was_something(
