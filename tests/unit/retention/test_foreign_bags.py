@@ -101,7 +101,7 @@ class TestRetention:
         bag_dir, mine, others = mixed
         house = house_of(bag_dir, keeps_foreign=True, measure_free=lambda _: 0)
         for _ in range(3):
-            house.make_room(PLENTY)
+            house.make_room(1)
         assert all(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
