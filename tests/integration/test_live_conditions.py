@@ -26,8 +26,9 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.ros_processes import (
+    RECORDERS,
     Robot,
-    needs_ros,
+    installation,
     publishing_robot,
     ros_environment,
     wait_for,
@@ -37,8 +38,6 @@ from tests.timing import in_time
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-pytestmark = needs_ros
-
 HZ: Final = 20.0
 DISK_BYTES: Final = 8_000_000
 NOBODY: Final = "65534"
@@ -46,10 +45,12 @@ TOLD_WITHIN_S: Final = 10.0
 HEARD: Final = {"/odom", "/bumper", "/clock"}
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+@pytest.fixture(scope="module", params=RECORDERS)
+def site(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Machine]:
     folder = tmp_path_factory.mktemp("conditions")
-    with ros_environment(folder) as env, machine(folder, env) as site:
+    with ros_environment(folder, real=installation(request)) as env, machine(folder, env) as site:
         yield site
 
 
@@ -200,12 +201,10 @@ def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
     site: Machine, robot: Robot, tmp_path: Path
 ) -> None:
     """A topic without messages, one that does not fit, one of an unknown type, one of nobody."""
-    # A workspace that does not know the robot's own messages.
-    env = {name: text for name, text in site.env.items() if name != "AMENT_PREFIX_PATH"}
-    listed = ["/odom", "/bumper", "/clock", "/vision/*/scene_objects", "/nobody"]
-    quiet = ("--topics", "/clock", "--subscribers", "99")
+    listed = ["/odom", "/bumper", "/clock", "/*/position", "/nobody"]
+    quiet = ("--topics", "/clock", "/px4/position", "--subscribers", "99")
     with (
-        publishing_robot(env, tmp_path / "quiet.json", *quiet),
+        publishing_robot(site.env, tmp_path / "quiet.json", *quiet),
         answering(site.folder / "amiss" / "bags", tmp_path / "server.log") as served,
     ):
         recorder = site.record(
@@ -214,12 +213,11 @@ def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
             # Asks of the bumper, whose messages are not latched, what it does not offer.
             "data.tf_static_topics=[/bumper]",
             topics=listed,
-            env=env,
         )
         # Each is found out when it is: topics one after the other, and silence by closed splits.
         for topic in HEARD:
             recorder.wait_for("subscribed", topic=topic)
-        wait_for_warnings(recorder, "/bumper", "/vision/scene/scene_objects")
+        wait_for_warnings(recorder, "/bumper", "/px4/position")
         recorder.wait_for("split_closed")
 
         def is_told() -> bool:

@@ -16,13 +16,11 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from tests.support.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
-from tests.support.ros_processes import needs_ros
+from tests.support.ros_processes import real_or_double
 from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-pytestmark = needs_ros
 
 KILLS: Final = 50 if os.environ.get("EPISODIC_LONG") == "1" else 10
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
@@ -53,9 +51,11 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Campaigns:
 
 
 def _run(folder: Path, watch: Watch) -> Campaigns:
+    real = real_or_double()
     with ThreadPoolExecutor(len(TERMS)) as pool:
         running = {
-            name: pool.submit(run_campaign, terms, folder / name) for name, terms in TERMS.items()
+            name: pool.submit(run_campaign, terms, folder / name, real)
+            for name, terms in TERMS.items()
         }
         found = {name: future.result() for name, future in running.items()}
     for name, campaign in found.items():

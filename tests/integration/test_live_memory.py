@@ -31,7 +31,12 @@ from tests.support.live_recorder import (
     stamp_of,
     ticks,
 )
-from tests.support.ros_processes import Robot, needs_ros, publishing_robot, ros_environment
+from tests.support.ros_processes import (
+    Robot,
+    publishing_robot,
+    real_or_double,
+    ros_environment,
+)
 from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
@@ -39,8 +44,6 @@ if TYPE_CHECKING:
 
     from tests.integration.test_server_process import Served
     from tests.support.live_recorder import Machine
-
-pytestmark = needs_ros
 
 HZ: Final = 50.0
 AGO_S: Final = 10
@@ -89,7 +92,7 @@ def judge(drive: Drive) -> None:
 def drive_once(folder: Path, watch: Watch) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "3")
     with (
-        ros_environment(folder) as env,
+        ros_environment(folder, real=real_or_double()) as env,
         machine(folder, env) as site,
         # It is there, and silent, before any of them rotates.
         publishing_robot(env, folder / "truth.json", *options) as robot,

@@ -28,13 +28,18 @@ from tests.support.live_recorder import (
     machine,
     ticks,
 )
-from tests.support.ros_processes import needs_ros, publishing_robot, ros_environment
+from tests.support.ros_processes import (
+    RECORDERS,
+    installation,
+    publishing_robot,
+    ros_environment,
+)
 from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = needs_ros
+    from tests.support.real_recorder import RealRecorder
 
 HZ: Final = 50.0
 SPLIT_S: Final = 4
@@ -62,9 +67,10 @@ class Drive:
     files: dict[str, int] = field(default_factory=dict)
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    return driven(lambda watch: drive_once(tmp_path_factory.mktemp("tail"), watch), judge)
+@pytest.fixture(scope="module", params=RECORDERS)
+def drive(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    real = installation(request)
+    return driven(lambda watch: drive_once(tmp_path_factory.mktemp("tail"), watch, real), judge)
 
 
 def judge(drive: Drive) -> None:
@@ -76,10 +82,10 @@ def judge(drive: Drive) -> None:
         is_recorded(drive, name)
 
 
-def drive_once(folder: Path, watch: Watch) -> Drive:
+def drive_once(folder: Path, watch: Watch, real: RealRecorder | None) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "2")
     with (
-        ros_environment(folder) as env,
+        ros_environment(folder, real=real) as env,
         machine(folder, env) as site,
         publishing_robot(env, folder / "truth.json", *options) as robot,
         ExitStack() as stack,

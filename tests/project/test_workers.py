@@ -12,7 +12,7 @@ LIVE = "tests/integration/test_live_memory.py"
 
 def test_every_test_of_ros_itself_is_in_a_group() -> None:
     files = {f"tests/integration/{path.name}" for path in (TESTS / "integration").glob("test_*.py")}
-    names = re.compile("needs_ros|installation|real_recorder")
+    names = re.compile("installation|real_or_double|real_recorder")
     with_ros = {file for file in files if names.search((TESTS.parent / file).read_text())}
     assert len(with_ros) >= 5
     assert {file for file in with_ros if group_of(file) not in {"live", "recorder"}} == set()

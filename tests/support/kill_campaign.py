@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.integration.test_server_process import Served
+    from tests.support.real_recorder import RealRecorder
 
 KINDS: Final = ("child", "daemon", "both")
 RECORD_OVERHEAD_BYTES: Final = 31  # of one MCAP message besides its payload
@@ -154,11 +155,14 @@ class Campaign:
         ]
 
 
-def run_campaign(terms: Terms, folder: Path) -> Campaign:
-    """Records a robot, kills `terms.kills` times, and looks at what is left."""
+def run_campaign(terms: Terms, folder: Path, real: RealRecorder | None) -> Campaign:
+    """Records a robot, kills `terms.kills` times, and looks at what is left.
+
+    `real` is as for `ros_environment`.
+    """
     folder.mkdir()
     campaign, chance = Campaign(terms), random.Random(terms.seed)
-    with ros_environment(folder) as env, machine(folder, env) as site:
+    with ros_environment(folder, real=real) as env, machine(folder, env) as site:
         recorder = _record(site, terms)
         options = ("--hz", f"{terms.hz:g}", "--subscribers", "1")
         with (

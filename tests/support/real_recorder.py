@@ -59,17 +59,23 @@ def env_without_ros() -> dict[str, str]:
     }
 
 
-def require_real_recorder() -> RealRecorder:
-    """The real recorder of this machine; the first call may set it up.
+def find_real_recorder() -> RealRecorder | str:
+    """The real recorder of this machine, or why there is none; the first call may set it up.
 
-    Skips the test where there is none, or fails it with EPISODIC_REQUIRE_REAL=1.
+    With EPISODIC_REQUIRE_REAL=1 the test fails where there is none.
     """
     found = _found()
-    if isinstance(found, RealRecorder):
-        return found
-    if os.environ.get("EPISODIC_REQUIRE_REAL") == "1":
+    if isinstance(found, str) and os.environ.get("EPISODIC_REQUIRE_REAL") == "1":
         pytest.fail(f"EPISODIC_REQUIRE_REAL=1, but there is no real recorder: {found}")
-    pytest.skip(f"no real recorder: {found}")
+    return found
+
+
+def require_real_recorder() -> RealRecorder:
+    """The real recorder, as `find_real_recorder`; skips the test where there is none."""
+    found = find_real_recorder()
+    if isinstance(found, str):
+        pytest.skip(f"no real recorder: {found}")
+    return found
 
 
 @pytest.fixture(scope="session")

@@ -31,12 +31,15 @@ import pytest
 
 from tests.support.bags import VISION_DEFINITIONS
 from tests.support.processes import PATIENCE_S
-from tests.support.real_recorder import env_without_ros, require_real_recorder
+from tests.support.real_recorder import (
+    RealRecorder,
+    env_without_ros,
+    find_real_recorder,
+    require_real_recorder,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from tests.support.real_recorder import RealRecorder
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108
@@ -51,7 +54,6 @@ _NO_ROS: Final = (
     f"UV_PROJECT_ENVIRONMENT=build/{ROS.name} "
     f"uv sync --locked --inexact --no-default-groups --group {ROS.name}"
 )
-needs_ros = pytest.mark.skipif(not _HAS_ROS, reason=_NO_ROS)
 
 _DOMAINS: Final = range(1, 102)  # those whose ports lie below the ephemeral ones (ROS_DOMAIN_ID)
 _DEFINITIONS: Final = {
@@ -79,9 +81,22 @@ def installation(request: pytest.FixtureRequest) -> RealRecorder | None:
     """
     if request.param == "real":
         return require_real_recorder()
+    _require_double()
+    return None
+
+
+def real_or_double() -> RealRecorder | None:
+    """The real recorder where there is one, else None, the double: for tests that take long."""
+    found = find_real_recorder()
+    if isinstance(found, RealRecorder):
+        return found
+    _require_double()
+    return None
+
+
+def _require_double() -> None:
     if not _HAS_ROS:
         pytest.skip(_NO_ROS)
-    return None
 
 
 def write_workspace(folder: Path, distro: str = "jazzy") -> Path:
