@@ -7,12 +7,10 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from benchmarks import ours
 from benchmarks.bags import ODOM
 from benchmarks.report import Figure
-from ros2_memory.analysis.intervals import ROW
+from ros2_memory.analysis.intervals import moved_rows
 from ros2_memory.analysis.motion.standstills import (
     BLOCK_NS,
     ChainDigest,
@@ -148,19 +146,12 @@ def _later(poses: list[TimedPosition], by: int) -> list[TimedPosition]:
     return [pose._replace(time=pose.time + by) for pose in poses]
 
 
-def _moved_rows(packed: bytes, by: int) -> bytes:
-    rows = np.frombuffer(packed, ROW).copy()
-    rows["first"] += by
-    rows["last"] += by
-    return rows.tobytes()
-
-
 def _moved_events(story: TopicEvents, by: int) -> TopicEvents:
     return replace(
         story,
         first=story.first + by,
         last=story.last + by,
-        visible=story.visible._replace(rows=_moved_rows(story.visible.rows, by)),
+        visible=story.visible._replace(rows=moved_rows(story.visible.rows, by)),
         known=tuple(each._replace(at=each.at + by) for each in story.known),
         toggles=tuple(each._replace(time=each.time + by) for each in story.toggles),
         errors=tuple(

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import math
-import zlib
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import accumulate, combinations
@@ -562,7 +561,7 @@ def encode_sights(sights: Sights) -> bytes:
         blocks.append(planes.tobytes())
         shapes.append((len(table), size))
     head = json.dumps([base, sights.frame_id, sights.topics, sights.labels, shapes])
-    return zlib.compress(b"\n".join((head.encode(), b"".join(blocks))))
+    return b"\n".join((head.encode(), b"".join(blocks)))
 
 
 def decode_sights(packed: bytes) -> Sights:
@@ -574,7 +573,7 @@ def decode_sights(packed: bytes) -> Sights:
     if not packed:
         return no_sights()
     try:
-        head, _, body = zlib.decompress(packed).partition(b"\n")
+        head, _, body = packed.partition(b"\n")
         base, frame_id, topics, labels, shapes = json.loads(head)
         if len(shapes) != len(_TABLES):
             raise ValueError("not sights: tables are missing")
@@ -601,6 +600,6 @@ def decode_sights(packed: bytes) -> Sights:
             for column in times:
                 table[:, column] = table[:, column] * _NS_PER_US + base
             tables.append(table)
-    except (TypeError, KeyError, zlib.error, OverflowError) as error:
+    except (TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"not sights: {error}") from error
     return Sights(tuple(topics), tuple(labels), tuple(tables), frame_id=frame_id)

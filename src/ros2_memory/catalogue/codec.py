@@ -1,7 +1,8 @@
 """Encodes digests as the bytes and texts in the catalogue. Exact: floats stay bit by bit.
 
-JSON, and packed numbers (little-endian) where there are many. The layouts belong to the
-catalogue's schema version.
+JSON, and packed numbers (little-endian) where there are many; times count from the first message,
+so that what happened likewise in two bags is equal, and `packing` stores it once. The layouts
+belong to the catalogue's schema version.
 """
 
 from __future__ import annotations
@@ -9,12 +10,11 @@ from __future__ import annotations
 import json
 import math
 import struct
-import zlib
 from dataclasses import fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.intervals import IntervalTable
+from ros2_memory.analysis.intervals import IntervalTable, moved_rows
 from ros2_memory.analysis.motion.odometry import (
     Leg,
     MotionTotals,
@@ -33,6 +33,7 @@ from ros2_memory.analysis.state_changes import (
     StateChanges,
 )
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
+from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
@@ -42,8 +43,9 @@ if TYPE_CHECKING:
 
 _VERTEX: Final = struct.Struct("<qdddd")
 _EVENTS: Final = struct.Struct("<qqqqqI")
-_MIN_COMPRESSED_BYTES: Final = 256
-"""A shorter text is not worth compressing."""
+_ZONES: Final = struct.Struct("<Bdd")
+_BOUNDS: Final = struct.Struct("<6d")
+_OPEN, _TEXTS, _FALSE, _TRUE, _WORDS, _BOX = 1, 2, 4, 8, 16, 32
 
 
 def encode_poses(poses: PoseDigest) -> bytes:
@@ -89,7 +91,7 @@ def encode_standstills(digest: StandstillDigest) -> bytes:
     sizes = json.dumps([len(head), digest.head_until, len(tail), digest.tail_since, chains, drops])
     blocks = (each.blocks for each in digest.chains)
     parts = (sizes.encode(), b"\n", head, tail, *blocks, slowed.head, slowed.tail)
-    return zlib.compress(b"".join(parts))
+    return b"".join(parts)
 
 
 def decode_standstills(packed: bytes) -> StandstillDigest:
@@ -98,8 +100,8 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     Raises:
         ValueError: the bytes are not one.
     """
+    sizes, _, body = packed.partition(b"\n")
     try:
-        sizes, _, body = zlib.decompress(packed).partition(b"\n")
         head, head_until, tail, tail_since, chains, drops = json.loads(sizes)
         at = head + tail
         unpacked = []
@@ -113,7 +115,7 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
             tuple(SpeedDrop(*each) for each in found),
         )
         at += first + last
-    except (TypeError, zlib.error) as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"not a digest of standstills: {error}") from error
     if at != len(body):
         raise ValueError("not a digest of standstills: some of it is missing")
@@ -122,16 +124,67 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     )
 
 
+def encode_zone_map(zones: ZoneMap) -> bytes:
+    """Encodes a zone map."""
+    flags = (
+        zones.open * _OPEN
+        | zones.texts * _TEXTS
+        | (False in zones.booleans) * _FALSE
+        | (True in zones.booleans) * _TRUE
+        | (zones.words is not None) * _WORDS
+        | (zones.box is not None) * _BOX
+    )
+    numbers = json.dumps(zones.numbers, separators=(",", ":"))
+    return b"".join(
+        (
+            _ZONES.pack(flags, zones.low, zones.high),
+            b"" if zones.box is None else _BOUNDS.pack(*zones.box),
+            numbers.encode(),
+            b"\n",
+            (zones.words or "").encode("utf-8", "surrogatepass"),
+        )
+    )
+
+
+def decode_zone_map(packed: bytes) -> ZoneMap:
+    """Decodes a zone map.
+
+    Raises:
+        ValueError: the bytes are not one.
+    """
+    try:
+        flags, low, high = _ZONES.unpack_from(packed)
+        if flags & _OPEN:
+            return UNBOUNDED
+        box, end = None, _ZONES.size
+        if flags & _BOX:
+            box, end = Box(*_BOUNDS.unpack_from(packed, end)), end + _BOUNDS.size
+        numbers, _, words = packed[end:].partition(b"\n")
+        known = json.loads(numbers)
+        return ZoneMap(
+            words=words.decode("utf-8", "surrogatepass") if flags & _WORDS else None,
+            texts=bool(flags & _TEXTS),
+            booleans=(False,) * bool(flags & _FALSE) + (True,) * bool(flags & _TRUE),
+            low=low,
+            high=high,
+            numbers=None if known is None else tuple(known),
+            box=box,
+        )
+    except (TypeError, struct.error) as error:
+        raise ValueError(f"not a zone map: {error}") from error
+
+
 def encode_topic_events(events: TopicEvents | None) -> bytes:
     """Encodes the events of a topic; None, where no message can be decoded, as no bytes."""
     if events is None:
         return b""
-    counts = (events.first, events.last, events.left_out, events.undecodable, events.beyond)
+    first = events.first
+    counts = (first, events.last - first, events.left_out, events.undecodable, events.beyond)
     # Paths, and times relative to the first message, are equal in many bags: _decode_text caches
     # them.
     known = [
         [each.path for each in events.known],
-        [each.at - events.first for each in events.known],
+        [each.at - first for each in events.known],
         "".join(str(each.first + 2 * each.last) for each in events.known),
     ]
     changes = events.changes
@@ -141,16 +194,15 @@ def encode_topic_events(events: TopicEvents | None) -> bytes:
             known,
             events.toggles,
             events.errors,
-            *([] if changes is NO_CHANGES else [_parts(_since(-events.first, changes))]),
+            *([] if changes is NO_CHANGES else [_parts(_since(-first, changes))]),
         ],
         ensure_ascii=False,
         separators=(",", ":"),
     )
-    rows = events.visible.rows
+    rows = moved_rows(events.visible.rows, -first)
     # A lone surrogate is not valid UTF-8, and JSON of a message may contain one.
     text = rest.encode("utf-8", "surrogatepass")
-    shorter = zlib.compress(text) if len(text) > _MIN_COMPRESSED_BYTES else text
-    return _EVENTS.pack(*counts, len(rows)) + rows + shorter
+    return _EVENTS.pack(*counts, len(rows)) + rows + text
 
 
 def decode_topic_events(packed: bytes) -> TopicEvents | None:
@@ -162,7 +214,7 @@ def decode_topic_events(packed: bytes) -> TopicEvents | None:
     if not packed:
         return None
     try:
-        first, last, left_out, undecodable, beyond, size = _EVENTS.unpack_from(packed)
+        first, lasted, left_out, undecodable, beyond, size = _EVENTS.unpack_from(packed)
         end = _EVENTS.size + size
         labels, (paths, after, values), flips, faults, relative = _decode_text(packed[end:])
         known = tuple(
@@ -170,11 +222,13 @@ def decode_topic_events(packed: bytes) -> TopicEvents | None:
             for path, at, value in zip(paths, after, values, strict=True)
         )
         changes = _since(first, relative)
-    except (TypeError, struct.error, zlib.error) as error:
+        rows = moved_rows(packed[_EVENTS.size : end], first)
+    except (TypeError, struct.error) as error:
         raise ValueError(f"not the events of a topic: {error}") from error
-    seen = IntervalTable(labels, packed[_EVENTS.size : end])
+    seen = IntervalTable(labels, rows)
     if not seen.is_sound:
         raise ValueError("not the events of a topic: a label is missing")
+    last = first + lasted
     return TopicEvents(
         first, last, seen, known, flips, faults, left_out, undecodable, beyond, changes
     )
@@ -213,9 +267,8 @@ def _decode_text(
 
     Cached, since those of many bags are equal.
     """
-    plain = text if text.startswith(b"[") else zlib.decompress(text)
     labels, (paths, after, values), flips, faults, *changes = json.loads(
-        plain.decode("utf-8", "surrogatepass")
+        text.decode("utf-8", "surrogatepass")
     )
     return (
         tuple(labels),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-VERSION: Final = 6
+VERSION: Final = 7
 """Version of the tables below and of their content; a file of any other version is set aside."""
 
 BUSY_S: Final = 1.0
@@ -33,17 +33,18 @@ RETRY_S: Final = 10.0
 _SHORT_MS: Final = 20
 """How long SQLite waits in one attempt: whoever asks a question waits for it too."""
 _PAUSE_S: Final = 0.02
-_ROW_ID_BITS: Final = 40
+ROW_ID_BITS: Final = 40
 """An entry's number is the row's id in these low bits, and in the others which database it is of.
 
 So the number of an entry in a file that was lost never means a row of the file that replaced it.
+In the tables `held` and `tales` the other bits are the topic's, so that its rows lie together.
 """
 _SUFFIXES: Final = ("-wal", "-shm")
 """The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
 _FIRST_ROWS: Final = """
 SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
   (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes),
-  (SELECT 1 FROM maps), (SELECT 1 FROM ranges), (SELECT 1 FROM fields)
+  (SELECT 1 FROM maps), (SELECT 1 FROM ranges), (SELECT 1 FROM fields), (SELECT 1 FROM models)
 """
 _TABLES: Final = """
 CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
@@ -51,14 +52,11 @@ CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, p
   shape INTEGER NOT NULL, counts BLOB NOT NULL, UNIQUE (config, path));
 CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
-CREATE TABLE held (topic INTEGER NOT NULL, bag INTEGER NOT NULL, flags INTEGER NOT NULL,
-  words TEXT, low REAL NOT NULL, high REAL NOT NULL, numbers TEXT,
-  min_x REAL, max_x REAL, min_y REAL, max_y REAL, min_z REAL, max_z REAL,
-  poses BLOB, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER, kept INTEGER,
-  undecodable TEXT,
-  PRIMARY KEY (topic, bag)) WITHOUT ROWID;
-CREATE TABLE tales (topic INTEGER NOT NULL, bag INTEGER NOT NULL, rests BLOB, story BLOB,
-  PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
+  kept INTEGER, undecodable TEXT, zones BLOB, poses BLOB);
+CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB, story BLOB);
+CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
+  PRIMARY KEY (topic, kind)) WITHOUT ROWID;
 CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
   sights BLOB NOT NULL);
 CREATE TABLE ranges (topic INTEGER NOT NULL, bag INTEGER NOT NULL, fields INTEGER NOT NULL,
@@ -71,7 +69,8 @@ CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT
 CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
   encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
   schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
-CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer TEXT NOT NULL);
+CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer BLOB NOT NULL)
+  WITHOUT ROWID;
 CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
 """
 
@@ -153,7 +152,7 @@ class CatalogueDatabase:
     @property
     def offset(self) -> int:
         """What is added to a row's id in the open database to give the number of its entry."""
-        return self._databases << _ROW_ID_BITS
+        return self._databases << ROW_ID_BITS
 
     def row_ids(self, numbers: Sequence[int]) -> Sequence[int]:
         """Returns the row ids of these entries, without those of a database that was lost."""
@@ -162,7 +161,7 @@ class CatalogueDatabase:
 
     def is_current(self, number: int) -> bool:
         """Returns whether an entry is of the open database, and of none that was lost."""
-        return number >> _ROW_ID_BITS == self._databases
+        return number >> ROW_ID_BITS == self._databases
 
     def close(self) -> None:
         """Closes the connection for good; afterwards nothing is known."""

@@ -11,15 +11,17 @@ import json
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.topic_events import TopicEvents
-from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
 from ros2_memory.catalogue.codec import (
     encode_poses,
     encode_schema,
     encode_standstills,
     encode_topic_events,
+    encode_zone_map,
 )
+from ros2_memory.catalogue.database import ROW_ID_BITS
 from ros2_memory.catalogue.field_columns import encode_field_ranges
 from ros2_memory.catalogue.map_digest import encode_map_track
+from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 
 if TYPE_CHECKING:
     import sqlite3
@@ -31,19 +33,20 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import Record
 
-_UNBOUNDED, _TEXTS, _FALSE, _TRUE = 1, 2, 4, 8
-QUIET: Final = 0
-"""Stands in `EVENTS` for messages without an event: `tales` has no row of these."""
+NO_TOPIC: Final = 0
+"""Stands for the topic of models of what belongs to no topic."""
 _TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 
-# Columns for `topic_rows`.
-ZONE_MAP: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y, min_z, max_z"
-EVENTS: Final = f"""coalesce((
-  SELECT story FROM tales WHERE tales.topic = held.topic AND tales.bag = held.bag), {QUIET})"""
-EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
+# Columns for `topic_rows`. Those of one word are packed, and the word is the kind of their model.
+ZONE_MAP: Final = "zones"
+POSES: Final = "poses"
 STANDSTILLS: Final = "rests"
+STORY: Final = "story"
+EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
+TRACK: Final = "track"
+SIGHTS: Final = "sights"
 
 
 def entry_rows(
@@ -61,10 +64,37 @@ def topic_rows(
 ) -> list[sqlite3.Row]:
     """Returns the row id and these columns of what entries hold of a topic."""
     table = "tales" if columns == STANDSTILLS else "held"
+    if columns == STORY:  # `tales` has no row of messages without an event
+        columns = f"(SELECT {STORY} FROM tales WHERE tales.id = held.id)"
+    number = topic_number(connection, topic)
+    base = number << ROW_ID_BITS
     return connection.execute(
-        f"SELECT bag, {columns} FROM {table} WHERE topic = {_TOPIC} AND bag {_AMONG}",
-        (topic, json.dumps(row_ids)),
+        f"SELECT id - ?, {columns} FROM {table} WHERE id IN (SELECT value + ? FROM json_each(?))",
+        (base, base, json.dumps(row_ids)),
     ).fetchall()
+
+
+def topic_number(connection: sqlite3.Connection, topic: str) -> int:
+    """Returns the number of a topic; `NO_TOPIC` where no entry has it."""
+    row = connection.execute("SELECT id FROM topics WHERE name = ?", (topic,)).fetchone()
+    return NO_TOPIC if row is None else int(row[0])
+
+
+def model_of(connection: sqlite3.Connection, topic: int, kind: str) -> bytes:
+    """Returns the model that what is stored of a kind and topic was packed with, if any."""
+    row = connection.execute(
+        "SELECT bytes FROM models WHERE topic = ? AND kind = ?", (topic, kind)
+    ).fetchone()
+    return b"" if row is None else bytes(row[0])
+
+
+def packed_by_model(connection: sqlite3.Connection, topic: int, kind: str, plain: bytes) -> bytes:
+    """Packs what is to be stored; the first of its kind becomes the model."""
+    model = model_of(connection, topic, kind)
+    if plain and not model:
+        model = plain[:MAX_MODEL_BYTES]
+        connection.execute("INSERT INTO models VALUES (?, ?, ?)", (topic, kind, model))
+    return packed(plain, model)
 
 
 def message_rows(
@@ -86,7 +116,12 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
     listed = json.dumps(row_ids)
     # Topic by topic: the primary keys begin with the topic.
     for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
-        for table in ("held", "tales", "ranges", "kept"):
+        for table in ("held", "tales"):
+            connection.execute(
+                f"DELETE FROM {table} WHERE id IN (SELECT value + ? FROM json_each(?))",
+                (topic << ROW_ID_BITS, listed),
+            )
+        for table in ("ranges", "kept"):
             connection.execute(
                 f"DELETE FROM {table} WHERE topic = ? AND bag {_AMONG}", (topic, listed)
             )
@@ -120,7 +155,12 @@ def insert_entry(
 def _insert_map(connection: sqlite3.Connection, bag: int, digest: MapDigest) -> None:
     connection.execute(
         "INSERT INTO maps VALUES (?, ?, ?, ?)",
-        (bag, digest.statics, encode_map_track(digest), digest.sights),
+        (
+            bag,
+            digest.statics,
+            packed_by_model(connection, NO_TOPIC, TRACK, encode_map_track(digest)),
+            packed_by_model(connection, NO_TOPIC, SIGHTS, digest.sights),
+        ),
     )
 
 
@@ -134,30 +174,20 @@ def map_rows(
 
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:
-    zones, edges = topic.zone_map, topic.edges
-    flags = (
-        zones.open * _UNBOUNDED
-        | zones.texts * _TEXTS
-        | (False in zones.booleans) * _FALSE
-        | (True in zones.booleans) * _TRUE
-    )
+    number, bag = key
+    edges, poses = topic.edges, topic.poses
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 19)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 8)})",
         (
-            *key,
-            flags,
-            zones.words,
-            zones.low,
-            zones.high,
-            None if zones.numbers is None else json.dumps(zones.numbers),
-            *(zones.box or (None,) * 6),
-            None if topic.poses is None else encode_poses(topic.poses),
+            number << ROW_ID_BITS | bag,
             pairs,
             None if edges is None else edges.first_stamp,
             None if edges is None else edges.last_stamp,
             topic.kept is not None,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
+            packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),
+            poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
         ),
     )
 
@@ -166,17 +196,18 @@ def _insert_events(
     connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest, summary: BagSummary
 ) -> None:
     """Inserts the topic's standstills and events; no row where there are none."""
+    number, bag = key
     spans = [(each.first, each.last) for each in summary.of(topic.topic)]
     quiet = TopicEvents(min(first for first, _ in spans), max(last for _, last in spans))
-    if topic.standstills is None and topic.events == quiet:
+    rests = topic.standstills
+    if rests is None and topic.events == quiet:
         return
+    rested = rests and packed_by_model(connection, number, STANDSTILLS, encode_standstills(rests))
+    story = None
+    if topic.events != quiet:
+        story = packed_by_model(connection, number, STORY, encode_topic_events(topic.events))
     connection.execute(
-        "INSERT INTO tales VALUES (?, ?, ?, ?)",
-        (
-            *key,
-            None if topic.standstills is None else encode_standstills(topic.standstills),
-            None if topic.events == quiet else encode_topic_events(topic.events),
-        ),
+        "INSERT INTO tales VALUES (?, ?, ?)", (number << ROW_ID_BITS | bag, rested, story)
     )
 
 
@@ -235,19 +266,3 @@ def _id_of(connection: sqlite3.Connection, table: str, column: str, text: str) -
     connection.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
     row = connection.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()
     return int(row[0])
-
-
-def zone_map(row: sqlite3.Row) -> ZoneMap:
-    """Decodes the columns `ZONE_MAP` of a row."""
-    _, flags, words, low, high, numbers, *box = row
-    if flags & _UNBOUNDED:
-        return UNBOUNDED
-    return ZoneMap(
-        words=words,
-        texts=bool(flags & _TEXTS),
-        booleans=(False,) * bool(flags & _FALSE) + (True,) * bool(flags & _TRUE),
-        low=low,
-        high=high,
-        numbers=None if numbers is None else tuple(json.loads(numbers)),
-        box=None if box[0] is None else Box(*box),
-    )

@@ -22,15 +22,20 @@ from ros2_memory.catalogue.codec import (
     decode_schema,
     decode_standstills,
     decode_topic_events,
+    decode_zone_map,
 )
 from ros2_memory.catalogue.database import CatalogueDatabase
 from ros2_memory.catalogue.field_columns import field_column
 from ros2_memory.catalogue.map_digest import decode_map_track
+from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.sql import (
     EDGES,
-    EVENTS,
-    QUIET,
+    NO_TOPIC,
+    POSES,
+    SIGHTS,
     STANDSTILLS,
+    STORY,
+    TRACK,
     UNDECODABLE,
     ZONE_MAP,
     delete_entries,
@@ -38,9 +43,11 @@ from ros2_memory.catalogue.sql import (
     insert_entry,
     map_rows,
     message_rows,
+    model_of,
+    packed_by_model,
     range_rows,
+    topic_number,
     topic_rows,
-    zone_map,
 )
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.core.bag_summary import BagSummary
@@ -176,23 +183,19 @@ class Catalogue(CatalogueDatabase):
 
     def zone_maps(self, topic: str, numbers: Sequence[int]) -> dict[int, ZoneMap]:
         """Returns what can be in the messages of the topic, by entry."""
-        return self._of_topic(topic, numbers, ZONE_MAP, zone_map)
+        return self._packed_of_topic(topic, numbers, ZONE_MAP, decode_zone_map)
 
     def poses(self, topic: str, numbers: Sequence[int]) -> dict[int, PoseDigest]:
         """Returns the digests of the topic's poses; not where some message carries no pose."""
-        return self._of_topic(topic, numbers, "poses", lambda row: decode_poses(row[1]))
+        return self._packed_of_topic(topic, numbers, POSES, decode_poses)
 
     def standstills(self, topic: str, numbers: Sequence[int]) -> dict[int, StandstillDigest]:
         """Returns the standstills among the topic's poses; not where some message has no pose."""
-        return self._of_topic(topic, numbers, STANDSTILLS, lambda row: decode_standstills(row[1]))
+        return self._packed_of_topic(topic, numbers, STANDSTILLS, decode_standstills)
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""
-
-        def decode(row: sqlite3.Row) -> TopicEvents | None:
-            return NO_EVENTS if row[1] == QUIET else decode_topic_events(row[1])
-
-        return self._of_topic(topic, numbers, EVENTS, decode)
+        return self._packed_of_topic(topic, numbers, STORY, decode_topic_events, NO_EVENTS)
 
     def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
         """Returns the frame edges of the topic; not where they are not all known."""
@@ -219,22 +222,28 @@ class Catalogue(CatalogueDatabase):
 
     def maps(self, numbers: Sequence[int]) -> dict[int, MapDigest]:
         """Returns the map digests of entries, without their sights."""
-        return self._of_map(numbers, "track", lambda row: decode_map_track(row[2], row[1]))
+        return self._of_map(numbers, TRACK, decode_map_track)
 
     def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
         """Returns, by entry, the hash of the static transforms its map digest was made with."""
-        return self._of_map(numbers, "1", lambda row: int(row[1]))
+        return self._of_map(numbers, "x''", lambda _, key: key)
 
     def sights(self, numbers: Sequence[int]) -> dict[int, tuple[int, bytes]]:
         """Returns, by entry, the hash as of `map_keys`, and the bytes of its sights."""
-        return self._of_map(numbers, "sights", lambda row: (int(row[1]), bytes(row[2])))
+        return self._of_map(numbers, SIGHTS, lambda plain, key: (key, plain))
 
     def _of_map(
-        self, numbers: Sequence[int], columns: str, decode: Callable[[sqlite3.Row], T]
+        self, numbers: Sequence[int], column: str, decode: Callable[[bytes, int], T]
     ) -> dict[int, T]:
+        """Decodes a column of map digests, which it gets with their hash, by entry."""
+
         def ask(connection: sqlite3.Connection) -> dict[int, T]:
-            rows = map_rows(connection, columns, self.row_ids(numbers))
-            return {self.offset + row[0]: decode(row) for row in rows}
+            model = model_of(connection, NO_TOPIC, column)
+            rows = map_rows(connection, column, self.row_ids(numbers))
+            return {
+                self.offset + number: decode(unpacked(stored, model), int(key))
+                for number, key, stored in rows
+            }
 
         return self.read(ask, {})
 
@@ -255,6 +264,33 @@ class Catalogue(CatalogueDatabase):
             offset = self.offset
             rows = topic_rows(connection, columns, topic, self.row_ids(numbers))
             return {offset + row[0]: decode(row) for row in rows if row[1] is not None}
+
+        return self.read(ask, {})
+
+    def _packed_of_topic(
+        self,
+        topic: str,
+        numbers: Sequence[int],
+        kind: str,
+        decode: Callable[[bytes], T],
+        absent: T | None = None,
+    ) -> dict[int, T]:
+        """Decodes what is packed of one topic, by entry.
+
+        Where there is none it is `absent`; without that, the entry is left out.
+        """
+
+        def ask(connection: sqlite3.Connection) -> dict[int, T]:
+            offset = self.offset
+            model = model_of(connection, topic_number(connection, topic), kind)
+            rows = topic_rows(connection, kind, topic, self.row_ids(numbers))
+            found: dict[int, T] = {}
+            for number, stored in rows:
+                if stored is not None:
+                    found[offset + number] = decode(unpacked(stored, model))
+                elif absent is not None:
+                    found[offset + number] = absent
+            return found
 
         return self.read(ask, {})
 
@@ -296,9 +332,33 @@ class Catalogue(CatalogueDatabase):
             row = connection.execute(
                 "SELECT answer FROM remembered WHERE question = ?", (key,)
             ).fetchone()
-            return None if row is None else str(row[0])
+            if row is None:
+                return None
+            model = model_of(connection, NO_TOPIC, _kind_of(question))
+            return unpacked(row[0], model).decode("utf-8", "surrogatepass")
 
         return self.read(ask, None)
+
+    def cached_answers(self, question: str) -> dict[tuple[int, ...], str]:
+        """Returns all answers to a question that are stored, by the numbers of the entries."""
+        begin = f"[{json.dumps(question)}, "
+
+        def ask(connection: sqlite3.Connection) -> dict[tuple[int, ...], str]:
+            offset = self.offset
+            model = model_of(connection, NO_TOPIC, _kind_of(question))
+            # Keys are ASCII, and a digit follows, which is less than a colon.
+            rows = connection.execute(
+                "SELECT question, answer FROM remembered WHERE question > ? AND question < ?",
+                (begin, f"{begin}:"),
+            )
+            return {
+                tuple(offset + number for number in json.loads(key)[1:]): unpacked(
+                    stored, model
+                ).decode("utf-8", "surrogatepass")
+                for key, stored in rows
+            }
+
+        return self.read(ask, {})
 
     def cache_answer(self, question: str, numbers: Sequence[int], answer: str) -> None:
         """Stores what was computed from these entries, until the oldest of them is deleted."""
@@ -306,9 +366,11 @@ class Catalogue(CatalogueDatabase):
         def write(connection: sqlite3.Connection) -> None:
             row_ids = self.row_ids(numbers)
             if len(row_ids) == len(numbers):
+                plain = answer.encode("utf-8", "surrogatepass")
+                stored = packed_by_model(connection, NO_TOPIC, _kind_of(question), plain)
                 connection.execute(
                     "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
-                    (json.dumps([question, *row_ids]), min(row_ids), answer),
+                    (json.dumps([question, *row_ids]), min(row_ids), stored),
                 )
 
         self.write(write)
@@ -361,6 +423,11 @@ class Catalogue(CatalogueDatabase):
     def _delete_paths(self, connection: sqlite3.Connection, paths: Sequence[str]) -> None:
         rows = entry_rows(connection, self._config, paths)
         delete_entries(connection, [row[0] for row in rows])
+
+
+def _kind_of(question: str) -> str:
+    """Returns the kind of a question's answers, by its first word."""
+    return f"answer {question.partition(' ')[0]}"
 
 
 def _time_spans(schema: SummarySchema, counts: Sequence[bytes]) -> tuple[list[Ns], list[Ns]]:

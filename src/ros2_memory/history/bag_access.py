@@ -21,7 +21,7 @@ from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
@@ -115,18 +115,23 @@ class BagAccess:
         self, question: str, bags: Sequence[BagSpan], parse: Callable[[str], T]
     ) -> T | None:
         """Returns what was computed from these bags before; None where the catalogue has none."""
-        cache, numbers = self.memory.recall, self._entry_numbers(bags)
+        cache, numbers = self.memory.recall, self.entry_numbers(bags)
         if cache is None or numbers is None:
             return None
         return cache.cached_answer(question, numbers, parse)
 
+    def cached_answers(self, question: str) -> Mapping[tuple[int, ...], str]:
+        """Returns all answers to a question that were stored, by the bags' `entry_numbers`."""
+        cache = self.memory.recall
+        return {} if cache is None else cache.catalogue.cached_answers(question)
+
     def cache_answer(self, question: str, bags: Sequence[BagSpan], answer: str) -> None:
         """Stores what was computed from these bags, unless something could not be read."""
-        cache, numbers = self.memory.recall, self._entry_numbers(bags)
+        cache, numbers = self.memory.recall, self.entry_numbers(bags)
         if cache is not None and numbers is not None and self.notes.complete:
             cache.catalogue.cache_answer(question, numbers, answer)
 
-    def _entry_numbers(self, bags: Sequence[BagSpan]) -> list[int] | None:
+    def entry_numbers(self, bags: Sequence[BagSpan]) -> list[int] | None:
         """Returns the numbers of the bags' entries; None where one has none."""
         entries = [self.entry(each.bag) for each in bags]
         numbers = [entry[1] for entry in entries if entry is not None]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MIN_NS, Ns
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Span: TypeAlias = tuple[Ns, Ns]
 """Log times of a first and a last message, both inclusive."""
+
+
+_ONE_BY_ONE: Final = 8
+"""Groups of several bags whose digests are looked up one by one; then all are read."""
 
 
 class MessagePosition(NamedTuple):
@@ -186,13 +190,15 @@ class StoredDigests(Generic[T]):
         self._question = f"{kind.name} {topic}"
         self._segment: SegmentDigests | None = None
         self._known: Mapping[int, T] = {}
+        self._asked = 0
+        self._answers: Mapping[tuple[int, ...], str] | None = None
 
     def of(self, group: Group) -> tuple[T, Span] | None:
         """Returns a group's digest and the times of its first and last message, if stored."""
         if group.may_be_relatched:
             return None
         if len(group.bags) > 1:
-            return self._view.bags.cached_answer(self._question, group.bags, self._decode)
+            return self._of_several(group)
         [span] = group.bags
         number = None if self._segment is None else self._segment.numbers.get(span.bag.file)
         if number is None:
@@ -200,6 +206,21 @@ class StoredDigests(Generic[T]):
         if number not in self._known:
             return None
         return self._known[number], (span.first, span.last)
+
+    def _of_several(self, group: Group) -> tuple[T, Span] | None:
+        """Returns what is stored of several bags: where they are many, all is read at once."""
+        self._asked += 1
+        if self._asked <= _ONE_BY_ONE:
+            return self._view.bags.cached_answer(self._question, group.bags, self._decode)
+        if self._answers is None:
+            self._answers = self._view.bags.cached_answers(self._question)
+        numbers = self._view.bags.entry_numbers(group.bags)
+        answer = None if numbers is None else self._answers.get(tuple(numbers))
+        try:
+            return None if answer is None else self._decode(answer)
+        # A damaged file can hold anything.
+        except (ValueError, TypeError, LookupError):
+            return None
 
     def _enter_segment(self, span: BagSpan) -> int:
         """Looks up the digests of all bags in the segment of this one; returns its number.
@@ -230,6 +251,30 @@ class StoredDigests(Generic[T]):
     def _decode(self, answer: str) -> tuple[T, Span]:
         digest, first, last = json.loads(answer)
         return self._kind.decode(bytes.fromhex(digest)), (int(first), int(last))
+
+
+def store_shared(
+    view: View,
+    topic: str,
+    kind: DigestKind[T],
+    collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]],
+    window: TimeWindow,
+) -> int:
+    """Stores the digests of all groups of several bags in a window that have none.
+
+    So the first question about them need not read bags. Returns how many it stored.
+    """
+    stored = StoredDigests(view, topic, kind, window)
+    done = 0
+    for group in groups_of(view.stream, topic, window):
+        if len(group.bags) < 2 or not group.is_whole or group.may_be_relatched:
+            continue
+        if stored.of(group) is None:
+            made, span = collect(group.messages())
+            if made is not None and span is not None:
+                stored.store(group, made, span)
+                done += 1
+    return done
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.history.bag_groups import DigestKind, Fold
+from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
 from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
 
 if TYPE_CHECKING:
@@ -94,6 +94,24 @@ def driven_path(
         count = len(failures)
         view.notes.add(f"poses left out, since they cannot be decoded: {count} ({error.reason})")
     return None if span is None else DrivenPath(builder.result(), builder.frames, *span)
+
+
+def store_shared_paths(view: View, topic: str, window: TimeWindow) -> int:
+    """Stores the poses of recordings that touch each other; returns of how many groups of bags.
+
+    Raises:
+        InvalidArgumentsError: a message of the topic carries no position.
+    """
+    fastest = view.memory.limits.max_plausible_speed_mps
+    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
+
+    def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest | None, Span | None]:
+        failures: list[UndecodableError] = []
+        collector = PoseCollector(fastest)
+        span = add_poses(view, collector.add, decoder, messages, failures)
+        return (None if failures else collector.digest()), span
+
+    return store_shared(view, topic, POSES, collect, window)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:

@@ -26,7 +26,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.bag_groups import DigestKind, Fold
+from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
 from ros2_memory.history.driven_path import add_poses, driven_path
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
@@ -34,6 +34,7 @@ from ros2_memory.history.robots import note_robots
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -114,6 +115,39 @@ _STANDSTILLS: Final = DigestKind(
 )
 
 
+def store_shared_standstills(view: View, topic: str, window: TimeWindow) -> int:
+    """Stores the standstills of recordings that touch each other; returns of how many groups.
+
+    Raises:
+        InvalidArgumentsError: a message of the topic carries no position.
+    """
+    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
+
+    def collect(
+        messages: Iterable[StoredMessage],
+    ) -> tuple[StandstillDigest | None, Span | None]:
+        failures: list[UndecodableError] = []
+        collector = StandstillCollector()
+        span = _add_places(view, collector, decoder, messages, failures)
+        return (None if failures else collector.digest()), span
+
+    return store_shared(view, topic, _STANDSTILLS, collect, window)
+
+
+def _add_places(
+    view: View,
+    to: StandstillBuilder | StandstillCollector,
+    decoder: BulkDecoder[MotionSample],
+    messages: Iterable[StoredMessage],
+    failures: list[UndecodableError],
+) -> Span | None:
+    def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
+        if is_place(pose.position):
+            to.add(time, pose.position, pose.orientation)
+
+    return add_poses(view, add_place, decoder, messages, failures)
+
+
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
@@ -134,25 +168,16 @@ def _standstills_in(
     decoder = motion_decoder(view.memory.reader, view.memory.extractor)
     failures: list[UndecodableError] = []
 
-    def add(
-        to: StandstillBuilder | StandstillCollector, messages: Iterable[StoredMessage]
-    ) -> Span | None:
-        def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
-            if is_place(pose.position):
-                to.add(time, pose.position, pose.orientation)
-
-        return add_poses(view, add_place, decoder, messages, failures)
-
     def collect(
         messages: Iterable[StoredMessage],
     ) -> tuple[StandstillDigest | None, Span | None]:
         collector = StandstillCollector()
-        span = add(collector, messages)
+        span = _add_places(view, collector, decoder, messages, failures)
         return collector.digest(), span
 
     Fold(
         _STANDSTILLS,
-        add=lambda messages: add(builder, messages),
+        add=lambda messages: _add_places(view, builder, decoder, messages, failures),
         collect=collect,
         join=lambda digest, _span: builder.join(digest),
         failures=failures,

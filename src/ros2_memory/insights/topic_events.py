@@ -14,7 +14,7 @@ from ros2_memory.analysis.topic_events import (
 )
 from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.history.bag_groups import DigestKind, Fold
+from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -54,6 +54,11 @@ def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
         join=join,
     ).over(view, topic, window)
     return builder.events()
+
+
+def store_shared_events(view: View, topic: str, window: TimeWindow) -> int:
+    """Stores the events of recordings that touch each other; returns of how many groups of bags."""
+    return store_shared(view, topic, TOPIC_EVENTS, partial(collect_events, view), window)
 
 
 def collect_events(

@@ -18,20 +18,25 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import anyio
 import anyio.to_thread
 
+from ros2_memory.analysis.topic_events import has_events
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ms_from_ns, unix_from_ns
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange, View
+from ros2_memory.history.driven_path import store_shared_paths
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
+from ros2_memory.insights.drive import store_shared_standstills
+from ros2_memory.insights.topic_events import store_shared_events
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import MapDigests
-from ros2_memory.queries import list_recorded_topics, trajectory_summary
+from ros2_memory.queries import list_recorded_topics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,6 +60,8 @@ PRUNE_INTERVAL_S: Final = 600.0
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be digested is tried again: the disk may have failed."""
 
+_BESIDE_NS: Final[Ns] = 3600 * NS_PER_S
+"""Bags that are older than a new one by more than this do not touch it."""
 _MAX_REFUSED: Final = 10_000
 
 
@@ -91,6 +98,7 @@ class Backfill:
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
+        self._shared_from: Ns = MIN_NS
         self._view: View | None = None
         self._stale: tuple[Timeline, int, list[BagFile]] | None = None
 
@@ -155,6 +163,7 @@ class Backfill:
             return False
         if not self.catalogue.put(self._key(bag), digest):
             return False
+        self._shared_from = min(self._shared_from, bag.start)
         log.debug(
             "bag_digested",
             path=str(bag.path),
@@ -176,13 +185,27 @@ class Backfill:
             self.catalogue.look_after(thorough=thorough)
 
     def precompute(self) -> None:
-        """Computes what overlapping recordings hold together, before a client asks."""
+        """Computes what overlapping recordings hold together, before a client asks.
+
+        What was computed once is not looked at again, but for the hour before the bags that were
+        digested since.
+        """
         with suppress(EpisodicError):
             rows = list_recorded_topics(self._memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
+        since, self._shared_from = self._shared_from, MAX_NS
+        if since == MAX_NS:
+            return
+        view = View(self._memory, Call())
+        window = TimeWindow(max(since - _BESIDE_NS, MIN_NS), MAX_NS)
         with suppress(EpisodicError):
-            everything = TimeRange(start_s=0.0, end_s=unix_from_ns(MAX_NS))
-            trajectory_summary(self._memory, Call(), everything)
+            poses = resolve_pose_topic(view)
+            store_shared_paths(view, poses, window)
+            store_shared_standstills(view, poses, window)
+        for topic, types in view.snapshot.timeline.types.items():
+            if any(has_events(each) for each in types):
+                with suppress(EpisodicError):
+                    store_shared_events(view, topic, window)
 
     def prune(self) -> None:
         """Removes the entries of deleted files, and those of older configurations.

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 
 import numpy as np
 import pytest
@@ -180,10 +179,10 @@ def test_joining_is_associative(
 
 @pytest.mark.parametrize(
     "packed",
-    [b"nothing", zlib.compress(b"nothing"), zlib.compress(b'[0,"",["/a"],[],[[9,9]]]\n12345')],
+    [b"nothing", b"\xff\n", b'[0,"",["/a"],[],[[9,9]]]\n12345'],
 )
 def test_other_bytes_are_no_sights(packed: bytes) -> None:
-    with pytest.raises(ValueError, match=r"not sights|Expecting"):
+    with pytest.raises(ValueError, match=r"not sights|Expecting|codec"):
         decode_sights(packed)
 
 

@@ -86,6 +86,21 @@ def test_what_another_server_digested_as_well_does_not_wait(tmp_path: Path) -> N
     assert other.waiting() == []
 
 
+def test_what_recordings_that_touch_hold_together_is_stored_before_anybody_asks(
+    tmp_path: Path,
+) -> None:
+    for number in range(2):
+        start = T0 + number * 10 * NS_PER_S
+        messages = [odom(start + n * NS_PER_S, number + n / 10, 0.0) for n in range(10)]
+        messages += [text(start + n * NS_PER_S, f"word {n}", "/said") for n in range(10)]
+        write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", messages)
+    memory = recalling(tmp_path)
+    backfill = backfill_of(memory, tmp_path)
+    fill_catalogue(backfill)
+    for question in ("poses /odom", "standstills /odom", "story /said"):
+        assert len(backfill.catalogue.cached_answers(question)) == 1, question
+
+
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     bag(tmp_path, 1, finish=False)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import heapq
 import struct
-import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -158,7 +157,7 @@ def encode_track(track: RobotTrack) -> bytes:
     unsigned = (steps << 1 ^ steps >> 63).astype("<i8")
     planes = unsigned.view(np.uint8).reshape(4, count, 8).transpose(0, 2, 1)
     head = _HEAD.pack(*rows[:, 0].tolist(), count, track.error_m)
-    return head + zlib.compress(planes.tobytes() + np.packbits(track.begins).tobytes(), 6)
+    return head + planes.tobytes() + np.packbits(track.begins).tobytes()
 
 
 def decode_track(packed: bytes) -> RobotTrack:
@@ -171,9 +170,9 @@ def decode_track(packed: bytes) -> RobotTrack:
         return empty_track()
     try:
         *firsts, count, error_m = _HEAD.unpack_from(packed)
-        body = zlib.decompress(packed[_HEAD.size :])
-    except (struct.error, zlib.error) as error:
+    except struct.error as error:
         raise ValueError(f"not a track: {error}") from error
+    body = packed[_HEAD.size :]
     size = count * _ROW_BYTES
     planes = np.frombuffer(body, np.uint8, size).reshape(4, 8, count).transpose(0, 2, 1)
     unsigned = np.ascontiguousarray(planes).view("<i8")[:, :, 0]

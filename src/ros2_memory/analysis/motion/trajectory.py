@@ -214,7 +214,7 @@ class PoseCollector(_Poses):
     """
 
     def __init__(self, max_plausible_speed_mps: float) -> None:
-        super().__init__(max_plausible_speed_mps, TOLERANCE_M / 8)
+        super().__init__(max_plausible_speed_mps, TOLERANCE_M / 4)
 
     def digest(self) -> PoseDigest:
         """Returns the digest."""

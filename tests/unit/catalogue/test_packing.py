@@ -1,0 +1,54 @@
+"""What is packed is unpacked the same, and what is damaged is refused."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
+from ros2_memory.catalogue.codec import decode_zone_map, encode_zone_map
+from ros2_memory.catalogue.packing import packed, unpacked
+
+NUMBERS = st.integers() | st.floats(allow_nan=False)
+BOUNDS = st.floats(allow_nan=False)
+ZONE_MAPS = st.builds(
+    ZoneMap,
+    words=st.none() | st.text(max_size=40),
+    texts=st.booleans(),
+    booleans=st.sampled_from([(), (False,), (True,), (False, True)]),
+    low=BOUNDS,
+    high=BOUNDS,
+    numbers=st.none() | st.lists(NUMBERS, max_size=5).map(tuple),
+    box=st.none() | st.builds(Box, *[BOUNDS] * 6),
+) | st.just(UNBOUNDED)  # fmt: skip
+
+
+@given(plain=st.binary(max_size=300), model=st.binary(min_size=1, max_size=300))
+def test_what_is_packed_is_unpacked_the_same(plain: bytes, model: bytes) -> None:
+    assert unpacked(packed(plain, model), model) == plain
+
+
+def test_what_equals_its_model_takes_nearly_nothing() -> None:
+    model = bytes(range(256))
+    assert len(packed(model, model)) < 12
+
+
+def test_other_bytes_than_packed_ones_are_refused() -> None:
+    model = bytes(range(200))
+    whole = packed(bytes(range(100, 220)), model)
+    for wrong in (whole[:-2], whole + b"x", b"\xff" * 9):
+        with pytest.raises(ValueError, match="not what was packed"):
+            unpacked(wrong, model)
+
+
+@given(ZONE_MAPS)
+def test_a_zone_map_that_is_stored_is_the_same(zones: ZoneMap) -> None:
+    assert repr(decode_zone_map(encode_zone_map(zones))) == repr(zones)
+
+
+def test_other_bytes_are_no_zone_map() -> None:
+    whole = encode_zone_map(ZoneMap(box=Box(0, 1, 0, 1, 0, 1)))
+    for wrong in (b"", b"abc", whole[:20], whole[:-4]):
+        with pytest.raises(ValueError, match=r"zone map|Expecting"):
+            decode_zone_map(wrong)

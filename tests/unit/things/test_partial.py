@@ -1,0 +1,80 @@
+"""Where the catalogue is not complete and the time is short: an answer that says how far it got."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from itertools import count
+from typing import TYPE_CHECKING, TypeVar
+
+import pytest
+
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.counts.matches import count_matches
+from ros2_memory.history.context import Call
+from ros2_memory.things.find import find_things
+from tests.support.memories import memory_of, recalling
+from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked, write
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+T = TypeVar("T")
+
+TOPIC = "/vision/scene/scene_objects"
+THINGS = [(f"thing {number}", 3.0 + number % 3, number / 3) for number in range(8)]
+
+
+def call(looks: int) -> Call:
+    """A call whose time is over after so many looks at the clock."""
+    return Call(Deadline.after(looks, map(float, count()).__next__))
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Callable[[], Memory]:
+    """Makes memories of eight bags, each with a thing of its own; the catalogue knows two bags.
+
+    None knows what another has read.
+    """
+    moments = [looked(10 * n, 10 * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
+    write(tmp_path, [message for some in moments for message in some])
+    recall = recalling(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).recall
+    return lambda: replace(memory_of(tmp_path, limits=NAMED), recall=recall)
+
+
+def in_time(ask: Callable[[Call], T]) -> list[T]:
+    """The answers after some numbers of looks at the clock, without the refusals."""
+    answers = []
+    for looks in (*range(1, 60), 100_000):
+        with suppress(QueryTimeoutError):
+            answers.append(ask(call(looks)))
+    return answers
+
+
+def test_find_things_answers_from_the_newest_bags_and_says_since_when(
+    fresh: Callable[[], Memory],
+) -> None:
+    answers = in_time(lambda short: find_things(fresh(), short))
+    assert len({each.total for each in answers} - {0}) > 2
+    for answer in answers:
+        newest = {label for label, *_ in THINGS[len(THINGS) - answer.total :]}
+        assert {each.label for each in answer.things} == newest
+        told = [note for note in answer.notes if "2 of 8 bags" in note]
+        assert (answer.total < len(THINGS)) == bool(told)
+        first = 10 * (len(THINGS) - answer.total) if answer.total else 72  # where all ends
+        assert all(str(BEGIN + first) in note for note in told), told
+
+
+def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None:
+    answers = in_time(
+        lambda short: count_matches(fresh(), short, TOPIC, "contains", "thing", by="day")
+    )
+    told = {any("only what is after" in note for note in each.notes) for each in answers}
+    assert told == {True, False}
+    for answer in answers:
+        for note in answer.notes:
+            assert "only what is after" not in note or "2 of 8 bags" in note
