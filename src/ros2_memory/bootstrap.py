@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -64,9 +63,8 @@ def build_reader(settings: Settings, *, cache_mb: int | None = None) -> BagReade
     Raises:
         ConfigError: it cannot be built.
     """
-    storage = settings.storage
-    node = storage if cache_mb is None else replace(storage, cache_mb=cache_mb)
-    return _instantiated("storage", node, BagReader)  # type: ignore[type-abstract]  # only compared with
+    own: dict[str, object] = {} if cache_mb is None else {"cache_mb": cache_mb}
+    return _instantiated("storage", settings.storage, BagReader, **own)  # type: ignore[type-abstract]  # only compared with
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:

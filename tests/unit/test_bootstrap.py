@@ -27,6 +27,11 @@ def settings(bag_dir: Path, *overrides: str) -> Settings:
 def test_the_storage_of_the_configuration_is_what_reads(tmp_path: Path) -> None:
     assert isinstance(build_reader(settings(tmp_path)), McapReader)
     assert isinstance(build_reader(settings(tmp_path, "storage=rosbag2")), Rosbag2Reader)
+    # As the recorder has it, which reads each bag once.
+    assert isinstance(build_reader(settings(tmp_path), cache_mb=2), McapReader)
+    assert isinstance(
+        build_reader(settings(tmp_path, "storage=rosbag2"), cache_mb=2), Rosbag2Reader
+    )
 
 
 def test_what_a_reader_refuses_is_told_in_its_own_words(tmp_path: Path) -> None:
