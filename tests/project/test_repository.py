@@ -148,7 +148,11 @@ class TestGates:
 
     def test_dependencies_are_looked_at_weekly(self) -> None:
         updates = read_yaml(".github/dependabot.yml")["updates"]
-        assert {entry["package-ecosystem"] for entry in updates} == {"uv", "github-actions"}
+        assert {entry["package-ecosystem"] for entry in updates} == {
+            "uv",
+            "docker",
+            "github-actions",
+        }
         assert {entry["schedule"]["interval"] for entry in updates} == {"weekly"}
 
     def test_pre_commit_has_every_hook(self) -> None:

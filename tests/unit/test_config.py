@@ -255,7 +255,7 @@ class TestPresets:
         [
             ("robot", MCAP, ROS2BAG, "sse", "wall"),
             ("robot_live", MCAP, ROS2BAG, "sse", "wall"),
-            ("query_only", MCAP, NONE, "stdio", "wall"),
+            ("query_only", ROSBAG2, NONE, "stdio", "wall"),
             ("replay", ROSBAG2, NONE, "stdio", "latest"),
             ("local", MCAP, NONE, "stdio", "wall"),
         ],
