@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 _MOST_COMPARED: Final = 5
 _MOST_STAYS: Final = (8, 5, 3, 2)
+_SHORT: Final = ("label", "moves", "at_once", "place", "frame_id", "in", "last_seen", "moved_times")
+_MISSED: Final = "not_seen_where_expected"
+_HOW: Final = "shortly; ask with label or where for their scores, states and moves"
 _LONGEST: Final = 6_000
 """Characters of a reply; its lists are cut until it is no longer."""
 _LONGEST_NAME: Final = 100
@@ -26,19 +29,41 @@ _LONGEST_LABEL: Final = 40
 
 @render.register(results.Things)
 def _things(answer: results.Things) -> JsonObject:
-    """Returns the things, each with as many of its newest places as leave the reply short."""
+    """Returns the things, each with as many of its newest places as leave the reply short.
+
+    Where that is not enough, what each is and where it was last, and only the things seen last.
+    """
     reply: JsonObject = {}
     for most in _MOST_STAYS:
-        reply = {
-            "frame_id": answer.frame_id or None,
-            "things": [_thing(each, answer, most) for each in answer.things],
-            "total": answer.total,
-            "labels": dict(answer.labels),
-        }
-        reply = with_notes(reply, answer.notes)
+        reply = _listed(answer, [_thing(each, answer, most) for each in answer.things])
+        if len(to_json_text(reply)) <= _LONGEST:
+            return reply
+    rows = [_shortly(each, answer) for each in answer.things]
+    for count in range(len(rows), 0, -1):
+        reply = _listed(
+            answer, rows[:count], f"{count} of {answer.total} things are listed, {_HOW}"
+        )
         if len(to_json_text(reply)) <= _LONGEST:
             break
     return reply
+
+
+def _listed(answer: results.Things, rows: Sequence[JsonObject], *notes: str) -> JsonObject:
+    reply: JsonObject = {
+        "frame_id": answer.frame_id or None,
+        "things": [*rows],
+        "total": answer.total,
+        "labels": dict(answer.labels),
+    }
+    return with_notes(reply, (*notes, *answer.notes))
+
+
+def _shortly(thing: results.Thing, answer: results.Things) -> JsonObject:
+    """Returns what a thing is, where it was last, and whether it was missed there."""
+    whole = _thing(thing, answer, 1)
+    is_missed = thing.still_there is not None and thing.still_there.state == _MISSED
+    keys = (*_SHORT, "still_there") if is_missed else _SHORT
+    return {key: whole[key] for key in keys if key in whole}
 
 
 def _thing(thing: results.Thing, answer: results.Things, most_stays: int) -> JsonObject:
@@ -67,9 +92,8 @@ def _thing(thing: results.Thing, answer: results.Things, most_stays: int) -> Jso
     if thing.still_there is not None:
         reply["still_there"] = _still_there(thing.still_there)
     if thing.moved:
+        reply["moved_times"] = len(thing.moved) - 1
         reply["moved"] = [_stay(each) for each in thing.moved[-most_stays:]]
-    if len(thing.moved) > most_stays:
-        reply["moved_total"] = len(thing.moved)
     return reply
 
 

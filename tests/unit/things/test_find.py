@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from random import Random
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import Msg, detections, header, make, odom, point, tf, transform, write_mcap
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, recalling, replied
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -147,6 +148,7 @@ def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
     ]
     write(tmp_path, messages)
     [thing] = ask(tmp_path, label="mug")["things"]
+    assert thing["moved_times"] == 1
     assert thing["moved"] == [
         {
             "from": BEGIN,
@@ -273,6 +275,19 @@ def test_the_limit_bounds_what_is_listed_and_not_what_is_counted(
     reply = ask(tmp_path, limit=limit)
     assert len(reply["things"]) == limit
     assert reply["total"] == 3
+
+
+def test_a_long_list_has_each_thing_shortly_and_says_how_to_ask_for_more(tmp_path: Path) -> None:
+    many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(70)]
+    write(tmp_path, looked(0, 8, HERE, *many))
+    reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
+    answer = json.loads(reply.text)
+    rows = answer["things"]
+    assert 4_000 < len(reply.text) <= 6_000
+    assert answer["total"] == 70
+    assert 20 < len(rows) < 70
+    assert set(rows[0]) == {"label", "place", "last_seen"}
+    assert answer["notes"][0].startswith(f"{len(rows)} of 70 things are listed")
 
 
 def random_messages(draw: Random) -> list[Msg]:
