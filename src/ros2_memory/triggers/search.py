@@ -1,8 +1,8 @@
 """Searches closed splits for what makes rules fire.
 
-Only messages of topics that a rule names are decoded, and of those only what no digest rules out.
-A rule over silences needs the times in a bag's summary alone, unless the bag is so long that a
-silence could lie within it.
+Only bags with topics that a rule names are opened, and only messages of these are decoded. A rule
+over silences needs the times in a bag's summary alone, unless the bag is so long that a silence
+could lie within it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from ros2_memory.triggers.rules import RuleKind
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.bag_dir.trigger_file import TriggerState
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.extract import SchemaExtractor
@@ -55,7 +54,6 @@ class SplitSearch:
         reader: gives the messages that count, and decodes them.
         extractor: gives the values that conditions are tested on.
         rules: what to search for.
-        zone_map: gives what a digest knows of a topic in a bag; None where there is none.
     """
 
     def __init__(
@@ -63,12 +61,10 @@ class SplitSearch:
         reader: BagReader,
         extractor: SchemaExtractor,
         rules: Sequence[Rule],
-        zone_map: Callable[[BagFile, str], ZoneMap | None] = lambda _bag, _topic: None,
     ) -> None:
         self._reader = reader
         self._extractor = extractor
         self._rules = [each for each in rules if each.kind is not RuleKind.RECORDER_RESTART]
-        self._zone_map = zone_map
         self._watching: dict[str, tuple[Rule, ...]] = {}
         self._tested: set[tuple[str, str]] = set()
 
@@ -189,7 +185,7 @@ class SplitSearch:
             rules = self._rules_of(topic)
             if not rules:
                 continue
-            if topic not in latched and not self._may_match(rules, bag, topic):
+            if topic not in latched and all(each.condition is None for each in rules):
                 times += ((time, topic) for time in self._times(rules, bag, topic, part.window))
             else:
                 read.append(topic)
@@ -208,14 +204,6 @@ class SplitSearch:
                     records[
                         rule.name
                     ].problem = f"not all could be searched: {bag.path.name}: {error.reason}"
-
-    def _may_match(self, rules: Sequence[Rule], bag: BagFile, topic: str) -> bool:
-        """Whether a message of a topic in a bag may meet the condition of any rule."""
-        conditions = [each.condition for each in rules if each.condition is not None]
-        if not conditions:
-            return False
-        digest = self._zone_map(bag, topic)
-        return digest is None or any(each.can_match(digest) for each in conditions)
 
     def _times(
         self, rules: Sequence[Rule], bag: BagFile, topic: str, window: TimeWindow

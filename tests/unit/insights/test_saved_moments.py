@@ -18,6 +18,7 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.bag_dir.trigger_file import RuleRecord, TriggerState, write_trigger_state
 from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import RefusedError
@@ -220,6 +221,28 @@ class TestTheList:
             status = asked(memory, tmp_path, "memory_status")
             assert status["moments"] == shown(memory, tmp_path)["moments"][:MAX_MOMENTS]
             assert status.get("moments_count") == (number + 1 if number >= MAX_MOMENTS else None)
+
+    def test_rules_are_told_with_how_often_they_fired(self, tmp_path: Path) -> None:
+        (tmp_path / ".episodic").mkdir()
+        bumper = RuleRecord(fired=3, moments=1, refused=2, last_fired=NOW - 5 * S, problem="full")
+        write_trigger_state(tmp_path, TriggerState({"door": RuleRecord(), "bumper": bumper}))
+        self.keep(tmp_path, 1, pending=False, rule="bumper", matches=3)
+        memory = memory_of(tmp_path, clock=SettableClock(NOW))
+        told = shown(memory, tmp_path)
+        assert (told["moments"][0]["rule"], told["moments"][0]["matches"]) == ("bumper", 3)
+        assert told["rules"] == [
+            {
+                "rule": "bumper",
+                "fired": 3,
+                "moments": 1,
+                "last_ts": (NOW - 5 * S) / S,
+                "last_ago_s": 5.0,
+                "refused": 2,
+                "problem": "full",
+            },
+            {"rule": "door", "fired": 0, "moments": 0},
+        ]
+        assert asked(memory, tmp_path, "memory_status")["rules"] == told["rules"]
 
     def test_a_status_says_that_they_cannot_be_listed(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, boolean
-from tests.support.watched_bags import T0, WatchedBags, rule
+from tests.support.watched_bags import T0, WatchedBags, flag, rule
 from tests.unit.triggers.test_fold import expected
 
 S = NS_PER_S
@@ -70,3 +70,35 @@ def test_a_rule_fires_at_the_times_of_the_uncut_stream(
     # Log times of the copies that count may be a millisecond late.
     wanted = [each - T0 for each in expected(stream, hold)]
     assert fired == pytest.approx(wanted, abs=2_000_000, rel=0)
+
+
+def test_a_message_that_is_written_late_into_the_next_split_counts_in_its_place(
+    tmp_path: Path,
+) -> None:
+    # As rosbag2 does: by less than a second, also across two splits.
+    robot = WatchedBags(tmp_path / "bags", [rule(hold=S * 3 // 2)])
+    robot.begin(T0)
+    robot.split([flag(0, False), flag(8, True), flag(9, True), flag(10, True)])
+    robot.look()
+    robot.split([flag(9.5, False), flag(11, True), flag(12, True)])
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 10 * S + S * 3 // 2]
+
+
+def test_a_recording_waits_for_the_end_of_the_one_that_it_took_over_from(tmp_path: Path) -> None:
+    robot = WatchedBags(tmp_path / "bags", [rule(hold=S * 3 // 2)])
+    old = robot.begin(T0)
+    robot.split([flag(n, False) for n in range(8)], old)
+    new = robot.begin(T0 + 8 * S)
+    robot.beat(old, new)
+    robot.hand_over(old, new, T0 + 11 * S, f"{old}_1.mcap")
+    robot.split([flag(n, n < 14) for n in range(11, 16)], new)
+    robot.look()
+    assert robot.fired_at() == []
+    robot.beat(new)
+    robot._splits = 1
+    robot.split([flag(n, n >= 10) for n in range(8, 11)], old)
+    robot.look()
+    robot.split([flag(n, False) for n in range(16, 20)], new)
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 11 * S + S // 2]

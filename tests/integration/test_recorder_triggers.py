@@ -1,0 +1,65 @@
+"""Rules beside the real `ros2 bag record`: through rotations, and a kill of everything."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.moment_file import stored_moments_in
+from tests.support.live_recorder import Machine, machine
+from tests.support.processes import until
+from tests.support.ros_processes import publishing_robot, ros_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.moment_file import StoredMoment
+    from tests.support.real_recorder import RealRecorder
+
+RULES = """
+rules:
+  bumper: {topic: /bumper, condition_type: equals, value: true, before_s: 3, after_s: 2}
+  turned: {topic: /odom, condition_type: above, value: 0.5, field: position.y, for_s: 1}
+  restarted: {kind: recorder_restart, before_s: 1, after_s: 1}
+"""
+
+
+@pytest.fixture
+def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
+    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
+        yield found
+
+
+def test_rules_fire_once_through_rotations_and_a_kill(site: Machine, tmp_path: Path) -> None:
+    rules = tmp_path / "triggers.yaml"
+    rules.write_text(RULES)
+    given = (
+        f"recording.keep_when={rules}",
+        "recording.split_duration_s=2",
+        "recording.session_duration_s=7",
+    )
+    with publishing_robot(site.env, tmp_path / "truth.json", "--hz", "10"):
+        recorder = site.record("robot", *given)
+        recorder.wait_for("trigger_fired", rule="turned")
+        recorder.wait_for("rotated", 2)
+        recorder.kill(with_children=True)
+        recorder = site.record("robot", *given)
+        recorder.wait_for("trigger_fired", rule="restarted")
+        recorder.wait_for("trigger_fired", rule="bumper")
+        recorder.wait_for("rotated", 1)
+
+        def complete() -> list[StoredMoment] | None:
+            found = [*stored_moments_in(recorder.bag_dir)]
+            waits = len(found) < 3 or any(each.moment.pending for each in found)
+            return None if waits else found
+
+        moments = until(complete)
+        recorder.stop()
+    [bumper] = [each for each in moments if each.moment.rule == "bumper"]
+    assert (bumper.moment.matches, bumper.moment.missing) == (1, ())
+    fired = [e["rule"] for each in site.recorders for e in each.events("trigger_fired")]
+    # y is above 0.5 once in a circle, and seen anew by a recorder that was off meanwhile.
+    assert sorted({*fired}) == ["bumper", "restarted", "turned"]
+    assert (fired.count("bumper"), fired.count("restarted")) == (1, 1)
