@@ -25,10 +25,11 @@ from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.messages.detections import Detection
 
 MAX_PER_BAG: Final = 64
 """Intervals, toggles and errors of one topic in one bag that are stored; the rest is counted."""
@@ -150,8 +151,13 @@ def has_events(type_name: str) -> bool:
     return type_name in _MEASURED_WITH_EVENTS or not type_name.startswith(_MEASUREMENT_PACKAGES)
 
 
-def state_of(value: JsonValue, type_name: str) -> State:
-    """Returns what an extracted message of a type states."""
+def state_of(
+    value: JsonValue, type_name: str, detections: Sequence[Detection] | None = None
+) -> State:
+    """Returns what an extracted message of a type states.
+
+    `detections` are those in it, where they are known already.
+    """
     levels = levels_of(value, type_name) if has_levels(type_name) else ()
     if not has_events(type_name):
         return State(levels=levels) if levels else EMPTY_STATE
@@ -160,7 +166,7 @@ def state_of(value: JsonValue, type_name: str) -> State:
         reports = reports_of(value, type_name)
         state = State(errors=errors, levels=levels, reports=reports)
         return EMPTY_STATE if state.is_empty else state
-    best = _best_scores(value)
+    best = _best_scores(detections_of(value) if detections is None else detections)
     labels = tuple(best)
     flags = tuple(_flags_in(value, ""))
     if not (labels or flags or levels):
@@ -172,10 +178,10 @@ def state_of(value: JsonValue, type_name: str) -> State:
     return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond, levels, scores=scores)
 
 
-def _best_scores(value: JsonValue) -> dict[str, float | None]:
-    """Returns the labels that a message has, in order, with the best score of each."""
+def _best_scores(detections: Sequence[Detection]) -> dict[str, float | None]:
+    """Returns the labels of detections, in order, with the best score of each."""
     best: dict[str, float | None] = {}
-    for each in detections_of(value):
+    for each in detections:
         known = best.get(each.label)
         if known is None or (each.score is not None and each.score > known):
             best[each.label] = each.score

@@ -20,7 +20,7 @@ from ros2_memory.messages.detections import detections_of
 if TYPE_CHECKING:
     from ros2_memory.analysis.bag_frames import BagFrames, Times
     from ros2_memory.catalogue.map_digest import PlacedPoses
-    from ros2_memory.core.model import JsonValue, Vector3
+    from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.messages.detections import Detection
@@ -76,8 +76,8 @@ class DetectorSights:
     """A `SightsSource` of `map_digest`.
 
     Args:
-        reader: decodes messages whose value is not given.
-        extractor: gives their values and frames.
+        reader: decodes messages whose detections are not given.
+        extractor: gives their values and the frames of all.
     """
 
     def __init__(self, reader: BagReader, extractor: SchemaExtractor) -> None:
@@ -96,16 +96,18 @@ class DetectorSights:
             self._topics[topic] = _Topic(named)
         return True
 
-    def add(self, record: Record, value: JsonValue | None) -> None:
+    def add(self, record: Record, detections: tuple[Detection, ...] | None) -> None:
         """Takes the next message of a topic."""
         of_topic = self._topics.get(record.channel.topic)
         if of_topic is None:
             return
         try:
-            frame, stamp, value = self._read(record, value, of_topic)
+            frame, stamp, detections = self._read(record, detections, of_topic)
         except UndecodableError:
             return
-        found = detections_of(value, frame)
+        found = tuple(
+            each if each.frame_id else each._replace(frame_id=frame) for each in detections
+        )
         self._left -= len(found)
         if self._left < 0:
             return
@@ -120,24 +122,24 @@ class DetectorSights:
             self._topics[record.channel.topic] = None
 
     def _read(
-        self, record: Record, value: JsonValue | None, of_topic: _Topic
-    ) -> tuple[str, Ns | None, JsonValue]:
-        """Returns the frame, the stamp and the value of a message.
+        self, record: Record, detections: tuple[Detection, ...] | None, of_topic: _Topic
+    ) -> tuple[str, Ns | None, tuple[Detection, ...]]:
+        """Returns the frame, the stamp and the detections of a message.
 
         Raises:
             UndecodableError: it cannot be decoded.
         """
-        if value is not None and of_topic.begins_with_header:
+        if detections is not None and of_topic.begins_with_header:
             front = _front_header(record.payload)
             if front is not None:
-                return *front, value
+                return *front, detections
         message = self._reader.decode(record)
         frame, stamp = self._extractor.frame(message), _stamp_of(message)
         if of_topic.begins_with_header is None:
             of_topic.begins_with_header = _front_header(record.payload) == (frame, stamp)
-        if value is None:
-            value = self._extractor.exact(message, record.channel.type)
-        return frame, stamp, value
+        if detections is None:
+            detections = detections_of(self._extractor.exact(message, record.channel.type))
+        return frame, stamp, detections
 
     def digest(self, robot: PlacedPoses) -> bytes:
         """Returns the encoded sights."""

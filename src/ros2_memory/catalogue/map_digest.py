@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.bag_frames import Floats, Mask, Times
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
-    from ros2_memory.core.model import JsonValue, Pose, StampedTransform
+    from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import Record
 
 ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
@@ -142,11 +143,11 @@ class SightsSource(Protocol):
     def wants(self, topic: str, type_name: str) -> bool:
         """Returns whether messages of a topic are to be added."""
 
-    def add(self, record: Record, value: JsonValue | None) -> None:
+    def add(self, record: Record, detections: tuple[Detection, ...] | None) -> None:
         """Takes the next message of a topic, in log-time order by topic.
 
-        `value` is the extracted value (`SchemaExtractor.exact`); None where many messages were
-        decoded at once and this one was not: the builder decodes the record where it needs to.
+        `detections` are those in it, without the message's own frame; None where many messages
+        were decoded at once and this one was not: it is decoded where that is needed.
         """
 
     def digest(self, robot: PlacedPoses) -> bytes:

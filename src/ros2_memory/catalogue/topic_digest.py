@@ -15,6 +15,7 @@ from ros2_memory.analysis.state_changes import follow_numbers, levels_by_number
 from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEventsBuilder, state_of
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
+from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -26,9 +27,10 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector
-    from ros2_memory.core.model import JsonValue, Pose, StampedTransform
+    from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import BagReader, Record
 
 MAX_STORED: Final = 64
@@ -81,13 +83,13 @@ class TopicDigest:
 class _Sample(NamedTuple):
     """What one message contributes to the digest besides its numbers and edges.
 
-    `value` is the extracted value where somebody asked for it, and the message was decoded alone.
+    `detections` are known where somebody asked for them, and the message was decoded alone.
     """
 
     pose: Pose | None
     speed_mps: float | None
     state: State
-    value: JsonValue | None = None
+    detections: tuple[Detection, ...] | None = None
 
 
 class TopicCollector:
@@ -208,7 +210,7 @@ class TopicCollector:
         if self._map_poses and sample.pose is not None:
             to.add_pose(record.log_time, sample.pose)
         if to.sights is not None and self._wants_sights(record.channel.type):
-            to.sights.add(record, sample.value)
+            to.sights.add(record, sample.detections)
 
     def _wants_sights(self, type_name: str) -> bool:
         if type_name not in self._sights:
@@ -226,8 +228,8 @@ class TopicCollector:
         if self._pairs is not None or self._map_transforms:
             self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
-        shown = value if self._wants_sights(type_name) else None
-        return _Sample(*motion, state_of(value, type_name), shown)
+        seen = detections_of(value) if self._wants_sights(type_name) else None
+        return _Sample(*motion, state_of(value, type_name, seen), seen)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> None:
         if self._map is not None and self._map_transforms:

@@ -34,8 +34,8 @@ from tests.support.random_histories import write_history
 
 if TYPE_CHECKING:
     from ros2_memory.catalogue.map_digest import PlacedPoses
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
+    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import Record
 
 
@@ -160,9 +160,9 @@ class Sights:
     def wants(self, topic: str, type_name: str) -> bool:
         return "Detection" in type_name and topic.startswith("/vision")
 
-    def add(self, record: Record, value: JsonValue | None) -> None:
+    def add(self, record: Record, detections: tuple[Detection, ...] | None) -> None:
         self.times.append(record.log_time)
-        self.values += value is not None
+        self.values += detections is not None
 
     def digest(self, robot: PlacedPoses) -> bytes:
         times = np.array(self.times, np.int64)
