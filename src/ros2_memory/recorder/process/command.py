@@ -13,12 +13,12 @@ import yaml
 
 from ros2_memory.bag_dir.own_recordings import BAG_DIR_ID, PROGRAM, RECORDED_BY
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.process.topics import TopicSelection
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.process.topics import TopicSelection
 
 HELP_ARGV: Final = ("bag", "record", "--help")
 KEYBOARD: Final = "--disable-keyboard-controls"
@@ -27,6 +27,9 @@ REPEAT: Final = "--repeat-transient-local"
 CUSTOM_DATA: Final = "--custom-data"
 SERVICES: Final = "--services"
 CACHE: Final = "--max-cache-size"
+STATISTICS: Final = "--stats_max_publishing_rate"
+MESSAGES_LOST: Final = "/events/rosbag2_messages_lost"
+"""Where a distribution with `STATISTICS` publishes what its recorders lose; it is recorded, too."""
 MIN_FREE: Final = "--min-free-space"
 
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
@@ -70,13 +73,15 @@ def record_argv(
         known_options: the options that this distribution has, see `options_in_help`.
     """
     argv = [ros2, "bag", "record", "-s", "mcap", "-d", str(split_duration_s), "-o", str(directory)]
+    if STATISTICS in known_options:
+        topics = TopicSelection((*topics.entries, MESSAGES_LOST))
     argv += ["-e", topics.regex]
     argv += ["--qos-profile-overrides-path", str(qos_file)]
     argv += ["--storage-config-file", str(storage_file)]
-    if CACHE in known_options:
-        argv += [CACHE, str(cache_bytes)]
-    if MIN_FREE in known_options and min_free_bytes:
-        argv += [MIN_FREE, str(min_free_bytes)]
+    # Of the statistics at most one message a second; without a rate they may be switched off.
+    limits = {CACHE: cache_bytes, MIN_FREE: min_free_bytes, STATISTICS: 1}
+    for name, limit in limits.items():
+        argv += [name, str(limit)] if name in known_options and limit else []
     if topics.hidden:
         argv.append("--include-hidden-topics")
     if use_sim_time:
