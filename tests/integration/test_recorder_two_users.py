@@ -6,62 +6,31 @@ which only the loopback interface is up, so that no other machine hears or is he
 
 from __future__ import annotations
 
-import os
 import shutil
+import signal
 import subprocess
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 import yaml
 
 from ros2_memory.recorder.process.environment import advice_on_silence
+from tests.support.another_user import as_nobody, needs_another_user, own_network
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder
-from tests.support.ros_processes import ros_environment, wait_for
+from tests.support.ros_processes import end, ros_environment, wait_for
 
-OTHER_UID = 65534  # nobody's
-SCRIPT = """\
-set -u
-folder=$1; shift
-ip link set lo up
-ip link set lo multicast on
-"$ROS2_LIVE_PYTHON" -P -m tests.support.counting_publishers /odom:50:reliable &
-robot=$!
-as() {
-  name=$1; shift
-  # Only to read programs below a private home: what lies in /dev/shm is opened for writing, too.
-  exec setpriv --reuid=$OTHER --regid=$OTHER --clear-groups \
-    --inh-caps=+dac_read_search --ambient-caps=+dac_read_search \
-    env "$@" HOME="$folder" ROS_LOG_DIR="$folder/log" PYTHONPATH="$OWN_PYTHONPATH" \
-    ros2 bag record -s mcap -d 1 -o "$folder/$name" -e '^(/odom)$' \
-    > "$folder/$name.log" 2>&1
+UDP = "FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+SUBNET = "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"
+PEERS = "ROS_STATIC_PEERS=127.0.0.1"
+ASKED = {
+    "local": ["ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST", UDP],
+    "subnet": [SUBNET, PEERS, UDP],
+    "shared": [SUBNET, PEERS],
 }
-udp=FASTDDS_BUILTIN_TRANSPORTS=UDPv4
-as local ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $udp & first=$!
-as subnet ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET ROS_STATIC_PEERS=127.0.0.1 $udp & second=$!
-as shared ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET ROS_STATIC_PEERS=127.0.0.1 & third=$!
-until [ -e "$folder/stop" ]; do sleep 0.1; done
-kill -TERM $first $second $third
-wait $first $second $third
-kill -KILL $robot
-"""
-
-
-def _cannot() -> str | None:
-    if os.geteuid() != 0:
-        return "only root may start a process of another user"
-    if missing := [each for each in ("unshare", "setpriv", "ip") if shutil.which(each) is None]:
-        return f"there is no {', '.join(missing)}"
-    tried = subprocess.run(["unshare", "--net", "true"], capture_output=True, check=False)
-    return None if tried.returncode == 0 else "no network namespace may be made here"
-
-
-def _done(folder: Path) -> bool:
-    """Whether one has recorded for seconds, and all have subscribed."""
-    logs = [folder / f"{name}.log" for name in ("local", "subnet", "shared")]
-    said = all(log.is_file() and "Subscribed" in log.read_text() for log in logs)
-    return said and len([*(folder / "subnet").glob("*.mcap")]) >= 3
+"""The settings of each recorder, beside a robot in LOCALHOST."""
 
 
 def messages(recording: Path) -> int:
@@ -69,33 +38,49 @@ def messages(recording: Path) -> int:
     return int(told["rosbag2_bagfile_information"]["message_count"])
 
 
+@needs_another_user
 def test_what_a_recorder_of_another_user_receives(
     real_recorder: RealRecorder, tmp_path: Path
 ) -> None:
     """What docs/how-to/systemd.md says of each discovery range; the robot is in LOCALHOST."""
-    if reason := _cannot():
-        pytest.skip(reason)
     with (
         ros_environment(tmp_path, real=real_recorder) as env,
         tempfile.TemporaryDirectory() as made,  # a test's own folder is closed to other users
+        own_network() as network,
+        ExitStack() as ended,
     ):
         folder = Path(made)
         folder.chmod(0o777)
-        known = {
-            **env,
-            "OTHER": str(OTHER_UID),
-            "OWN_PYTHONPATH": env["PYTHONPATH"],
-            "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"],
-        }
-        argv = ["unshare", "--net", "bash", "-c", SCRIPT, "two-users", made]
-        script = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
-        wait_for(lambda: _done(folder), "messages in SUBNET", alive=script)
-        (folder / "stop").touch()
-        script.wait(timeout=PATIENCE_S)
-        found = {name: messages(folder / name) for name in ("local", "subnet", "shared")}
-        subscribed = (folder / "local.log").read_text()
-    # Subscribed, and yet it receives nothing.
-    assert "Subscribed to topic '/odom'" in subscribed
+        publisher = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.counting_publishers"]
+        robot = subprocess.Popen(
+            [*network, *publisher, "/odom:50:reliable"],
+            env={**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]},
+        )
+        ended.callback(end, robot)
+        ros2 = shutil.which("ros2", path=env["PATH"])
+        assert ros2 is not None
+        logs: dict[str, Path] = {}
+        recorders: list[subprocess.Popen[bytes]] = []
+        for name, settings in ASKED.items():
+            argv = [*network, *as_nobody(), f"HOME={made}", *settings, ros2, "bag", "record"]
+            argv += ["-s", "mcap", "-d", "1", "-o", str(folder / name), "-e", "^(/odom)$"]
+            logs[name] = folder / f"{name}.log"
+            with logs[name].open("wb") as log:
+                recorders.append(subprocess.Popen(argv, env=env, stderr=log))
+            ended.callback(end, recorders[-1])
+
+        def is_done() -> bool:
+            """Whether one has recorded for seconds, and all have subscribed."""
+            said = all("Subscribed to topic" in log.read_text() for log in logs.values())
+            return said and len([*(folder / "subnet").glob("*.mcap")]) >= 3
+
+        wait_for(is_done, "messages in SUBNET", alive=robot)
+        for recorder in recorders:
+            recorder.send_signal(signal.SIGTERM)
+        for recorder in recorders:
+            recorder.wait(timeout=PATIENCE_S)
+        found = {name: messages(folder / name) for name in ASKED}
+    # They have subscribed, and yet they receive nothing.
     assert found["local"] == 0
     assert found["shared"] == 0
     assert found["subnet"] > 50
