@@ -6,22 +6,22 @@ paths: where it was recorded, and hard links in saved moments. Of all these one 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import FileNotes, FileState, classify
-from ros2_memory.index.scan import ScanResult, Tree
+from ros2_memory.index.scan import YOUNG_NS, ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.index.unchanged_bags import UnchangedBags
+from ros2_memory.index.unchanged_bags import KINDS, UnchangedBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
+    from pathlib import Path
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -41,11 +41,13 @@ class KnownBags:
 
     Attributes:
         counted: classifications of files, of all forms and links of a bag only the one that counts.
+            Those in `unchanged` are left out.
         hidden: files whose other form counts.
         files: notes on all files.
         named: recordings that the last heartbeat names as being written.
         now: when the directory was scanned.
         saved: all files in saved moments, whether they count or not.
+        unchanged: closed bags of which only rows are kept; each counts.
     """
 
     counted: Mapping[str, Classification]
@@ -54,6 +56,7 @@ class KnownBags:
     named: Collection[str]
     now: Ns
     saved: Collection[str] = ()
+    unchanged: UnchangedBags = field(default_factory=UnchangedBags)
 
 
 class TableChange(NamedTuple):
@@ -75,7 +78,6 @@ class BagTable:
         reader: reads its bags.
         known: returns, by path, closed files that were read earlier: they are not read again while
             they are unchanged.
-        keep_all_notes: keeps notes on every file, which retention needs.
     """
 
     def __init__(
@@ -84,11 +86,9 @@ class BagTable:
         reader: BagReader,
         *,
         known: Callable[[], Mapping[str, BagFile]] | None,
-        keep_all_notes: bool,
     ) -> None:
         self._reader = reader
         self._known = known
-        self._keep_all_notes = keep_all_notes
         self._tree = Tree(bag_dir)
         self._unchanged = UnchangedBags()
         self._files: dict[str, FileNotes] = {}
@@ -112,12 +112,15 @@ class BagTable:
         self._reactivate_changed(scanned, context)
         known = self._known_at_first()
         restored = self._restore(scanned.stamps, known, context)
-        changed = self._forget(scanned.gone) | self._examine(scanned.stamps, known, context)
+        changed = self._forget(scanned.gone) | self._examine(
+            scanned.stamps, known, context, restored
+        )
         hidden = frozenset(self._hidden)
         removed, added = self._count(changed | hidden, context)
         changed |= hidden - self._hidden
         added = [*restored, *added]
         self._timeline = self._timeline.changed(removed, added)
+        self._settle(context)
         is_new = bool(changed or restored) or not scanned.is_like(self._scanned)
         self._scanned = scanned
         return TableChange(removed, added, is_new)
@@ -148,7 +151,15 @@ class BagTable:
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:
         """Returns what retention considers; `named` are recordings that are being written."""
-        return KnownBags(self._counted, self._hidden, self._files, named, now, self._links.known)
+        return KnownBags(
+            self._counted,
+            self._hidden,
+            self._files,
+            named,
+            now,
+            self._links.known,
+            self._unchanged,
+        )
 
     def _next_patrol(self) -> list[str]:
         if not self._patrol:
@@ -166,7 +177,7 @@ class BagTable:
         self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
     ) -> list[BagFile]:
         """Returns the bags of files that are unchanged, which need no examination."""
-        if self._keep_all_notes or not known:
+        if not known:
             return []
         # Which link of a saved bag counts has yet to be decided.
         saved = {path: stamps.pop(path) for path in self._links.saved_among(stamps)}
@@ -204,15 +215,51 @@ class BagTable:
                 forgotten.add(path)
         return forgotten
 
+    def _settle(self, context: ScanContext) -> None:
+        """Keeps no more than a row of bags that will not change."""
+        for path in [*self._files]:
+            classification = self._counted.get(path)
+            if classification is not None and self._is_settled(path, classification, context):
+                self._add_unchanged(path, classification)
+                del self._classified[path], self._counted[path]
+
+    def _is_settled(self, path: str, found: Classification, context: ScanContext) -> bool:
+        """Returns whether a bag is closed and old, and has no other form or link."""
+        notes = self._files[path]
+        return (
+            found.state is FileState.CLOSED
+            and found.bag is not None
+            and found.aside is None
+            and notes.trusted
+            and notes.kind in KINDS
+            and notes.stamp.mtime_ns < context.now - max(context.three_splits, YOUNG_NS)
+            and path not in self._watched
+            and path not in self._links.known
+            and other_form(path) not in self._files
+        )
+
+    def _add_unchanged(self, path: str, found: Classification) -> None:
+        if found.bag is not None:
+            self._unchanged.add(found.bag, self._files.pop(path).stamp.inode)
+
     def _examine(
-        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
+        self,
+        stamps: dict[str, Stamp],
+        known: Mapping[str, BagFile],
+        context: ScanContext,
+        settled: list[BagFile],
     ) -> set[str]:
-        """Classifies files; returns those whose classification changed."""
+        """Classifies files; returns those whose classification changed.
+
+        New ones that will not change are added to `settled` instead: a first scan of a week would
+        otherwise hold all that is known of each file at once.
+        """
         changed = set()
+        is_first = not (self._classified or self._unchanged)
         for path, stamp in stamps.items():
             notes = self._files.get(path)
             if notes is None:
-                notes = FileNotes.first(Path(path), stamp, context.now)
+                notes = FileNotes.first(path, stamp, context.now)
                 self._files[path] = notes
                 self._links.add(path)
                 file = known.get(path)
@@ -230,7 +277,15 @@ class BagTable:
                 self._watched.add(path)
             else:
                 self._watched.discard(path)
-            if classification != self._classified.get(path):
+            if (
+                is_first
+                and other_form(path) not in stamps
+                and self._is_settled(path, classification, context)
+                and classification.bag is not None
+            ):
+                settled.append(classification.bag)
+                self._add_unchanged(path, classification)
+            elif classification != self._classified.get(path):
                 self._classified[path] = classification
                 changed.add(path)
         return changed

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
@@ -42,8 +43,6 @@ from ros2_memory.index.scan import YOUNG_NS, settled
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader
@@ -128,7 +127,7 @@ class FileNotes:
     """What is known of one bag file, from outside and, as far as it was read, from inside.
 
     Attributes:
-        path: of the file.
+        file: its path as a string, to save memory.
         kind: its suffix, one of `layout.BAG_KINDS`.
         stamp: its stat result.
         seen_at: when it was first seen like this.
@@ -140,7 +139,7 @@ class FileNotes:
         is_transient: the fault may be the machine's, not the file's.
     """
 
-    path: Path
+    file: str
     kind: str
     stamp: Stamp
     seen_at: Ns
@@ -152,9 +151,14 @@ class FileNotes:
     is_transient: bool = False
 
     @classmethod
-    def first(cls, path: Path, stamp: Stamp, now: Ns) -> FileNotes:
+    def first(cls, file: str, stamp: Stamp, now: Ns) -> FileNotes:
         """Returns the notes on a bag file that was not known before."""
-        return cls(path, bag_kind(path.name) or "", stamp, now, settled(stamp.mtime_ns, now))
+        return cls(file, bag_kind(file) or "", stamp, now, settled(stamp.mtime_ns, now))
+
+    @property
+    def path(self) -> Path:
+        """The path of the file."""
+        return Path(self.file)
 
     def restore(self, summary: BagSummary) -> None:
         """Sets what was read earlier from a closed file, which has not changed since."""
@@ -324,7 +328,7 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Classification:
 def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
     stamp = notes.stamp
     return BagFile(
-        str(notes.path),
+        notes.file,
         stamp.size,
         stamp.mtime_ns,
         state,

@@ -1,4 +1,4 @@
-"""Closed bags that are as they were when the catalogue stored them: most of a week.
+"""Closed bags that do not change any more, or not since the catalogue stored them: most of a week.
 
 Of each the index keeps the bag and its inode, and nothing else. Should its file change, it is
 reactivated: the notes on it are made as if it had been read, and it is classified again.
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.file_state import ScanContext
     from ros2_memory.storage.base import BagReader
 
-_KINDS: Final = (".mcap", ".db3")
+KINDS: Final = (".mcap", ".db3")
 """A compressed bag may lie beside the file it was made from, and is classified with that."""
 
 
@@ -58,7 +58,7 @@ class UnchangedBags:
             Their bags in the order of their starts.
         """
         last = context.now - max(context.three_splits, YOUNG_NS)
-        kinds = tuple(kind for kind in _KINDS if reader.reads(Path(f"bag{kind}")))
+        kinds = tuple(kind for kind in KINDS if reader.reads(Path(f"bag{kind}")))
         compressed = {path for path in stamps if path.endswith(COMPRESSED)}
         taken, inodes = self._bags, self._inodes
         for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
@@ -82,6 +82,14 @@ class UnchangedBags:
         order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
         return [bags[at] for at in order.tolist()]
 
+    def add(self, bag: BagFile, inode: int) -> None:
+        """Adds a bag that has proved to be closed, and old enough not to change."""
+        self._bags[bag.file], self._inodes[bag.file] = bag, inode
+
+    def rows(self) -> Iterator[tuple[BagFile, int]]:
+        """Yields each bag with its inode."""
+        return zip(self._bags.values(), map(self._inodes.__getitem__, self._bags), strict=True)
+
     def is_unchanged(self, path: str, stamp: Stamp, now: Ns) -> bool:
         """Returns whether a file is one of these, and looks as before."""
         known = self.stamp(path)
@@ -104,6 +112,6 @@ class UnchangedBags:
             return None
         bag = self._bags.pop(path)
         del self._inodes[path]
-        notes = FileNotes.first(Path(path), stamp, now)
+        notes = FileNotes.first(path, stamp, now)
         notes.restore(bag.summary)
         return notes, Classification(FileState.CLOSED, bag)

@@ -157,11 +157,7 @@ class IndexManager:
     # The methods below run under the lock.
 
     def _new_table(self) -> BagTable:
-        # Retention counts more than the bags that answer.
-        keep_all_notes = self._collector is not None
-        return BagTable(
-            self.bag_dir, self._reader, known=self._known, keep_all_notes=keep_all_notes
-        )
+        return BagTable(self.bag_dir, self._reader, known=self._known)
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         with _gc_paused() if self.published is None else nullcontext():

@@ -7,12 +7,15 @@ one. Only what changed is worked out again, since a week has 60,000 bags.
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 from enum import Enum, auto
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
+    CARRY_FILE,
     LOCK_FILE,
     MOMENT_FILE,
     MOMENTS_FOLDER,
@@ -30,10 +33,11 @@ from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, Span, StoredBag, StoredFile
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import TopicSummary
+    from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.file_state import Classification
     from ros2_memory.index.scan import Stamp
@@ -66,7 +70,7 @@ _BY_STATE: Final = {
 
 
 class _Entry(NamedTuple):
-    """A bag, and what it was made from."""
+    """A bag that may still change, and what it was made from."""
 
     classification: Classification
     stamp: Stamp
@@ -102,6 +106,7 @@ class Inventory:
         self._own = own
         self._static_topics = frozenset(static_topics)
         self._entries: dict[str, _Entry] = {}
+        self._unchanged: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}
 
     def stock(
@@ -128,15 +133,10 @@ class Inventory:
         owned: dict[str, bool] = {}
         if self._own is not None:
             self._own.names()
-        entries, files = self._entries, known.files
-        for path, classification in known.counted.items():
+        for deletable, bag in chain(self._changing(known), self._settled(known)):
+            path = bag.path
             if path in deleted:
                 continue
-            entry = entries.get(path)
-            stamp = files[path].stamp
-            if not (entry and entry.classification is classification and entry.stamp is stamp):
-                entry = entries[path] = self._entry(path, classification, known)
-            deletable, bag = entry.deletable, entry.bag
             own = owned.get(bag.recording)
             if own is None:
                 own = owned[bag.recording] = self._is_own(bag.recording)
@@ -162,6 +162,37 @@ class Inventory:
         return RetentionStock(
             bags, known.now, sidecars, others, saved=saved, foreign_bytes=elsewhere
         )
+
+    def _changing(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:
+        """Yields the bags that the index has notes on."""
+        for path, classification in known.counted.items():
+            entry = self._entries.get(path)
+            stamp = known.files[path].stamp
+            if not (entry and entry.classification is classification and entry.stamp is stamp):
+                entry = self._entries[path] = self._entry(path, classification, known)
+            yield entry.deletable, entry.bag
+
+    def _settled(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:
+        """Yields the bags of which the index keeps rows."""
+        rows = self._unchanged
+        for bag, inode in known.unchanged.rows():
+            stored = rows.get(bag.file)
+            if stored is None or (
+                stored.files[0].inode[1],
+                stored.files[0].size,
+                stored.written,
+            ) != (
+                inode,
+                bag.size,
+                bag.mtime_ns,
+            ):
+                recording = sys.intern(bag.file.rpartition("/")[0])
+                device = self._folder(recording, known.now).device
+                file = StoredFile((device, inode), bag.size, _on_disk(bag.size))
+                span = self._span(bag)
+                stored = StoredBag(bag.file, recording, span, bag.mtime_ns, (file,))
+                rows[bag.file] = stored
+            yield (Deletable.NO if bag.file.endswith(CARRY_FILE) else Deletable.YES), stored
 
     def _is_own(self, recording: str) -> bool:
         own = self._own
@@ -198,7 +229,7 @@ class Inventory:
         )
 
     def _stored(self, path: str, classification: Classification, known: KnownBags) -> StoredBag:
-        recording = str(known.files[path].path.parent)
+        recording = sys.intern(path.rpartition("/")[0])
         device = self._folder(recording, known.now).device
         other = other_form(path)
         forms = (path, other) if other in known.hidden and other in known.files else (path,)
@@ -206,21 +237,20 @@ class Inventory:
         files = (
             StoredFile((device, each.inode), each.size, _on_disk(each.size)) for each in stamps
         )
-        return StoredBag(
-            path, recording, self._span(classification), stamps[0].mtime_ns, tuple(files)
-        )
+        span = None if classification.bag is None else self._span(classification.bag)
+        return StoredBag(path, recording, span, stamps[0].mtime_ns, tuple(files))
 
-    def _span(self, classification: Classification) -> Span | None:
-        if classification.bag is None:
-            return None
+    def _span(self, bag: BagFile) -> Span | None:
         spans = [
             (topic.first, topic.last)
-            for topic in classification.bag.summary.topics
+            for topic in bag.summary.topics
             if not self._is_received_again(topic)
         ]
         if not spans:
             return None
-        return Span(min(first for first, _ in spans), max(last for _, last in spans))
+        start, end = min(first for first, _ in spans), max(last for _, last in spans)
+        # The bag's own numbers where they are equal, which take no memory.
+        return Span(bag.start if start == bag.start else start, bag.end if end == bag.end else end)
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
         """Whether all messages of a topic in a bag may be repeated by each recording."""
@@ -242,10 +272,16 @@ class Inventory:
         return known
 
     def _forget(self, known: KnownBags) -> None:
-        if len(self._entries) > len(known.counted):
-            for path in self._entries.keys() - known.counted.keys():
-                del self._entries[path]
-            recordings = {entry.bag.recording for entry in self._entries.values()}
+        gone = self._entries.keys() - known.counted.keys()
+        for path in gone:
+            del self._entries[path]
+        if len(self._unchanged) > len(known.unchanged):
+            for path in [path for path in self._unchanged if path not in known.unchanged]:
+                gone.add(path)
+                del self._unchanged[path]
+        if gone:
+            bags = chain((entry.bag for entry in self._entries.values()), self._unchanged.values())
+            recordings = {bag.recording for bag in bags}
             for path in self._folders.keys() - recordings:
                 del self._folders[path]
 

@@ -64,7 +64,7 @@ class RepeatedScan:
             os.utime(path, ns=(mtime_ns, mtime_ns))
         stamp = Stamp.of(path.lstat())
         if self.notes is None:
-            self.notes = FileNotes.first(path, stamp, now)
+            self.notes = FileNotes.first(str(path), stamp, now)
         else:
             self.notes.update(stamp, now)
         recordings = None if names is None else frozenset(names)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
+from ros2_memory.index.bag_table import BagTable
+from ros2_memory.index.file_state import ScanContext
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.clocks import FixedClock
 from tests.support.plain_text_bags import PlainReader, plain
@@ -74,6 +76,30 @@ def test_a_start_over_known_bags_reads_none_and_finds_the_same(start: Start) -> 
     assert index.refresh() == start.read()
     assert index.refresh() == start.read()
     assert (reader.closings.total(), reader.summaries.total()) == (0, 0)
+
+
+def test_of_old_bags_an_index_keeps_rows_alone_and_of_young_ones_once_they_are_old(
+    start: Start,
+) -> None:
+    young = start.bag_dir / "rec" / "rec_5.mcap"
+    os.utime(young, ns=(NOW - 5 * S, NOW - 5 * S))
+    table = BagTable(start.bag_dir, PlainReader(*KINDS), known=None)
+
+    def scan(now: int) -> tuple[set[str], int]:
+        table.update(ScanContext(start.bag_dir, now, 30 * S), patrolling=True)
+        known = table.known((), now)
+        assert known.files.keys() == known.counted.keys()
+        assert len(table.snapshot(now).bags) == 6
+        return {*known.files}, len(known.unchanged)
+
+    assert scan(NOW) == ({str(young)}, 5)
+    assert scan(NOW + 60 * S) == (set(), 6)
+    plain(young, [50, 51, 52])
+    os.utime(young, ns=(NOW + 55 * S, NOW + 55 * S))
+    assert scan(NOW + 60 * S) == ({str(young)}, 5)
+    young.unlink()
+    table.update(ScanContext(start.bag_dir, NOW + 70 * S, 30 * S), patrolling=True)
+    assert len(table.snapshot(NOW).bags) == 5
 
 
 def test_a_bag_that_looks_otherwise_than_it_is_known_is_read(start: Start) -> None:
