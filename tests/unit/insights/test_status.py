@@ -8,9 +8,12 @@ import pytest
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.lost_file import Loss, append_losses
 from ros2_memory.history.context import Call
+from ros2_memory.history.view import TimeRange
 from ros2_memory.index.listed_splits import absent_splits
 from ros2_memory.insights.status import memory_status
+from ros2_memory.queries import topic_range
 from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
@@ -66,6 +69,50 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     assert told["never_heard"] == ["/b"]
     assert (told["restarts"], told["missing"]) == (0, [])
     assert told["fell_silent"] == []
+
+
+def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole(
+    tmp_path: Path,
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    beating(tmp_path, RecorderState.RECORDING, 59, lost={"/odom": 7})
+    append_losses(
+        tmp_path,
+        [
+            Loss("/odom", BEGIN + 10 * S, BEGIN + 11 * S, 4, "stamps"),
+            Loss("/odom", BEGIN + 20 * S, BEGIN + 21 * S, 3, "counter"),
+        ],
+    )
+    told = shown(memory, tmp_path)
+    assert told["lost_last_hour"] == {"/odom": 7}
+    assert (
+        told["trust"] == "7 messages lost before they were recorded, or never published: /odom (7)"
+    )
+
+
+@pytest.mark.parametrize(("start", "lost"), [(0, 4), (12, 0)])
+def test_an_answer_notes_what_was_lost_in_its_window_alone(
+    tmp_path: Path, start: int, lost: int
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    append_losses(tmp_path, [Loss("/odom", BEGIN + 10 * S, BEGIN + 11 * S, 4, "stamps")])
+    begin = (BEGIN + start * S) / S
+    found = topic_range(memory, Call(), "/odom", TimeRange(begin, begin + 15))
+    notes = [note for note in found.notes if "lost" in note]
+    assert (
+        notes
+        == [f"{lost} messages lost before they were recorded, or never published: /odom (4)"][
+            : bool(lost)
+        ]
+    )
+
+
+def test_a_recorder_that_waits_says_for_what(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    beating(tmp_path, RecorderState.WAITING, 59, waiting_for="no /clock")
+    told = shown(memory, tmp_path)
+    assert told["recorder"] == "waiting"
+    assert told["trust"] == "the recorder waits: no /clock"
 
 
 def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -> None:

@@ -106,6 +106,8 @@ def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_p
     assert found["recorder_silent_topics"] == 1
     assert found["recorder_restarts_total"] == 0
     assert found["recorder_state_since_timestamp_seconds"] == T0 / NS_PER_S
+    write_heartbeat(tmp_path, replace(heartbeat(7, T0 + 5 * NS_PER_S), lost={"/odom": 3}))
+    assert measured(gauges)["recorder_lost_messages /odom"] == 3
     for pid, restarts in ((7, 0), (8, 1), (8, 1), (9, 2)):
         write_heartbeat(tmp_path, replace(heartbeat(pid, T0), interval_s=2.0))
         assert measured(gauges)["recorder_restarts_total"] == restarts
