@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 SPLIT_BYTES: Final = 64 * 2**20
-"""Of a larger split only the last seconds are measured, to spare the processor."""
+"""Of a larger split only the last seconds are measured, and no holes, to spare the processor."""
 TAIL_NS: Final[Ns] = 4 * NS_PER_S
 _HOLD_NS: Final[Ns] = ns_from_unix(HOLD_S)
 _FEWEST: Final = 5
@@ -52,8 +52,8 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
     for channel in reader.channels(path):
         texts = offers.setdefault(channel.topic, [])
         texts += [text for name, text in channel.metadata if name == "offered_qos_profiles"]
-    window = TimeWindow.everything()
-    if path.stat().st_size > SPLIT_BYTES:
+    window, is_whole = TimeWindow.everything(), path.stat().st_size <= SPLIT_BYTES
+    if not is_whole:
         summary = reader.summarize(path)
         if not summary.empty:
             window = TimeWindow(summary.end - TAIL_NS, summary.end + 1)
@@ -87,7 +87,7 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
     progress = {
         topic: Progress(readers[topic][0], found)
         for topic, found in positions.items()
-        if topic in readers and topic in flows and flows[topic].offered.publishers == 1
+        if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
     }
     return SplitMeasure(flows, progress, span)
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import yaml
 
-from ros2_memory.recorder.reception.measure import burst_of
+from ros2_memory.recorder.reception import measure
+from ros2_memory.recorder.reception.measure import burst_of, measure_split
 from ros2_memory.recorder.reception.reception import (
     ASK_AGAIN_S,
     DEEPEN_EVERY_S,
@@ -100,6 +102,20 @@ def test_a_queue_that_memory_cuts_short_is_named(tmp_path: Path) -> None:
     made = reception(queue_bytes=2000)
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     assert made.cut_short == {"/odom"}
+
+
+def test_of_a_huge_split_the_end_shows_rates_and_no_holes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = split(tmp_path / "a_0.mcap", 50, 10)
+    whole = measure_split(McapReader(), path)
+    assert len(whole.progress["/odom"].positions) == 500
+    monkeypatch.setattr(measure, "SPLIT_BYTES", 1000)
+    tail = measure_split(McapReader(), path)
+    assert tail.flows == whole.flows
+    assert tail.progress == {}
+    assert tail.span is not None
+    assert tail.span[1] - tail.span[0] <= measure.TAIL_NS
 
 
 def test_an_unreadable_split_teaches_nothing(tmp_path: Path) -> None:
