@@ -45,6 +45,15 @@ _CACHED_TYPE_BYTES: Final = 2_048
 _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
+_EVENT: Final = "_Event"
+_HALVES: Final = ("Request", "Response")
+_SERVICE_HEADER: Final = re.compile(r"={80}\nSRV: .*\n")
+_EVENT_INFO: Final = """\
+uint8 event_type  # 0 request sent, 1 request received, 2 response sent, 3 response received
+builtin_interfaces/Time stamp
+uint8[16] client_gid
+int64 sequence_number
+"""
 _SERVICE: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _MSG_NOISE: Final = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
 _IDL_PIECE: Final = re.compile(
@@ -208,18 +217,47 @@ def _sections(name: str, encoding: str, text: bytes) -> dict[str, _Section]:
     if not plain.strip():
         # A type without fields has an empty text, and so has one whose text was not found.
         return {name: _Section(encoding, "")} if encoding else {}
+    service: dict[str, _Section] = {}
     if encoding != "ros2idl" and _SERVICE.search(plain):
-        kind = "an action" if plain.count("\n---") > 1 else "a service"
-        raise _UnusableError(f"{kind} definition; service events are not decoded")
+        service, plain = _service_event(name, plain)
     pieces = _SEPARATOR.split(plain if plain.endswith("\n") else plain + "\n")
     root = "ros2msg" if encoding in {"", "ros2msg"} else "ros2idl"
-    sections: dict[str, _Section] = {}
+    sections = service
     if pieces[0].strip():
         sections[name] = _Section(root, pieces[0])
     for kind, named, body in zip(pieces[1::3], pieces[2::3], pieces[3::3], strict=True):
         section = _Section("ros2idl" if kind == "IDL" else "ros2msg", body)
         sections.setdefault(full_name(named), section)
     return sections
+
+
+def _service_event(name: str, text: str) -> tuple[dict[str, _Section], str]:
+    """Returns the definitions of a service's events, and what follows that of the service.
+
+    rosbag2 stores the definition of the service itself. An event is that of rosidl's service
+    introspection (REP-2012): who called when, and the request or the response, if contents are
+    published.
+    """
+    found = _SEPARATOR.search(text)
+    own, nested = (text, "") if found is None else (text[: found.start()], text[found.start() :])
+    parts = _SERVICE.split(_SERVICE_HEADER.sub("", own, count=1))
+    words = name.removesuffix(_EVENT).split("/")
+    is_event = name.endswith(_EVENT) and len(words) == 3 and words[1] == "srv"
+    if not is_event or len(parts) != len(_HALVES):
+        kind = "an action" if len(parts) > len(_HALVES) else "a service"
+        raise _UnusableError(f"{kind} definition, and no message")
+    package, _, short = words
+    sections = {"service_msgs/msg/ServiceEventInfo": _Section("ros2msg", _EVENT_INFO)}
+    fields = ["service_msgs/ServiceEventInfo info"]
+    for half, part in zip(_HALVES, parts, strict=True):
+        member = f"{package}/{short}_{half}"
+        parsed = _parse(full_name(member), _Section("ros2msg", part))
+        is_empty = not parsed[full_name(member)][1]
+        body = f"{part}\nuint8 structure_needs_at_least_one_member\n" if is_empty else part
+        sections[full_name(member)] = _Section("ros2msg", body)
+        fields.append(f"{member}[<=1] {half.lower()}")
+    sections[name] = _Section("ros2msg", "\n".join(fields))
+    return sections, nested
 
 
 def full_name(name: str) -> str:
@@ -235,7 +273,13 @@ def _parse(name: str, section: _Section) -> Typesdict:
     if statements > MAX_STATEMENTS:
         raise _UnusableError(f"its definition of {name} has {statements} statements, too many")
     try:
-        return get_types_from_idl(text) if is_idl else get_types_from_msg(text, name)
+        if is_idl:
+            return get_types_from_idl(text)
+        if "/srv/" not in name:
+            return get_types_from_msg(text, name)
+        # The parser knows names of messages alone.
+        parsed = get_types_from_msg(text, name.replace("/srv/", "/msg/"))
+        return {name: parsed[name.replace("/srv/", "/msg/")]}
     # The parser raises its own error, or whatever Python does with what it took for a number.
     except Exception as error:
         reason = f"its definition of {name} cannot be parsed: {_brief(error)}"

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
@@ -199,12 +199,30 @@ module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
     @pytest.mark.parametrize(
         ("whole", "kind"),
         [
-            ("bool ask\n---\nbool answer\n", "a service definition; service events"),
+            ("bool ask\n---\nbool answer\n", "a service definition"),
             ("int8 goal\n---\nint8 result\n---\nint8 feedback\n", "an action definition"),
         ],
     )
     def test_services_and_actions_are_refused_as_what_they_are(self, whole: str, kind: str) -> None:
-        assert kind in reason(lookup("a_msgs/srv/A_Event", whole))
+        assert kind in reason(lookup("a_msgs/srv/A", whole))
+
+    @pytest.mark.parametrize("header", ["", f"{RULE}\nSRV: a_msgs/srv/A\n"])
+    def test_an_event_of_a_service_has_its_request_or_its_response(self, header: str) -> None:
+        found = lookup("a_msgs/srv/A_Event", f"{header}B ask\n---\n{RULE}\nMSG: a_msgs/B\nbool b\n")
+        assert isinstance(found, MessageType)
+        info = b"\1\0\0\0" + bytes(4) + bytes(4) + bytes(16) + bytes(4) + (7).to_bytes(8, "little")
+        asked: Any = decoded(found, CDR + info + b"\1\0\0\0\1\0\0\0" + bytes(4))
+        assert (asked.info.event_type, asked.info.sequence_number) == (1, 7)
+        assert [each.ask.b for each in asked.request] == [True]
+        assert list(asked.response) == []
+        answered = decoded(found, CDR + info + bytes(4) + b"\1\0\0\0\0")
+        assert len(getattr(answered, "response", ())) == 1
+
+    @pytest.mark.parametrize(
+        "name", ["a/b/srv/A_Event", "srv/A_Event", "a_msgs/msg/A_Event", "A_Event"]
+    )
+    def test_a_service_under_another_name_is_refused(self, name: str) -> None:
+        assert "a service definition" in reason(lookup(name, "bool ask\n---\nbool answer\n"))
 
     def test_a_type_without_fields_differs_from_one_whose_text_was_not_found(self) -> None:
         empty = lookup("a_msgs/msg/Nothing", "")

@@ -27,7 +27,6 @@ pytestmark = needs_real
 DAMAGED: Final = {"tiryoh_small_and_truncated": {"Dockerfile.mcap"}}
 NOT_DECODED: Final = {
     # topic types that have no definition anywhere, service events, foreign encodings
-    "rosbag2_service_events_mcap": 2,
     "rosbag2_time0_mcap": 0,
     "rosbag2_v1_2018_db3": 2,
     "novatel_customtypes_nometa_db3": 5,

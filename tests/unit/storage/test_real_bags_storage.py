@@ -34,9 +34,6 @@ REFUSED = {
         "test_msgs/msg/StaticArrayPrimitives": "no definition",
         "test_msgs/msg/Primitives": "no definition",
     },
-    "rosbag2_service_events_mcap": {
-        "test_msgs/srv/BasicTypes_Event": "a service definition; service events are not decoded"
-    },
     "novatel_customtypes_nometa_db3": {
         "novatel_oem7_msgs/msg/INSPVA": "reader.custom_msg_paths",
         "novatel_oem7_msgs/msg/BESTPOS": "reader.custom_msg_paths",
@@ -198,11 +195,17 @@ def test_of_the_bag_without_definitions_the_standard_types_decode() -> None:
 
 
 @needs_real
-def test_the_topics_beside_service_events_decode() -> None:
+def test_service_events_decode_as_do_the_topics_beside_them() -> None:
     (path,) = files_of("rosbag2_service_events_mcap")
-    good = [r for r in all_records(mcap(), path) if mcap().undecodable(r.channel) is None]
-    assert [record.channel.type for record in good] == ["test_msgs/msg/Strings"] * 2
-    assert all(mcap().decode(record) for record in good)
+    found = [(r.channel.type, mcap().decode(r)) for r in all_records(mcap(), path)]
+    kinds = Counter(kind for kind, _ in found)
+    assert kinds == {"test_msgs/msg/Strings": 2, "test_msgs/srv/BasicTypes_Event": 8}
+    events: list[Any] = [message for kind, message in found if kind.endswith("_Event")]
+    assert {each.info.event_type for each in events} <= {0, 1, 2, 3}
+    # 0 and 1 are of requests, 2 and 3 of responses; without contents there is neither.
+    for each in events:
+        assert len(each.request) <= (each.info.event_type < 2)
+        assert len(each.response) <= (each.info.event_type >= 2)
 
 
 @needs_real
