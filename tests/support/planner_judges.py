@@ -277,7 +277,7 @@ def stopped(last_s: float) -> Judge:
 
 def _stop(event: JsonValue, row: Sequence[Message]) -> None:
     x, y = text(event, "text").removeprefix("stood at x ").split(", y ")
-    middle = robot.pose(row[len(row) // 2].t)
+    middle = robot.pose_in_map(row[len(row) // 2].t)
     near("x", float(x), middle.x, PLACE_M)
     near("y", float(y), middle.y, PLACE_M)
     near("time", number(event, "timestamp"), unix_from_ns(row[0].log_time), STOP_S)

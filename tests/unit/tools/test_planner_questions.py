@@ -49,7 +49,7 @@ THAT_COUNT = {
         "stood_s",
     },
     "How long have you been standing here?": {
-        f"events.4.{name}" for name in ("timestamp", "ago_s", "duration_s", "text", "goes_on")
+        f"events.5.{name}" for name in ("timestamp", "ago_s", "duration_s", "text", "goes_on")
     },
     "How far did you drive between your last two stops?": {"distance_m"},
     "Where is the cup?": {

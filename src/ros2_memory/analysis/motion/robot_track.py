@@ -174,6 +174,8 @@ def decode_track(packed: bytes) -> RobotTrack:
         raise ValueError(f"not a track: {error}") from error
     body = packed[_HEAD.size :]
     size = count * _ROW_BYTES
+    if len(body) != size + -(-count // 8):
+        raise ValueError(f"not a track: {len(body)} bytes for {count} points")
     planes = np.frombuffer(body, np.uint8, size).reshape(4, 8, count).transpose(0, 2, 1)
     unsigned = np.ascontiguousarray(planes).view("<i8")[:, :, 0]
     steps = unsigned >> 1 ^ -(unsigned & 1)
