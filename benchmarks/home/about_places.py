@@ -56,10 +56,10 @@ def _visited(asked: Asked) -> list[Question]:
     door = truth.visits["front door"][-1]
     kitchen = _within(truth.visits["kitchen"], asked.day(last), asked.day(last + 1))
     bedroom = _within(truth.visits["bedroom"], asked.day(last), asked.day(last + 1))
-    minutes = sum(b - a for a, b in kitchen) / 60
+    minutes = sum(truth.elapsed(a, b) for a, b in kitchen) / 60
     day = (asked.day(last - 1), asked.day(max(last, 1)))
     spent = {
-        name: sum(b - a for a, b in _within(spans, *day)) / 60
+        name: sum(truth.elapsed(a, b) for a, b in _within(spans, *day)) / 60
         for name, spans in truth.visits.items()
     }
     return [
@@ -69,7 +69,7 @@ def _visited(asked: Asked) -> list[Question]:
             "When were you last at the front door, and how long?",
             {
                 "arrived": Time(door[0] - 5.0, door[0] + 5.0),
-                "seconds": Number(door[1] - door[0], 5.0),
+                "seconds": Number(truth.elapsed(*door), 5.0),
             },
             ask("visits", where="front door", limit=1),
             lambda found: {
@@ -167,7 +167,7 @@ def _was_at(asked: Asked) -> list[Question]:
 def _off_the_dock(asked: Asked) -> list[Question]:
     outing = asked.world.life.outings[-1]
     left = asked.world.clock_at(outing.start)
-    seconds = asked.world.clock_at(outing.stop) - left
+    seconds = outing.stop - outing.start
     return [
         Question(
             "last-outing",

@@ -45,7 +45,7 @@ def _why(asked: Asked) -> list[Question]:
 
 def _stopped(reason: str, stood: Standstill, words: tuple[str, ...]) -> Question:
     at = round(stood.start + 1.0)
-    truth = Words(words, () if words else _OTHERS)
+    truth = Words(words, () if words else _OTHERS, or_none=True)
 
     def read(found: Sequence[Row]) -> Answer:
         # What came before, wherever the reply lists it; an empty list is an answer.

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
 
-_NOTHING = ("nothing", "no reason", "not recorded", "unknown")
+_NOTHING = ("none", "nothing", "no reason", "not recorded", "unknown", "not known")
+_NO = "no "
+_NO_WAY = "no way"
+"""An answer that begins so gives a reason; one that begins with another "no" gives none."""
 
 Answer: TypeAlias = "Mapping[str, JsonValue]"
 
@@ -81,17 +84,21 @@ class Time:
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """A text that holds one of some words, if there are any, and none of others."""
+    """A text that holds one of some words, if there are any, and none of others.
+
+    `or_none`: it is a short word, or says that there is none.
+    """
 
     any_of: tuple[str, ...] = ()
     none_of: tuple[str, ...] = ()
+    or_none: bool = False
 
     def accepts(self, given: JsonValue) -> bool:
         """Returns whether the text is right."""
         if not isinstance(given, str):
             return False
         text = given.casefold().strip()
-        if not self.any_of and text.startswith(_NOTHING):
+        if not self.any_of and _says_none(text):
             return True
         if any(word in text for word in self.none_of):
             return False
@@ -103,7 +110,7 @@ class Words:
 
     def form(self) -> str:
         """Returns what kind of value is asked for."""
-        return "text"
+        return 'a short word, or "none"' if self.or_none else "text"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +212,11 @@ def wrong_fields(truth: Mapping[str, Expected], answer: Answer) -> Sequence[str]
         for name, expected in truth.items()
         if name not in answer or not expected.accepts(answer[name])
     ]
+
+
+def _says_none(text: str) -> bool:
+    is_no = text.startswith(_NO) and not text.startswith(_NO_WAY)
+    return is_no or text in {"", "no"} or text.startswith(_NOTHING)
 
 
 def unix_of(given: JsonValue) -> float | None:

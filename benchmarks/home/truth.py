@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 
 from benchmarks.home import flat
+from benchmarks.home.days import CLOCK_STEP_S
 from benchmarks.home.things import DAY
 from benchmarks.home.world import START_S, world_of
 
@@ -122,6 +123,11 @@ class Truth:
     def end(self) -> float:
         """Returns the last recorded moment; questions are asked then."""
         return self.recorded[-1][1]
+
+    def elapsed(self, start: float, end: float) -> float:
+        """Returns how long it truly was from one time of the robot's clock to another."""
+        step = self.clock_step
+        return end - start - max(0.0, min(end, step + CLOCK_STEP_S) - max(start, step))
 
     def of(self, label: str) -> list[ThingTruth]:
         """Returns the things of a label."""

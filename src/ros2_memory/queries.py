@@ -65,7 +65,7 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
-from ros2_memory.insights.clock_steps import clock_steps
+from ros2_memory.insights.clock_steps import across_steps, clock_steps, elapsed_in
 from ros2_memory.insights.field_extremes import (
     MAX_MESSAGES,
     TOO_MANY,
@@ -424,7 +424,8 @@ def trajectory_summary(
     note_robots(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
-    drawn = _with_few_waypoints(path.trajectory, max_waypoints)
+    elapsed = elapsed_in(view, window)
+    drawn = _with_few_waypoints(across_steps(path, elapsed), max_waypoints)
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
         drawn = replace(drawn, waypoints=moved)
@@ -434,6 +435,7 @@ def trajectory_summary(
         path.first,
         path.last,
         drawn,
+        elapsed.skipped_between(path.first, path.last),
         notes=view.notes.sentences(),
     )
 

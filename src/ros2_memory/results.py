@@ -219,13 +219,17 @@ class ValueWhen(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class TrajectorySummary(AnswerWithNotes):
-    """The driven path in a window, from one pose topic in log-time order."""
+    """The driven path in a window, from one pose topic in log-time order.
+
+    `skipped`: how much of the time from its first to its last pose the clock skipped.
+    """
 
     topic: str
     frame_id: str
     start: Ns
     end: Ns
     trajectory: Trajectory
+    skipped: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,6 +284,7 @@ class Sighting:
         matched: the texts of the last message that met the condition, where that is on texts.
         value: the requested fields of the last message; None where none were, or it has none.
         score: of the detection, if the message has that; the best of several.
+        skipped: how much of the time from the first to the last the clock skipped.
     """
 
     topic: str
@@ -292,6 +297,7 @@ class Sighting:
     matched: tuple[str, ...] = ()
     value: JsonValue = None
     score: float | None = None
+    skipped: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,6 +353,7 @@ class Event:
 
     With `goes_on`, `end` is only as far as is known. `before`: what changed before, nearest first.
     `place`: the named place that the robot was in. `score`: the best one of a thing in view.
+    `skipped`: how much of its time the clock skipped.
     """
 
     kind: str
@@ -357,6 +364,7 @@ class Event:
     before: tuple[PastChange, ...] = ()
     place: str | None = None
     score: float | None = None
+    skipped: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,6 +390,7 @@ class Recap(AnswerWithNotes):
         gap_m: the path across gaps in the recording, in straight lines; None without a gap.
         where: the region's name, where only what happened there was asked for.
         visits: how often the robot was there; `inside` is how long in all.
+        skipped: how much of the window the clock skipped.
     """
 
     start: Ns
@@ -400,6 +409,7 @@ class Recap(AnswerWithNotes):
     where: str | None = None
     visits: int = 0
     inside: Ns = 0
+    skipped: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)

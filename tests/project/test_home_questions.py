@@ -72,6 +72,11 @@ def test_answers_are_judged_within_their_tolerance() -> None:
     assert Words((), ("bumper",)).accepts("nothing recorded")
     assert Words((), ("bumper",)).accepts("Nothing recorded, the bumper was free")
     assert not Words((), ("bumper",)).accepts("/bumper became true")
+    assert Words((), ("cancel",)).accepts("no bump, error or cancel was recorded")
+    assert Words((), ("bumper",)).accepts("None")
+    assert not Words((), ("no way",)).accepts("No way to the goal")
+    assert not Words(("abort",)).accepts("none")
+    assert Words((), or_none=True).form() == 'a short word, or "none"'
     assert not Words(("kitchen",)).accepts(None)
     names = Names(frozenset({"mug"}), frozenset({"cup"}))
     assert names.accepts(["Mug", "cup"])

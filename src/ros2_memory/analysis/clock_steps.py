@@ -37,6 +37,29 @@ class ClockStep(NamedTuple):
     by: Ns
 
 
+class Elapsed:
+    """How much time passed between log times, where the clock was set at some moments.
+
+    A step forward skipped the time that follows it on the clock, which never passed and does not
+    count. A step back is known as a bound alone, and changes nothing here. So durations that adjoin
+    add up, and none is negative.
+
+    Attributes:
+        skipped: the times that steps forward skipped, as half-open spans, in order.
+    """
+
+    def __init__(self, steps: Iterable[ClockStep] = ()) -> None:
+        self.skipped = tuple((at, at + by) for at, by in sorted(steps) if by > 0)
+
+    def between(self, start: Ns, stop: Ns) -> Ns:
+        """Returns how much time passed from one moment to another."""
+        return stop - start - self.skipped_between(start, stop)
+
+    def skipped_between(self, start: Ns, stop: Ns) -> Ns:
+        """Returns how much of the time from one moment to another the clock skipped."""
+        return sum(max(0, min(stop, end) - max(start, begin)) for begin, end in self.skipped)
+
+
 def holes(times: Iterable[Ns]) -> list[tuple[Ns, Ns]]:
     """Returns where the log times of all messages of a bag, in any order, are far apart."""
     return [

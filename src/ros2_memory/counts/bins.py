@@ -11,6 +11,7 @@ from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps, unix_text
 from ros2_memory.history.no_data import no_data_between
+from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.results import Bins, Usual
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class BinnedWindow:
         window: the part of it that the memory reaches.
         bins: its bins.
         gaps: when nothing was recorded in it.
+        elapsed: how much time passed between moments of it.
         usual: when something usually began first in a day, if that is counted.
         usual_exit: when the robot usually left first in a day, likewise.
 
@@ -68,11 +70,9 @@ class BinnedWindow:
         self.usual: Usual | None = None
         self.usual_exit: Usual | None = None
         self.gaps = list(recording_gaps(view, self.window))
-        whole = [(self.window.start, self.window.stop)]
-        recorded = self._lengths(whole) - self._lengths(self.gaps)
-        total = sum(stop - start for start, stop in whole) - sum(
-            stop - start for start, stop in self.gaps
-        )
+        self.elapsed = elapsed_in(view, self.window)
+        recorded = self._lengths([self._ends]) - self._lengths(self.gaps)
+        total = self._total([self._ends]) - self._total(self.gaps)
         self.add("recorded_s", "duration", recorded.tolist(), total)
 
     def add(self, name: str, kind: BinColumn, values: Values, whole: float | None) -> None:
@@ -98,10 +98,7 @@ class BinnedWindow:
 
     def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[tuple[Ns, Ns]]) -> None:
         """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""
-        start, stop = self._ends
-        inside = [(max(begin, start), min(end, stop)) for begin, end in spans]
-        total = sum(max(end - begin, 0) for begin, end in inside)
-        self.add(column, kind, self._lengths(spans).tolist(), total)
+        self.add(column, kind, self._lengths(spans).tolist(), self._total(spans))
 
     def add_counts(self, column: str, times: ArrayLike) -> None:
         """Adds how many of these times each bin has."""
@@ -161,7 +158,18 @@ class BinnedWindow:
         return len(found)
 
     def _lengths(self, spans: Sequence[tuple[Ns, Ns]]) -> NDArray[np.int64]:
-        return self.bins.lengths([each[0] for each in spans], [each[1] for each in spans])
+        """Returns how much time (ns) of half-open spans passed in each bin."""
+        starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
+        lengths = self.bins.lengths(starts, stops)
+        for skipped in self.elapsed.skipped:
+            lengths -= self.bins.lengths(starts.clip(*skipped), stops.clip(*skipped))
+        return lengths
+
+    def _total(self, spans: Sequence[tuple[Ns, Ns]]) -> Ns:
+        """Returns how much time (ns) of half-open spans passed in the window."""
+        start, stop = self._ends
+        inside = [(max(begin, start), min(end, stop)) for begin, end in spans]
+        return sum(self.elapsed.between(begin, end) for begin, end in inside if begin < end)
 
     @property
     def _ends(self) -> tuple[Ns, Ns]:

@@ -102,7 +102,8 @@ def _add_each_place(binned: BinnedWindow, inside: Sequence[Sequence[Inside]]) ->
     rest: list[None] = [None] * (len(binned.bins.names) - len(inside))
     entries = [sum(each.entered for each in stays) for stays in inside]
     exits = [sum(each.left for each in stays) for stays in inside]
-    lengths = [sum(stop - start for start, stop in _spans(stays)) for stays in inside]
+    between = binned.elapsed.between
+    lengths = [sum(between(start, stop) for start, stop in _spans(stays)) for stays in inside]
     binned.add("entries", "count", [*entries, *rest], sum(entries))
     binned.add("exits", "count", [*exits, *rest], sum(exits))
     binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
@@ -10,21 +11,31 @@ from ros2_memory.analysis.clock_steps import (
     BESIDE_NS,
     SHORTEST_STEP_NS,
     ClockStep,
+    Elapsed,
     holes,
     step_over,
 )
-from ros2_memory.analysis.motion.odometry import TimedPosition, is_place
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.analysis.motion.odometry import GAP_PERIODS, TimedPosition, is_place
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+    UndecodableError,
+)
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import add_poses
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.index.clock_faults import FaultyClock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import SuspectedHole
 
@@ -39,6 +50,60 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     Back by the order of log times, forward where the robot drove through the step.
     """
     window = TimeWindow.everything() if window is None else window
+    return tuple(each for each in _steps_around(view, window) if window.contains(each.at))
+
+
+def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
+    """Returns how much time passed between moments of a window; notes name the steps in it."""
+    try:
+        steps = [
+            each
+            for each in _steps_around(view, window)
+            if window.overlaps(each.at, each.at + max(each.by - 1, 0))
+        ]
+    except QueryTimeoutError:
+        view.notes.complete = False
+        view.notes.add(
+            "the time was over before it was known whether the clock was set: durations are by "
+            "the clock"
+        )
+        return Elapsed()
+    for at, by in steps:
+        view.notes.add(
+            f"the clock was set {seconds(by)} ahead at {unix_text(at)}: durations are without that"
+            if by > 0
+            else f"the clock was set back by {seconds(-by)} or more at {unix_text(at)}: durations "
+            "across that are too short by as much"
+        )
+    return Elapsed(steps)
+
+
+def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
+    """Returns the trajectory of a path on which a step of the clock is no gap, and takes no time.
+
+    A step is a gap among poses that are often enough for it; see `odometry`.
+    """
+    found = path.trajectory
+    duration_s = found.totals.duration_s
+    skipped = elapsed.skipped_between(path.first, path.last)
+    if not skipped or found.poses < 2:
+        return found
+    least = GAP_PERIODS * duration_s / (found.poses - 1)
+    crossed = sum(
+        path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
+        for begin, stop in elapsed.skipped
+    )
+    gaps = max(0, found.totals.gaps - crossed)
+    elapsed_s = duration_s - unix_from_ns(skipped)
+    return replace(
+        found,
+        totals=replace(found.totals, gaps=gaps, gap_m=found.totals.gap_m if gaps else 0.0),
+        avg_speed=found.totals.distance_m / elapsed_s if elapsed_s > 0 else found.avg_speed,
+    )
+
+
+def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
+    """Returns the steps in a window, and others near it."""
     steps = [
         ClockStep(fault.bag.start, -fault.by)
         for fault in view.snapshot.dating.faults
@@ -54,7 +119,7 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
             suspects = []
         for suspect in suspects[-_MOST_SUSPECTS:]:
             steps += _steps_in(view, topic, suspect)
-    return tuple(sorted(each for each in steps if window.contains(each.at)))
+    return sorted(steps)
 
 
 def _steps_in(view: View, topic: str, suspect: SuspectedHole) -> Sequence[ClockStep]:

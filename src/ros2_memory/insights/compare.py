@@ -31,6 +31,7 @@ from ros2_memory.things.known import known_things
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Call, Memory
@@ -77,15 +78,16 @@ def compare(
     drives = [drive_in(view, each) for each in windows]
     ways = [_way(view, drive, each) for drive, each in zip(drives, windows, strict=True)]
     placement = _placement(view)
-    places = _places(view, placement, windows, region)
+    elapsed = [each.elapsed for each in drives]
+    places = _places(view, placement, windows, region, elapsed)
     apart = _ways_apart(view, placement, drives, windows, region)
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
     for each in windows:
         note_unread(view, each)
-    recorded = [_recorded(view, each) for each in windows]
+    recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
     _note_lengths(view, recorded)
     return Comparison(
-        lengths=Pair(*(_length(each) for each in windows)),
+        lengths=Pair(*(_length(*each) for each in zip(windows, elapsed, strict=True))),
         recorded=Pair(*recorded),
         frame_id=frame,
         things=things,
@@ -215,19 +217,21 @@ def _places(
     placement: MapPlacement | None,
     windows: tuple[TimeWindow, TimeWindow],
     where: Where | None,
+    elapsed: Sequence[Elapsed],
 ) -> list[dict[str, float | None]]:
     """Returns the minutes in each named place, or in a region, of each window."""
     places = view.memory.limits.places
     if placement is None or (where is None and not places):
         return [{}, {}]
     found: list[dict[str, float | None]] = []
-    for window in windows:
+    for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
             visited = place_visits(view, places, placement.frame_id, window)
             durations = {each.place: each.duration for each in visited}
         else:
             inside = times_inside(view, where, placement.frame_id, window)
-            durations = {where.name or "where": sum(each.stop - each.start for each in inside)}
+            there = sum(passed.between(each.start, each.stop) for each in inside)
+            durations = {where.name or "where": there}
         found.append({name: unix_from_ns(each) / 60 for name, each in durations.items()})
     return found
 
@@ -249,12 +253,11 @@ def _silent(view: View, window: TimeWindow) -> dict[str, float | None]:
     return silent
 
 
-def _length(window: TimeWindow) -> float:
-    start, end = window.asked()
-    return unix_from_ns(end - start)
+def _length(window: TimeWindow, elapsed: Elapsed) -> float:
+    return unix_from_ns(elapsed.between(*window.asked()))
 
 
-def _recorded(view: View, window: TimeWindow) -> float:
+def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
     """Returns how many seconds of a window were recorded, but for pauses of less than a split."""
     start, end = window.asked()
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
@@ -264,9 +267,11 @@ def _recorded(view: View, window: TimeWindow) -> float:
     if last <= first:
         return 0.0
     gaps = sum(
-        max(0, min(stop, last) - max(begin, first)) for begin, stop in recording_gaps(view, window)
+        elapsed.between(max(begin, first), min(stop, last))
+        for begin, stop in recording_gaps(view, window)
+        if begin < last and first < stop
     )
-    return unix_from_ns(max(0, last - first - gaps))
+    return unix_from_ns(max(0, elapsed.between(first, last) - gaps))
 
 
 def _note_lengths(view: View, recorded: list[float]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
+from ros2_memory.analysis.clock_steps import Elapsed
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.speed_drops import SLOT_NS
 from ros2_memory.analysis.motion.standstills import (
@@ -30,6 +31,7 @@ from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
 from ros2_memory.history.driven_path import add_poses, driven_path
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
+from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -54,12 +56,14 @@ _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
 class Drive:
     """How the robot moved: its path, and its standstills with whether each goes on afterwards.
 
-    `drops` are sudden losses of speed that no standstill follows.
+    `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
+    between moments of the window.
     """
 
     path: DrivenPath | None = None
     standstills: tuple[tuple[Standstill, bool], ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
+    elapsed: Elapsed = field(default_factory=Elapsed)
 
     @property
     def known(self) -> Trajectory | None:
@@ -73,7 +77,7 @@ class Drive:
         It is not known where no pose has a valid position, nor where the robot neither moved nor
         stood for most of the time: noise hides where it stood.
         """
-        stood = sum(each.end - each.start for each, _ in self.standstills)
+        stood = sum(self.elapsed.between(each.start, each.end) for each, _ in self.standstills)
         known = self.known
         if known is None:
             return stood or None
@@ -94,6 +98,7 @@ class Drive:
 
 def drive_in(view: View, window: TimeWindow) -> Drive:
     """Returns how the robot moved; nothing, with a note, where that is not known."""
+    elapsed = elapsed_in(view, window)
     try:
         topic = resolve_pose_topic(view)
         path = driven_path(view, topic, window)
@@ -101,10 +106,12 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         standstills, drops = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"nothing is known of the way: {error}")
-        return Drive()
+        return Drive(elapsed=elapsed)
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
-    return Drive(path, standstills, drops)
+    else:
+        path = replace(path, trajectory=across_steps(path, elapsed))
+    return Drive(path, standstills, drops, elapsed)
 
 
 _STANDSTILLS: Final = DigestKind(

@@ -43,6 +43,7 @@ from ros2_memory.results import Before, Event, Recap
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.intervals import IntervalTable
     from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.analysis.topic_events import ReportedError, TopicEvents
@@ -135,8 +136,9 @@ def recap(
     view, window = open_span(memory, call, span)
     start, end = window.asked()
     places = robot_places(view, window, frame_id)
-    there = None if region is None else _There(times_in_region(view, region, window))
     drive = drive_in(view, window)
+    elapsed = drive.elapsed
+    there = None if region is None else _There(times_in_region(view, region, window), elapsed)
     found = found_events(view, window)
     least = memory.limits.min_score if min_score is None else min_score
     reported, things, throughout = _topic_events(view, window, found, there, least)
@@ -146,7 +148,7 @@ def recap(
         for begin, until in recording_gaps(view, window)
     ]
     events += [*_clock_steps(view, window), *_silences(view, window)]
-    events += [_goal(each, start) for each in goals_in(view, window, found)]
+    events += [_goal(each, start, elapsed) for each in goals_in(view, window, found)]
     if there is not None:
         events = [each for each in events if there.has(each)]
     note_unread(view, window)
@@ -158,6 +160,10 @@ def recap(
     shown = _with_changes(changes_in(view, window, found), shown)
     if places is not None:
         shown = [_in_place(each, places) for each in shown]
+    shown = [
+        replace(each, skipped=elapsed.skipped_between(each.start, each.end or each.start))
+        for each in shown
+    ]
     stood = drive.stood(end - start)
     if stood is None and drive.known is not None:
         view.notes.add(_STANDSTILLS_UNKNOWN)
@@ -173,6 +179,7 @@ def recap(
         events=tuple(shown),
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
+        skipped=elapsed.skipped_between(start, end),
     )
     if there is None or region is None:
         answer = _with_way(view, answer, drive)
@@ -187,8 +194,14 @@ def recap(
 class _There:
     """The times at which the robot was in a region, in order."""
 
-    def __init__(self, spans: Sequence[Inside]) -> None:
+    def __init__(self, spans: Sequence[Inside], elapsed: Elapsed) -> None:
         self.spans = spans
+        self._elapsed = elapsed
+
+    @property
+    def length(self) -> Ns:
+        """How long they were in all."""
+        return sum(self._elapsed.between(each.start, each.stop) for each in self.spans)
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""
@@ -209,9 +222,10 @@ class _There:
     def length_of(self, standstills: Iterable[tuple[Standstill, bool]]) -> Ns:
         """Returns how long the robot stood in them."""
         return sum(
-            max(0, min(stood.end, each.stop) - max(stood.start, each.start))
+            self._elapsed.between(max(stood.start, each.start), min(stood.end, each.stop))
             for stood, _ in standstills
             for each in self.spans
+            if stood.start < each.stop and each.start < stood.end
         )
 
 
@@ -239,7 +253,7 @@ def _with_way_there(view: View, answer: Recap, window: TimeWindow, there: _There
         distance_m=None if driven is None else driven.distance_m,
         max_speed=None if driven is None else driven.max_speed,
         visits=len(there.spans),
-        inside=sum(each.stop - each.start for each in there.spans),
+        inside=there.length,
     )
 
 
@@ -359,7 +373,7 @@ def _errors(
     return () if inside is None else inside.errors
 
 
-def _goal(goal: GoalRun, start: Ns) -> Event:
+def _goal(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     """Returns a goal from when it was accepted; one from before the window, from when it ended."""
     kind = "failed goal" if goal.outcome in FAILURES else "goal"
     if goal.accepted is None:
@@ -368,7 +382,7 @@ def _goal(goal: GoalRun, start: Ns) -> Event:
         return Event(kind, at, None, text, goes_on=goal.ended is None)
     if goal.ended is None:
         return Event(kind, goal.accepted, None, f"{goal.action} goal accepted", goes_on=True)
-    after = f"after {seconds(goal.ended - goal.accepted)}"
+    after = f"after {seconds(elapsed.between(goal.accepted, goal.ended))}"
     return Event(kind, goal.accepted, goal.ended, f"{goal.action} goal {goal.outcome} {after}")
 
 

@@ -31,6 +31,7 @@ from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.pose_frames import placed, with_place
@@ -121,7 +122,14 @@ def find_matches(
     if collected.cut and collected.selected:
         searched = TimeWindow(collected.selected[-1].first, window.stop)
     view.notes.retract_before(searched.start)
-    found = tuple(_sighting(view, condition, matches, frame_id) for matches in collected.selected)
+    elapsed = elapsed_in(view, searched)
+    found = tuple(
+        replace(
+            _sighting(view, condition, matches, frame_id),
+            skipped=elapsed.skipped_between(matches.first, matches.newest.time),
+        )
+        for matches in collected.selected
+    )
     if fields:
         found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)

@@ -36,6 +36,7 @@ from ros2_memory.history.no_data import (
 )
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import open_span
+from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.pose_frames import placed_waypoints
 from ros2_memory.places.scope import times_in_region
 from ros2_memory.places.where import parse_where
@@ -88,6 +89,7 @@ def driven_inside(
         raise no_data_between(view, (name,), window)
     inside = times_in_region(view, region, window)
     totals, waypoints = way.totals(inside), way.waypoints(inside, max_waypoints)
+    elapsed = elapsed_in(view, window)
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
     note_robots(view, name, window)
@@ -98,7 +100,7 @@ def driven_inside(
         frame_id or way.frames[0],
         region.name or "where",
         len(inside),
-        sum(each.stop - each.start for each in inside),
+        sum(elapsed.between(each.start, each.stop) for each in inside),
         inside[0].start if inside else None,
         inside[-1].stop if inside else None,
         totals.distance_m,

@@ -13,12 +13,14 @@ import numpy as np
 from ros2_memory.core.regions import Circle
 from ros2_memory.core.timebase import NS_PER_MS, Ns
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside
 from ros2_memory.results import PlaceVisits, Visit
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Place
@@ -28,15 +30,19 @@ if TYPE_CHECKING:
 
 
 class RegionVisits(NamedTuple):
-    """All visits to a region in a window, newest first, and the track that they are of."""
+    """All visits to a region in a window, newest first, and the track that they are of.
+
+    `elapsed`: how much time passed between moments of the window.
+    """
 
     track: RobotTrack
     all: list[Inside]
+    elapsed: Elapsed
 
     @property
     def duration(self) -> Ns:
         """How long they were in all."""
-        return sum(each.stop - each.start for each in self.all)
+        return sum(self.elapsed.between(each.start, each.stop) for each in self.all)
 
 
 def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
@@ -57,9 +63,15 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
     return joined.track
 
 
-def region_visits(track: RobotTrack, where: Where, window: TimeWindow) -> RegionVisits:
-    """Returns the visits to a region."""
-    return RegionVisits(track, robot_inside(track, where.region, window)[::-1])
+def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -> RegionVisits:
+    """Returns the visits to a region in a window.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before anything is known.
+    """
+    track = track_in(view, frame_id, window)
+    inside = robot_inside(track, where.region, window)
+    return RegionVisits(track, inside[::-1], elapsed_in(view, window))
 
 
 def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:
@@ -71,7 +83,7 @@ def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) 
     return Visit(
         arrived=one.start,
         departed=None if there_still and not one.left else one.stop,
-        duration=one.stop - one.start,
+        duration=found.elapsed.between(one.start, one.stop),
         closest_m=distance_m,
         closest_at=at,
         restarts=0,
@@ -121,6 +133,7 @@ def place_visits(
     Those in which it was longest come first.
     """
     track = track_in(view, frame_id, window)
+    elapsed = elapsed_in(view, window)
     found: list[PlaceVisits] = []
     for place in places_in(view, places, frame_id):
         inside = robot_inside(track, place.region, window)
@@ -131,7 +144,7 @@ def place_visits(
                 place=place.name,
                 entries=len(entries),
                 exits=len(exits),
-                duration=sum(each.stop - each.start for each in inside),
+                duration=sum(elapsed.between(each.start, each.stop) for each in inside),
                 first=entries[0] if entries else None,
                 last=exits[-1] if exits else None,
             )

@@ -40,8 +40,9 @@ from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.view import TimeRange, open_view, search_window
+from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits, region_visits, track_in, visit_of
+from ros2_memory.places.region_visits import place_visits, region_visits, visit_of
 from ros2_memory.places.where import Where, parse_where
 from ros2_memory.results import Visit, Visits
 
@@ -123,7 +124,7 @@ def visits(
         known = _by_poses(view, search, now, limit)
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
-    _note_doubts(view, known)
+    _note_doubts(view, known, window)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(
         frame_id=placement.frame_id,
@@ -190,7 +191,7 @@ def _by_track(
 ) -> _Known:
     """Returns the visits by the robot's track."""
     window, now, limit = bounds
-    found = region_visits(track_in(view, frame_id, window), place, window)
+    found = region_visits(view, frame_id, place, window)
     newest = search.newest_time
     current = newest if _is_current(view, newest, now) else None
     shown = tuple(visit_of(found, each, place, current) for each in found.all[:limit])
@@ -203,18 +204,19 @@ def _by_poses(view: View, search: _VisitSearch, now: Ns, limit: int) -> _Known:
     newest = search.newest_time
     known = _is_current(view, newest, now)
     found, every = search.newest(limit)
+    elapsed = elapsed_in(view, TimeWindow.everything())
     shown = tuple(
         Visit(
             arrived=dwell.arrived if dwell.begun else None,
             departed=None if known and dwell.departed == newest else dwell.departed,
-            duration=dwell.departed - dwell.arrived,
+            duration=elapsed.between(dwell.arrived, dwell.departed),
             closest_m=closest.distance_m,
             closest_at=closest.time,
             restarts=0,
         )
         for dwell, closest in found
     )
-    duration = sum(each.departed - each.arrived for each in every)
+    duration = sum(elapsed.between(each.arrived, each.departed) for each in every)
     return _Known(shown, len(every), duration, newest)
 
 
@@ -237,10 +239,10 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
     )
 
 
-def _note_doubts(view: View, known: _Known) -> None:
+def _note_doubts(view: View, known: _Known, window: TimeWindow) -> None:
     """Notes what visits may not be."""
     shown, newest = known.shown, known.newest
-    note_unread(view, TimeWindow.everything(), nothing=not shown)
+    note_unread(view, window, nothing=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
             f"the newest pose, of {unix_text(newest)}, is too old to know whether the robot is "

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.core.geometry import yaw
-from ros2_memory.core.timebase import Ns, unix_rounded_up
+from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.tools.reply_json import (
     LocalTimes,
@@ -96,11 +96,12 @@ def _frames(answer: results.Frames) -> JsonObject:
 def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
     path = answer.trajectory
     known = path.is_known
+    duration_s = path.totals.duration_s - unix_from_ns(answer.skipped)
     reply: JsonObject = {
         "distance_m": rounded(path.totals.distance_m, 4) if known else None,
         "avg_speed": rounded(path.avg_speed, 4) if known else None,
         "max_speed": rounded(path.max_speed, 4) if known else None,
-        "duration_s": rounded(path.totals.duration_s, 3) if known else None,
+        "duration_s": rounded(duration_s, 3) if known else None,
         "waypoints": _waypoints(path.waypoints, "jump"),
         "topic": answer.topic,
         "frame_id": answer.frame_id or None,

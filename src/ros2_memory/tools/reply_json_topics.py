@@ -234,7 +234,7 @@ def _sighting(sighting: results.Sighting, now: Ns, local: LocalTimes) -> JsonObj
         "first_seen": unix_rounded_up(sighting.first),
         "last_seen": unix_rounded_up(sighting.last),
         **local.of(sighting.first, sighting.last),
-        "duration_s": seconds(sighting.last - sighting.first),
+        "duration_s": seconds(sighting.last - sighting.first - sighting.skipped),
         "ago_s": seconds(now - sighting.last),
         "count": sighting.messages,
         "robot": None
@@ -264,7 +264,7 @@ def _recap(answer: results.Recap) -> JsonObject:
         "start": moment(answer.start),
         "end": moment(answer.end),
         **LocalTimes(answer.start, answer.now).of(answer.start, answer.end),
-        "duration_s": seconds(answer.end - answer.start),
+        "duration_s": seconds(answer.end - answer.start - answer.skipped),
         "distance_m": None if answer.distance_m is None else rounded(answer.distance_m, 3),
         "max_speed": None if answer.max_speed is None else rounded(answer.max_speed, 3),
         "stood_s": None if answer.stood is None else seconds(answer.stood),
@@ -297,7 +297,7 @@ def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
         "text": event.text,
     }
     if event.end is not None:
-        reply["duration_s"] = seconds(event.end - event.start)
+        reply["duration_s"] = seconds(event.end - event.start - event.skipped)
     if event.place is not None:
         reply["in"] = event.place
     if event.score is not None:

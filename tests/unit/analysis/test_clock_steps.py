@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.clock_steps import ClockStep, holes, step_over
+from ros2_memory.analysis.clock_steps import ClockStep, Elapsed, holes, step_over
 from ros2_memory.analysis.motion.odometry import TimedPosition
 
 S = 10**9
@@ -57,3 +59,44 @@ def test_a_step_is_as_long_as_the_clock_was_set(by: float, speed: float, period:
     found = over(speed * period, length=by + period, before=speed, after=speed)
     assert isinstance(found, ClockStep)
     assert abs(found.by - round(by * S)) < S / 100
+
+
+@given(
+    steps=st.lists(st.tuples(st.integers(0, 1000 * S), st.integers(2 * S, 90 * S)), max_size=6),
+    times=st.lists(st.integers(0, 1000 * S), min_size=2, max_size=6),
+)
+def test_what_a_clock_skipped_is_no_time_that_passed(
+    steps: list[tuple[int, int]], times: list[int]
+) -> None:
+    """A clock that is set ahead at moments of a true time: what it shows gives the true time."""
+
+    def shown(t: int) -> int:
+        return t + sum(by for moment, by in steps if moment < t)
+
+    def last_shown(moment: int, nth: int) -> int:
+        # Of steps at one moment each follows on those before it.
+        same = sum(by for other, by in steps[:nth] if other == moment)
+        return shown(moment) + same
+
+    elapsed = Elapsed(
+        ClockStep(last_shown(moment, nth), by) for nth, (moment, by) in enumerate(steps)
+    )
+    ordered = sorted(times)
+    for start, stop in pairwise(ordered):
+        assert elapsed.between(shown(start), shown(stop)) == stop - start
+
+
+@given(
+    spans=st.lists(st.tuples(st.integers(0, 100), st.integers(-20, 20)), max_size=4),
+    cuts=st.lists(st.integers(-10, 150), min_size=2, max_size=6),
+)
+def test_durations_that_adjoin_add_up(spans: list[tuple[int, int]], cuts: list[int]) -> None:
+    free = 0
+    steps = []
+    for gap, by in spans:
+        steps.append(ClockStep(free + gap, by))
+        free += gap + max(by, 0)
+    elapsed = Elapsed(steps)
+    parts = [elapsed.between(start, stop) for start, stop in pairwise(sorted(cuts))]
+    assert sum(parts) == elapsed.between(min(cuts), max(cuts))
+    assert all(each >= 0 for each in parts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -133,3 +134,83 @@ def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(begin, 0.0, 0.0, 0.0)])
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
     assert memory.index.snapshot().suspected_holes == ()
+
+
+WHEN = 54.95
+FLAG = {"topic": "/bumper", "condition_type": "equals", "value": False}
+
+
+def set_ahead(folder: Path) -> Memory:
+    return recorded(folder, shown=lambda t: t + 8.0 * (t > WHEN))
+
+
+def ahead_notes(reply: dict[str, Any]) -> list[str]:
+    return [note for note in reply.get("notes", []) if " ahead at " in note]
+
+
+def test_durations_are_without_what_the_clock_skipped_and_a_note_says_so(
+    tmp_path: Path, known: Callable[[Memory], Memory]
+) -> None:
+    memory = known(set_ahead(tmp_path))
+    span = {"start": BEGIN, "end": BEGIN + 207.9}
+    found = asked(memory, tmp_path, "find_matches", **FLAG)
+    assert found["sightings"][0]["duration_s"] == pytest.approx(199.0, abs=0.02)
+    assert ahead_notes(found) == [
+        f"the clock was set 8 s ahead at {BEGIN + 54.9:.6f}: durations are without that"
+    ]
+    recap = asked(memory, tmp_path, "recap", **span)
+    assert recap["duration_s"] == pytest.approx(199.9, abs=0.02)
+    way = asked(memory, tmp_path, "trajectory_summary", **span)
+    assert way["duration_s"] == pytest.approx(199.9, abs=0.02)
+    assert way["avg_speed"] == pytest.approx(SPEED, abs=0.01)
+    near = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0)
+    bounded = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0, **span)
+    for reply in (near, bounded):
+        assert reply["visits"][0]["duration_s"] == pytest.approx(20.0, abs=0.25)
+    other = {"with_start": BEGIN + 100, "with_end": BEGIN + 200}
+    differs = asked(memory, tmp_path, "compare", start=BEGIN, end=BEGIN + 100, **other)
+    assert differs["duration_s"] == differs["recorded_s"]
+    assert differs["duration_s"] == {"this": pytest.approx(92.0, abs=0.05), "with": 100.0}
+    for reply in (recap, way, near, bounded, differs):
+        assert len(ahead_notes(reply)) == 1
+        assert "gap_m" not in reply
+        assert not [note for note in reply["notes"] if "gap" in note]
+
+
+@pytest.mark.parametrize("by", ["hour", "day"])
+def test_bins_are_without_what_the_clock_skipped(
+    tmp_path: Path, known: Callable[[Memory], Memory], by: str
+) -> None:
+    memory = known(set_ahead(tmp_path))
+    reply = asked(memory, tmp_path, "find_matches", **FLAG, by=by)
+    assert len(ahead_notes(reply)) == 1
+    for column, expected in (("recorded_s", 199.9), ("topic_s", 199.0), ("seconds", 199.0)):
+        at = reply["columns"].index(column)
+        assert reply["all"][at - 1] == pytest.approx(expected, abs=0.11)
+        assert sum(row[at] for row in reply["rows"]) == pytest.approx(expected, abs=0.2)
+
+
+def test_windows_that_adjoin_within_a_step_add_up(tmp_path: Path) -> None:
+    memory = set_ahead(tmp_path)
+    cuts = [BEGIN + each for each in (0.0, 30.0, 56.0, 60.0, 63.5, 100.0)]
+    lengths = [
+        asked(memory, tmp_path, "recap", start=start, end=end)["duration_s"]
+        for start, end in pairwise(cuts)
+    ]
+    assert sum(lengths) == pytest.approx(92.0, abs=0.05)
+    assert lengths[2] == 0.0
+
+
+def test_an_answer_that_no_step_is_in_does_not_name_it(tmp_path: Path) -> None:
+    memory = set_ahead(tmp_path)
+    for tool, more in (("recap", {}), ("find_matches", FLAG), ("visits", {"x": 0.0, "y": 0.0})):
+        reply = asked(memory, tmp_path, tool, start=BEGIN + 100, end=BEGIN + 150, **more)
+        assert not ahead_notes(reply)
+
+
+def test_a_step_back_is_named_and_changes_no_duration(tmp_path: Path) -> None:
+    memory = recorded(tmp_path, shown=lambda t: t - 30.0 * (t >= 100))
+    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 160)
+    assert reply["duration_s"] == 160.0
+    [note] = [each for each in reply["notes"] if "set back" in each]
+    assert note.startswith("the clock was set back by 29.9 s or more at ")

@@ -463,7 +463,7 @@ def test_messages_lost_on_the_way_home_are_no_reset(lost: int) -> None:
 
 @each_way
 def test_the_way_across_a_gap_is_given_apart(tmp_path: Path, recalls: bool) -> None:
-    history(tmp_path, [(0, 0.0, 10.0), (50, 13.0, 20.0)])
+    history(tmp_path, [(0, 0.0, 10.0), (18, 13.0, 20.0)])
     for reply in replies(tmp_path, recalls=recalls):
         assert (reply["distance_m"], reply["gap_m"]) == (17.0, 3.0)
         assert [note for note in reply["notes"] if note.startswith("1 gap ")]
