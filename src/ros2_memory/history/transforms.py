@@ -285,8 +285,19 @@ def _pairs(
     With a window, those of the bags that have something of a topic in it; with `among`, those of a
     session's bags.
     """
-    pairs: set[tuple[str, str]] = set()
     recorded = _recorded(view, topics)
+    pairs, unknown = _known_pairs(view, recorded, window, among)
+    for span in united(unknown):
+        for each in _transforms(view, recorded, TimeWindow(*span), among):
+            pairs.add((each.parent, each.child))
+    return pairs
+
+
+def _known_pairs(
+    view: View, recorded: Iterable[str], window: TimeWindow | None, among: Session | None
+) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
+    """Returns the pairs that the catalogue has, and the times of the bags that it has none of."""
+    pairs: set[tuple[str, str]] = set()
     unknown: list[tuple[Ns, Ns]] = []
     for topic in recorded:
         for segment in view.snapshot.timeline.segments:
@@ -295,10 +306,7 @@ def _pairs(
             )
             pairs |= known
             unknown += spans
-    for span in united(unknown):
-        for each in _transforms(view, recorded, TimeWindow(*span), among):
-            pairs.add((each.parent, each.child))
-    return pairs
+    return pairs, unknown
 
 
 def _is_edge(pair: tuple[str, str]) -> bool:
@@ -376,20 +384,52 @@ def connected(
 
     False, too, where the time for the answer is over before that is known.
     """
-    limits = view.memory.limits
     try:
-        pairs = _pairs(view, limits.tf_topics, window, among)
-        pairs |= _pairs(view, limits.tf_static_topics, among=among)
+        return connects(view, frames, window, among)
     except QueryTimeoutError:
         return False
-    origin, target = (name.lstrip("/") for name in frames)
-    linked = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(_is_edge, pairs))
-    return target in components(linked).get(origin, ())
+
+
+def connects(
+    view: View,
+    frames: tuple[str, str],
+    window: TimeWindow | None = None,
+    among: Session | None = None,
+) -> bool:
+    """Does as `connected`; reads the newest bags without a digest first, until they do.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before that is known.
+    """
+    limits = view.memory.limits
+    pairs: set[tuple[str, str]] = set()
+    unread: list[tuple[Ns, Ns, tuple[str, ...]]] = []
+    for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window)):
+        recorded = _recorded(view, topics)
+        known, unknown = _known_pairs(view, recorded, within, among)
+        pairs |= known
+        unread += [(stop, start, recorded) for start, stop in dict.fromkeys(unknown)]
+    if _link(pairs, frames):
+        return True
+    for stop, start, recorded in sorted(unread, reverse=True):
+        view.bags.check_deadline()
+        read = _transforms(view, recorded, TimeWindow(start, stop), among)
+        found = {(each.parent, each.child) for each in read}
+        if not found <= pairs:
+            pairs |= found
+            if _link(pairs, frames):
+                return True
+    return False
 
 
 def connected_by_statics(view: View, frames: tuple[str, str]) -> bool:
     """Whether static transforms alone lead from one frame to the other, in some recording."""
     pairs = _pairs(view, view.memory.limits.tf_static_topics)
+    return _link(pairs, frames)
+
+
+def _link(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
+    """Whether pairs of a parent and a child lead from one frame to the other."""
     origin, target = (name.lstrip("/") for name in frames)
     linked = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(_is_edge, pairs))
     return target in components(linked).get(origin, ())

@@ -22,6 +22,7 @@ from ros2_memory.history.transforms import (
     children_moving,
     connected,
     connected_by_statics,
+    connects,
     graph_of,
     lending_to,
     moving_in,
@@ -184,9 +185,11 @@ def map_placement(
 
     Raises:
         InvalidArgumentsError: places are in another frame than `frame_id`.
+        QueryTimeoutError: the time is over before it is known whether they are in `frame_id`.
     """
     own = MapPlacement(view, pose_frame, pose_frame)
-    placement = own if frame_id == pose_frame else _map_or_own(view, topic, own)
+    asked_for = frame_id is not None
+    placement = own if frame_id == pose_frame else _map_or_own(view, topic, own, asked_for)
     if frame_id not in (None, placement.frame_id):
         known = " or ".join(dict.fromkeys((placement.frame_id, pose_frame)))
         raise InvalidArgumentsError(
@@ -196,13 +199,15 @@ def map_placement(
     return placement
 
 
-def _map_or_own(view: View, topic: str, own: MapPlacement) -> MapPlacement:
+def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> MapPlacement:
     """Returns the placement in the map, where transforms of some recording lead there."""
     target, pose_frame = view.memory.limits.map_frame, own.pose_frame
-    if not target or target == pose_frame or not connected(view, (target, pose_frame)):
+    # No answer is better than one that denies a frame which is asked for, since the time is over.
+    leads = connects if asked_for else connected
+    if not target or target == pose_frame or not leads(view, (target, pose_frame)):
         return own
     recordings = view.snapshot.timeline.recordings(topic).items()
     lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
-    if any(connected(view, (target, pose_frame), among=each) for each in lending):
+    if any(leads(view, (target, pose_frame), among=each) for each in lending):
         return MapPlacement(view, target, pose_frame)
     return own

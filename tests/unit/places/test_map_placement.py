@@ -1,0 +1,70 @@
+"""Which frame places are told in, however much of the history is in the catalogue."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import View
+from ros2_memory.places.map_placement import map_placement
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import memory_of
+from tests.support.moving_map import BEGIN, S, write_moving_map
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    """A map that moves, in fifty bags."""
+    folder = tmp_path_factory.mktemp("moving")
+    write_moving_map(folder, 1, seconds=100, split_s=2.0)
+    return memory_of(folder)
+
+
+class _Looks:
+    """A clock that shows how often it was looked at."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self) -> float:
+        self.count += 1
+        return self.count
+
+
+def test_the_map_is_known_from_the_newest_bags_alone(moving: Memory) -> None:
+    looks = _Looks()
+    view = View(moving, Call(Deadline.after(1e6, looks)))
+    assert map_placement(view, "odom", "/odom", "map").frame_id == "map"
+    nothing = _Looks()
+    everything = View(moving, Call(Deadline.after(1e6, nothing)))
+    assert map_placement(everything, "elsewhere", "/odom").frame_id == "elsewhere"
+    assert looks.count < nothing.count / 4
+
+
+def test_a_map_of_which_it_is_not_known_whether_transforms_lead_there_is_not_denied(
+    moving: Memory,
+) -> None:
+    outcomes = set()
+    for ticks in range(1, 40):
+        view = View(moving, Call(Deadline.after(ticks, _Looks())))
+        try:
+            outcomes.add(map_placement(view, "odom", "/odom", "map").frame_id)
+        except QueryTimeoutError:
+            outcomes.add("timeout")
+    assert outcomes == {"map", "timeout"}
+
+
+def test_a_map_that_no_transform_leads_to_is_denied(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(BEGIN + at * S, 0.0, 0.0) for at in range(3)])
+    view = View(memory_of(tmp_path), Call())
+    with pytest.raises(InvalidArgumentsError, match="places are told in odom"):
+        map_placement(view, "odom", "/odom", "map")
