@@ -358,7 +358,7 @@ def positions(value: JsonValue) -> Iterator[Vector3]:
     The value itself where it is an object with x and y, or the elements of a list of those; else
     the objects found at any depth under `position`, `point` or `translation`.
     """
-    own = list(_own_positions(value))
+    own = list(own_positions(value))
     if own:
         yield from own
         return
@@ -371,7 +371,7 @@ def positions(value: JsonValue) -> Iterator[Vector3]:
             for key in POSITION_KEYS:
                 inner = node.get(key)
                 if isinstance(inner, dict | list):
-                    yield from _own_positions(inner)
+                    yield from own_positions(inner)
             waiting.extend(reversed(node.values()))
 
 
@@ -470,14 +470,18 @@ def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
             yield node
 
 
-def _own_positions(value: JsonValue) -> Iterator[Vector3]:
+def own_positions(value: JsonValue) -> Iterator[Vector3]:
+    """Yields the position that a value is, or those that the elements of a list are."""
     for node in value if isinstance(value, list) else (value,):
         # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
-        if isinstance(node, dict) and all(
-            axis in node and isinstance(node[axis], int | float | None) for axis in ("x", "y")
+        if (
+            isinstance(node, dict)
+            and "x" in node
+            and "y" in node
+            and isinstance(node["x"], int | float | None)
+            and isinstance(node["y"], int | float | None)
         ):
-            x, y = _coordinate(node["x"]), _coordinate(node["y"])
-            yield (x, y, _coordinate(node.get("z")))
+            yield (_coordinate(node["x"]), _coordinate(node["y"]), _coordinate(node.get("z")))
 
 
 def _coordinate(value: JsonValue) -> float:

@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
 
 MAX_FIELDS: Final = 48
 """Fields of one topic of which ranges are kept; where there are more, none are."""
+_MOST_WAITING: Final = 4_096
+"""Numbers of single messages that are held before their bounds are taken."""
 _SUMMARY: Final = frozenset({"bytes", "numbers"})
 """The keys of a summary in place of numbers that are too many to show."""
 
@@ -57,13 +58,20 @@ class _Numbers:
     messages: int = 0
     bounded_only: bool = False
 
-    def add(self, low: float, high: float, total: float, count: int, messages: int) -> None:
-        """Adds the numbers of some messages, each of which has equally many."""
-        self.low, self.high = min(self.low, low), max(self.high, high)
-        if not math.isfinite(total):
-            self.bounded_only = True
-            return
-        each = count // messages
+    def bound(self, low: float, high: float) -> None:
+        """Adds numbers of which only the bounds are known."""
+        self.low, self.high, self.bounded_only = min(self.low, low), max(self.high, high), True
+
+    def add(
+        self,
+        bounds: tuple[float, float],
+        total: float,
+        count: int,
+        each: int,
+        messages: int,
+    ) -> None:
+        """Adds numbers of some messages: their sum, how many, and in each message."""
+        self.low, self.high = min(self.low, bounds[0]), max(self.high, bounds[1])
         self.each = each if self.messages == 0 or self.each == each else 0
         self.count += count
         self.messages += messages
@@ -82,25 +90,43 @@ class FieldRangesBuilder:
     def __init__(self) -> None:
         self._found: dict[str, _Numbers] | None = {}
         self._messages = 0
+        # Numbers of single messages, and how many each of them has: their bounds are taken at once.
+        self._waiting: dict[str, tuple[list[float], list[int]]] = {}
+        self._waiting_numbers = 0
 
     def give_up(self) -> None:
         """Takes a message whose value is not known: no field is known any more."""
         self._found = None
+        self._waiting = {}
 
     def add(self, value: JsonValue) -> None:
         """Takes the exact value of one message."""
         if self._found is None:
             return
         numbers: dict[str, list[float]] = {}
-        for path, number in numbers_by_field(value):
-            numbers.setdefault(path, []).append(number)
+        _collect(value, "", numbers)
         self._messages += 1
         for path, some in numbers.items():
-            total = sum(some)
-            if math.isfinite(total):
-                self._numbers(path).add(min(some), max(some), total, len(some), 1)
+            waiting = self._waiting.get(path)
+            if waiting is None:
+                self._waiting[path] = (some, [len(some)])
             else:
-                self._add(path, np.array(some, np.float64), 1)
+                waiting[0].extend(some)
+                waiting[1].append(len(some))
+            self._waiting_numbers += len(some)
+        if self._waiting_numbers > _MOST_WAITING or len(self._waiting) > MAX_FIELDS:
+            self._take_waiting()
+
+    def _take_waiting(self) -> None:
+        waiting, self._waiting, self._waiting_numbers = self._waiting, {}, 0
+        for path, (numbers, counts) in waiting.items():
+            if math.isfinite(sum(numbers)):
+                each = counts[0] if counts.count(counts[0]) == len(counts) else 0
+                bounds = min(numbers), max(numbers)
+                total = math.fsum(numbers)
+                self._numbers(path).add(bounds, total, len(numbers), each, len(counts))
+            else:
+                self._add(path, np.array(numbers, np.float64), len(counts))
 
     def add_rows(self, template: PayloadTemplate, rows: Bytes) -> None:
         """Takes many messages of a template, the first of which was added as a value."""
@@ -111,14 +137,15 @@ class FieldRangesBuilder:
         for path, offsets in template.fields:
             self._add(path, template.block(rows, offsets), messages)
         for path, constant in template.constants:
-            count, total = len(constant) * messages, math.fsum(constant) * messages
-            self._numbers(path).add(min(constant), max(constant), total, count, messages)
+            total, each = math.fsum(constant) * messages, len(constant)
+            bounds = min(constant), max(constant)
+            self._numbers(path).add(bounds, total, each * messages, each, messages)
         for path in template.computed:
-            numbers = self._numbers(path)
-            numbers.low, numbers.high, numbers.bounded_only = -math.inf, math.inf, True
+            self._numbers(path).bound(-math.inf, math.inf)
 
     def ranges(self) -> dict[str, FieldRange] | None:
         """Returns the range of each field that has a number; None where they are not known."""
+        self._take_waiting()
         if self._found is None:
             return None
         return {
@@ -141,32 +168,37 @@ class FieldRangesBuilder:
         with np.errstate(invalid="ignore", over="ignore"):
             total = float(numbers.sum())
         if math.isfinite(total):
-            low, high = float(numbers.min()), float(numbers.max())
-            self._numbers(path).add(low, high, total, numbers.size, messages)
+            bounds = float(numbers.min()), float(numbers.max())
+            each = numbers.size // messages
+            self._numbers(path).add(bounds, total, numbers.size, each, messages)
             return
         rest = numbers[~np.isnan(numbers)]
         if rest.size:
-            found = self._numbers(path)
-            found.add(float(rest.min()), float(rest.max()), math.nan, 0, messages)
+            self._numbers(path).bound(float(rest.min()), float(rest.max()))
         elif path in (self._found or {}):
             self._numbers(path).bounded_only = True
 
 
-def numbers_by_field(value: JsonValue, path: str = "") -> Iterator[tuple[str, float]]:
-    """Yields the field and the value of each number, rounded to a float; NaN too."""
+def _collect(value: JsonValue, path: str, into: dict[str, list[float]]) -> None:
+    """Adds each number by its field, rounded to a float; NaN too."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from numbers_by_field(inner, joined(path, name))
+            if isinstance(inner, float):
+                into.setdefault(joined(path, name), []).append(inner)
+            elif inner is not None and not isinstance(inner, str | bool):
+                _collect(inner, joined(path, name), into)
     elif isinstance(value, list):
         for inner in value:
-            yield from numbers_by_field(inner, path)
+            _collect(inner, path, into)
     elif isinstance(value, int | float) and not isinstance(value, bool):
         try:
-            yield path, float(value)
+            number = float(value)
         except OverflowError:  # JSON may hold whole numbers of any length
-            yield path, math.inf if value > 0 else -math.inf
+            number = math.inf if value > 0 else -math.inf
+        into.setdefault(path, []).append(number)
 
 
+@lru_cache(4096)
 def joined(path: str, name: str) -> str:
     """Returns the dot-path of a key below another."""
     if _is_index(name):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import leaves, positions
+from ros2_memory.analysis.conditions import POSITION_KEYS, own_positions
 from ros2_memory.analysis.zone_map import (
     MAX_NUMBERS,
     MAX_WORD_CHARS,
@@ -53,17 +53,18 @@ class ZoneMapBuilder:
         """Takes the exact value of one message."""
         if self._open:
             return
+        texts: list[str] = []
+        booleans: list[bool] = []
         numbers: list[int | float] = []
-        for leaf in leaves(value):
-            if isinstance(leaf, str):
-                self._add_text(leaf)
-            elif isinstance(leaf, bool):
-                self._booleans.add(leaf)
-            elif isinstance(leaf, int) or (isinstance(leaf, float) and not math.isnan(leaf)):
-                numbers.append(leaf)
+        places: list[JsonValue] = []
+        _sort(value, texts, booleans, numbers, places)
+        for text in texts:
+            self._add_text(text)
+        self._booleans.update(booleans)
         if numbers:
             self._add_numbers(numbers)
-            for x, y, z in positions(value):
+            own = list(own_positions(value))
+            for x, y, z in own or (each for place in places for each in own_positions(place)):
                 if math.isfinite(x) and math.isfinite(y):
                     low_z, high_z = (z, z) if math.isfinite(z) else (math.inf, -math.inf)
                     self._add_box(Box(x, x, y, y, low_z, high_z))
@@ -141,3 +142,28 @@ class ZoneMapBuilder:
 
     def _add_box(self, box: Box) -> None:
         self._box = box if self._box is None else self._box.united(box)
+
+
+def _sort(
+    value: JsonValue,
+    texts: list[str],
+    booleans: list[bool],
+    numbers: list[int | float],
+    places: list[JsonValue],
+) -> None:
+    """Sorts what is in a value by kind, without NaN; places are what may hold a position."""
+    waiting: list[JsonValue] = [value]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, dict):
+            waiting.extend(node.values())
+            places.extend(node[key] for key in POSITION_KEYS if key in node)
+        elif isinstance(node, str):
+            texts.append(node)
+        elif isinstance(node, bool):
+            booleans.append(node)
+        elif isinstance(node, list):
+            waiting.extend(node)
+        # NaN is equal to nothing; `isnan` takes no whole number that is beyond a float.
+        elif node is not None and node == node:  # noqa: PLR0124
+            numbers.append(node)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,7 +16,7 @@ from ros2_memory.analysis.field_ranges import (
     MAX_FIELDS,
     FieldRangesBuilder,
     field_named,
-    numbers_by_field,
+    joined,
 )
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column
@@ -107,12 +108,26 @@ def test_a_limit_that_is_never_passed_rules_every_bag_out() -> None:
         assert bounds.between(*limits) == expected
 
 
+def numbers_of(value: JsonValue, path: str = "") -> list[tuple[str, float]]:
+    """Returns the field and the value of each number."""
+    if isinstance(value, dict):
+        inner = [(joined(path, name), each) for name, each in value.items()]
+    elif isinstance(value, list):
+        inner = [(path, each) for each in value]
+    else:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return []
+        is_huge = isinstance(value, int) and abs(value) > sys.float_info.max
+        return [(path, math.copysign(math.inf, value > 0 or -1) if is_huge else float(value))]
+    return [found for below, each in inner for found in numbers_of(each, below)]
+
+
 @given(st.lists(values, min_size=1, max_size=4), st.sampled_from(["x", "seen.score", "nothing"]))
 def test_sums_and_sizes_are_those_of_all_numbers(bags: list[list[JsonValue]], field: str) -> None:
     column = field_column(rows_of(*bags), field)
     assert column.numbers.tolist() == [7 + number for number in range(len(bags))]
     for row, bag in enumerate(bags):
-        found = [number for each in bag for path, number in numbers_by_field(each) if path == field]
+        found = [number for each in bag for path, number in numbers_of(each) if path == field]
         real = [number for number in found if not math.isnan(number)]
         if real:
             assert column.low[row] <= min(real)
@@ -120,7 +135,7 @@ def test_sums_and_sizes_are_those_of_all_numbers(bags: list[list[JsonValue]], fi
         if column.size[row] < 0:
             continue
         assert column.size[row] == len(real)
-        # Sums of one message are numpy's, which may round once more.
+        # Sums of rows are numpy's, which may round once more.
         assert column.total[row] == pytest.approx(math.fsum(real), rel=1e-12, abs=1e-300)
         if column.low[row] == column.high[row]:
             assert {*real} == {column.low[row]}

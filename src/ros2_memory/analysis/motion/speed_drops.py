@@ -89,6 +89,8 @@ class _Finder:
         rows = self.rows
         if len(rows) < _ROWS or rows[-1].time // SLOT_NS - rows[0].time // SLOT_NS >= _ROWS:
             return None
+        if _speed(rows[1], rows[2]) < MOVING_MPS:  # as it mostly is: nothing falls from there
+            return None
         speeds = [_speed(rows[nth], rows[nth + 1]) for nth in range(_ROWS - 1)]
         if not _falls(speeds[1:]) or _falls(speeds[:-1]):
             return None
