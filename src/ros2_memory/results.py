@@ -335,6 +335,7 @@ class Before(AnswerWithNotes):
         robot: where the robot was; None where that is not known.
         speed_mps: what its pose topic states.
         state: booleans, statuses that are not ok and the goal of each action, as of the moment.
+        after: the first changes in the seconds after, nearest first; their `before` is negative.
     """
 
     at: Ns
@@ -345,6 +346,7 @@ class Before(AnswerWithNotes):
     robot: Pose | None
     speed_mps: float | None
     state: tuple[tuple[str, bool | str], ...]
+    after: tuple[PastChange, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

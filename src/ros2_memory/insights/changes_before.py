@@ -61,6 +61,9 @@ _POSE_NS: Final = 2 * NS_PER_S
 SLACK_NS: Final = NS_PER_S // 2
 """When a standstill began is known to half a second: what changed by then counts as before."""
 _MOST_CHANGES: Final = 20
+_AFTER_NS: Final = 5 * NS_PER_S
+"""How long after a moment a change is told: what was the cause is often reported late."""
+_MOST_AFTER: Final = 3
 _MAX_LOG_CHARS: Final = 100
 
 _LEVELS: Final = ("ok", "warning", "error", "stale")
@@ -97,6 +100,15 @@ class ChangesBefore:
         self.recorded = recorded
         self.state = state
         self.left_out = left_out or {}
+
+    def after(self, at: Ns, length: Ns, *, slack: Ns = 0) -> tuple[PastChange, ...]:
+        """Returns what changed in the time after a moment, nearest first: `before` is negative.
+
+        What changed up to `slack` after it is left out: it counts as before.
+        """
+        begin = bisect_left(self._changes, (at + slack + 1,))
+        end = bisect_left(self._changes, (at + length + 1,))
+        return tuple(PastChange(text, at - first) for first, _, text in self._changes[begin:end])
 
     def before(
         self, at: Ns, length: Ns = LENGTH_NS, *, without: str = "", slack: Ns = 0
@@ -317,16 +329,19 @@ def before(
 ) -> Before:
     """Returns what changed in the seconds before a moment, and the state of the robot then.
 
+    And the first changes after it: a robot may report what was the cause only seconds later.
+
     Raises:
         InvalidArgumentsError: the moment is not finite, or no transform leads to `frame_id`.
         NoDataError: the memory holds nothing.
         QueryTimeoutError: the call's time is over.
     """
     at, length = ns_argument("around", at_s), ns_argument("seconds_before", length_s)
-    view = open_view(memory, call, at)
+    view = open_view(memory, call, max(at, min(at + _AFTER_NS, memory.clock.now())))
     window = TimeWindow(max(at - length, MIN_NS), min(at + SLACK_NS + 1, MAX_NS))
     changes = changes_in(view, window, {})
     found = changes.before(at, length, slack=SLACK_NS)
+    later = changes_in(view, TimeWindow(window.stop, min(at + _AFTER_NS + 1, MAX_NS)), {})
     robot, speed_mps = _robot(view, at, frame_id)
     if not view.snapshot.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
@@ -347,6 +362,7 @@ def before(
         robot,
         speed_mps,
         (*changes.state, *_charges(view, at)),
+        later.after(at, _AFTER_NS, slack=SLACK_NS)[:_MOST_AFTER],
         notes=view.notes.sentences(),
     )
 

@@ -29,7 +29,9 @@ from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
     "When, where, how often and how long a condition held, newest first; "
-    "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
+    'matches in a row are one sighting. while: {{"topic": "/is_docked", "condition_type": '
+    '"equals", "value": false}} takes those while another topic meets a condition. '
+    "Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: where it "
     "was then, place: of the thing, score}}], total}}.",
     MatchesArguments,
@@ -43,7 +45,7 @@ _RECAP = ToolDeclaration(
     "What happened {when}: way, stops, speed drops, things in view, flips of booleans, goals, "
     "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
     "duration_s, text, in, score, before: what changed in the 10 s before}}], counts}}. With "
-    "around: {{before: [{{text, s_before}}], nearest first, recorded, robot, state}}.",
+    "around: {{before: [{{text, s_before}}], after, nearest first, recorded, robot, state}}.",
     RecapArguments,
     recap_or_before,
     blocking=True,

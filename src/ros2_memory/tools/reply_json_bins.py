@@ -20,14 +20,21 @@ _MINUTE_S = 60
 @render.register(results.Bins)
 def _bins(answer: results.Bins) -> JsonObject:
     kinds = [kind for _, kind in answer.columns]
+    times = [at for at, kind in enumerate(kinds) if kind == "time"]
 
     def row(name: str, values: tuple[float | None, ...]) -> list[JsonValue]:
-        return [name, *(_cell(value, kind) for value, kind in zip(values, kinds, strict=True))]
+        cells = [_cell(value, kind) for value, kind in zip(values, kinds, strict=True)]
+        exact = [values[at] for at in times]
+        return [name, *cells, *(None if at is None else moment(int(at)) for at in exact)]
 
     about: list[JsonValue] = [*answer.about]
     reply: JsonObject = {
         "topic": about[0] if len(about) == 1 else about,
-        "columns": [answer.by, *(name for name, _ in answer.columns)],
+        "columns": [
+            answer.by,
+            *(name for name, _ in answer.columns),
+            *(f"{answer.columns[at][0]}_unix" for at in times),
+        ],
         "rows": [row(name, values) for name, values in answer.rows],
         "all": row("all", answer.all)[1:],
         "start": moment(answer.start),

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import Ns, iso_local, unix_rounded_up
 from ros2_memory.retention.policy import GB
 from ros2_memory.tools.reply_json import LocalTimes, moment, render, seconds, with_notes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.silences import Silence
@@ -99,6 +100,25 @@ def file_name(path: Path | str, bag_dir: Path) -> str:
     return str(bag.relative_to(bag_dir)) if bag.is_relative_to(bag_dir) else bag.name
 
 
+def _doubts(answer: results.Status) -> Iterator[str]:
+    """Yields in short why answers may be missing something, or be wrong."""
+    yield from answer.problems
+    topics = {each.topic for each in answer.silences}
+    if len(answer.silences) == 1:
+        one = answer.silences[0]
+        still = ", and still is" if one.goes_on else ""
+        yield f"{one.topic} was silent for {seconds(one.length):.0f} s{still}"
+    elif topics:
+        named = next(iter(topics)) if len(topics) == 1 else counted(len(topics), "topic")
+        yield f"{named} fell silent {len(answer.silences)} times, as silences lists"
+    if len(answer.clock_steps) == 1:
+        [(_, by)] = answer.clock_steps
+        how = f"{seconds(by):.3g} s ahead" if by > 0 else f"back by {seconds(-by):.3g} s or more"
+        yield f"the clock was set {how}"
+    elif answer.clock_steps:
+        yield f"the clock was set {len(answer.clock_steps)} times, as clock_steps lists"
+
+
 @render.register(results.Status)
 def _status(answer: results.Status) -> JsonObject:
     latest = answer.latest
@@ -119,7 +139,7 @@ def _status(answer: results.Status) -> JsonObject:
         "missing": [*answer.missing],
     }
     reply: JsonObject = {
-        "trust": "; ".join(answer.problems) or "nothing is known to be missing",
+        "trust": "; ".join(_doubts(answer)) or "nothing is known to be missing",
         "recorder": answer.recorder,
         "recorder_alive": answer.live,
         "restarts": answer.restarts,

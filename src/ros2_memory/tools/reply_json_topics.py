@@ -320,6 +320,10 @@ def _before(answer: results.Before) -> JsonObject:
     }
     if answer.more:
         reply["more"] = answer.more
+    if answer.after:
+        reply["after"] = [
+            {"text": each.text, "s_after": round(seconds(-each.before), 1)} for each in answer.after
+        ]
     reply["recorded"] = [*answer.recorded]
     if answer.robot is not None:
         robot = {**planar_pose(answer.robot), "frame_id": answer.robot.frame_id or None}

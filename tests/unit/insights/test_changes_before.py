@@ -249,3 +249,18 @@ def test_what_went_wrong_has_room_before_goals_that_merely_succeeded(tmp_path: P
     stops, _ = recap_of(tmp_path, 24 * 12)
     assert len([each for each in stops if "81 C" in str(each.get("before"))]) == 1
     assert any("before" not in each for each in stops)
+
+
+@each_way
+def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path, recalls: bool) -> None:
+    late = [log_entry(at(40 + t), 30, name, "late") for t, name in ((0.4, "a"), (5.2, "f"))]
+    late += [log_entry(at(41 + 0.7 * nth), 30, name, "late") for nth, name in enumerate("bcde")]
+    write(tmp_path, [*driving(60, 40), *late])
+    reply = before(tmp_path, 40.0, recalls=recalls)
+    assert told(reply) == [("warning of a: late", 0.0)]
+    assert [(each["text"], each["s_after"]) for each in reply["after"]] == [
+        ("warning of b: late", 1.0),
+        ("warning of c: late", 1.7),
+        ("warning of d: late", 2.4),
+    ]
+    assert "after" not in before(tmp_path, 50.0, recalls=recalls)

@@ -214,3 +214,14 @@ def test_a_step_back_is_named_and_changes_no_duration(tmp_path: Path) -> None:
     assert reply["duration_s"] == 160.0
     [note] = [each for each in reply["notes"] if "set back" in each]
     assert note.startswith("the clock was set back by 29.9 s or more at ")
+
+
+def test_trust_sums_up_the_steps_of_the_clock(tmp_path: Path) -> None:
+    trust = asked(set_ahead(tmp_path), tmp_path, "memory_status")["trust"]
+    assert trust.endswith("the clock was set 8 s ahead")
+
+
+def test_bins_have_their_times_in_unix_seconds_too(tmp_path: Path) -> None:
+    reply = asked(recorded(tmp_path), tmp_path, "find_matches", **FLAG, by="day")
+    at = reply["columns"].index("last_unix")
+    assert reply["rows"][-1][at] == reply["all"][at - 1] == pytest.approx(BEGIN + 199, abs=1e-5)
