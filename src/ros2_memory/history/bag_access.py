@@ -21,7 +21,7 @@ from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
@@ -245,6 +245,26 @@ class BagAccess:
                 self.call.stages.add("read", spent)
                 spent = 0
 
+    def all_of(
+        self, segment: Segment, topic: str
+    ) -> Iterator[tuple[BagFile, Iterable[StoredMessage]]]:
+        """Yields the bags of a segment that hold a topic, each with all messages it has of it.
+
+        As `read` does for each; stored messages of all bags are looked up at once.
+        """
+        numbers: Mapping[str, int] = {}
+        stored: Mapping[int, Sequence[Record]] = {}
+        digests = self.digests_of(segment) if self._stores(topic) else None
+        if digests is not None:
+            self.check_deadline()
+            numbers, stored = digests.numbers, digests.messages(topic)
+        for bag in segment.bags_with(topic):
+            records = stored.get(numbers.get(bag.file, -1))
+            if records is None or is_carried(bag.path):
+                yield bag, self.read(bag, (topic,), TimeWindow.everything())
+            else:
+                yield bag, [StoredMessage(bag, each) for each in records]
+
     def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> StoredMessage | None:
         """Returns what `read` yields first with `newest_first`, without reading more of the bag."""
         if self._stored_messages(bag, [topic]) is not None:
@@ -263,16 +283,10 @@ class BagAccess:
         return next(self.read(bag, [topic], window, newest_first=True), None)
 
     def _stored_messages(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
-        """Returns all messages of one topic in a bag, if the catalogue stores them; else None.
-
-        It does so for static transforms and other topics that are transient local.
-        """
-        if self.memory.recall is None or len(topics) != 1:
+        """Returns all messages of one topic in a bag, if the catalogue stores them; else None."""
+        if len(topics) != 1 or not self._stores(topics[0]):
             return None
         [topic] = topics
-        static = topic in self.memory.limits.tf_static_topics
-        if not static and topic not in self.snapshot.timeline.transient_local:
-            return None
         if is_carried(bag.path):
             return None  # its channels name the recording of each message, the catalogue not
         entry = self.entry(bag)
@@ -280,6 +294,13 @@ class BagAccess:
             return None
         digests, number = entry
         return digests.messages(topic).get(number)
+
+    def _stores(self, topic: str) -> bool:
+        """Whether the catalogue stores messages of a topic: static transforms, and latched ones."""
+        static = topic in self.memory.limits.tf_static_topics
+        return self.memory.recall is not None and (
+            static or topic in self.snapshot.timeline.transient_local
+        )
 
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:

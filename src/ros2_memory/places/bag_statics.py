@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
 
 from ros2_memory.catalogue.map_digest import NO_STATICS, Statics, statics_of
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
 from ros2_memory.history.transforms import sessions_of, static_at, static_changes
 
@@ -149,25 +148,32 @@ def _gather(view: View, segment: Segment, topics: Topics) -> _Gathered:
     sessions = sessions_of(view)
     gathered = _Gathered()
     latest: dict[tuple[str, str], StampedTransform] = {}
-    decoded: dict[tuple[str, bytes], tuple[StampedTransform, ...]] = {}
+    decoded: dict[tuple[str, str, bytes], tuple[StampedTransform, ...]] = {}
     for topic in topics:
         if topic not in segment.spans:
             continue
         by_folder: dict[str, list[StampedTransform]] = defaultdict(list)
-        for bag in segment.bags_with(topic):
+        for bag, messages in view.bags.all_of(segment, topic):
             folder, is_carried = sessions.folder(bag.recording), sessions.is_carried(bag)
-            for found in view.bags.read(bag, (topic,), TimeWindow.everything()):
-                key = (found.record.channel.encoding, found.record.payload)
-                if is_carried:
-                    gathered.carried.append((found, _transforms(view, found)))
-                    continue
+            if is_carried:
+                gathered.carried += [(found, _transforms(view, found)) for found in messages]
+                continue
+            for found in messages:
+                channel = found.record.channel
+                key = (channel.type, channel.encoding, found.record.payload)
+                known = decoded.get(key)
                 # The same bytes again, and nothing else in between, as in nearly every split.
-                if key in decoded and all(
-                    latest.get((folder, each.child)) is each for each in decoded[key]
+                if known is not None and all(
+                    latest.get((folder, each.child)) is each for each in known
                 ):
                     continue
-                decoded[key] = _transforms(view, found)
-                for each in decoded[key]:
+                # Another recording has the same ones at another time.
+                decoded[key] = made = (
+                    _transforms(view, found)
+                    if known is None
+                    else tuple([replace(each, log_time=found.time) for each in known])
+                )
+                for each in made:
                     before = latest.get((folder, each.child))
                     latest[folder, each.child] = each
                     if before is None or _place(before) != _place(each):
