@@ -141,6 +141,11 @@ class TopicEvents:
         has_events = self.visible.rows or self.known or self.errors or self.undecodable
         return not has_events and self.changes.is_empty
 
+    @property
+    def all_left_out(self) -> int:
+        """Events of any kind beyond what is stored, changes included."""
+        return self.left_out + self.changes.left_out
+
 
 NO_EVENTS: Final = TopicEvents(0, 0)
 """Stands for the events of messages without any, whenever they were."""
@@ -244,6 +249,11 @@ class TopicEventsBuilder:
         if events.changes is not NO_CHANGES:
             self._changes.join(events.changes)
 
+    def join_uneventful(self, first: Ns, last: Ns) -> None:
+        """Takes all messages of a bag that come next and report nothing, by the times of two."""
+        self._close_part()
+        self._take(IntervalPart(first, last, _NOTHING_VISIBLE))
+
     def events(self, at_most: int | None = None) -> TopicEvents | None:
         """Returns the events so far, `at_most` of each kind; None without a message."""
         self._close_part()
@@ -302,7 +312,10 @@ class TopicEventsBuilder:
         if before is None and len(self._known) >= MAX_HELD:
             self._left_out += 1
             return
-        self._known[known.path] = known if before is None else before._replace(last=known.last)
+        if before is None:
+            self._known[known.path] = known
+        elif before.last != known.last:
+            self._known[known.path] = before._replace(last=known.last)
 
     def _add_toggle(self, toggle: Toggle) -> None:
         """Adds a toggle, or counts it where there are too many."""

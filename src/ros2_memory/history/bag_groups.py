@@ -15,7 +15,6 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 
 if TYPE_CHECKING:
@@ -24,12 +23,13 @@ if TYPE_CHECKING:
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.errors import UndecodableError
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.merged_stream import MergedStream
     from ros2_memory.history.view import View
 
 T = TypeVar("T")
-Span: TypeAlias = tuple[Ns, Ns]
+Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
 
@@ -67,7 +67,9 @@ class Group:
         self._window = window
         self.bags = bags
         self.may_be_relatched = may_be_relatched
-        self._has_duplicates = may_be_relatched or len({each.bag.recording for each in bags}) > 1
+        self._has_duplicates = may_be_relatched or (
+            len(bags) > 1 and len({each.bag.recording for each in bags}) > 1
+        )
         self._known_positions: list[MessagePosition] | None = None
 
     @property
@@ -137,27 +139,32 @@ def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Grou
     groups: list[list[BagSpan]] = []
     latest: dict[Path, Ns] = {}
     for each in bags:
-        oldest = each.first - COPY_HORIZON_NS
-        if latest and min(latest.values()) < oldest:
-            latest = {path: last for path, last in latest.items() if last >= oldest}
-        if groups and _belongs(each, latest):
+        recording = each.bag.recording
+        before = latest.get(recording)
+        if before is not None and len(latest) == 1:
+            # One recording goes on, as nearly everywhere.
+            belongs = each.first < before
+        else:
+            oldest = each.first - COPY_HORIZON_NS
+            if latest and min(latest.values()) < oldest:
+                latest = {path: last for path, last in latest.items() if last >= oldest}
+            belongs = _belongs(each.first, recording, latest)
+        if belongs:
             groups[-1].append(each)
         else:
             groups.append([each])
-        recording = each.bag.recording
-        latest[recording] = max(latest.get(recording, MIN_NS), each.last)
+        latest[recording] = each.last if before is None else max(before, each.last)
     return [Group(stream, topic, window, group) for group in groups]
 
 
-def _belongs(span: BagSpan, latest: Mapping[Path, Ns]) -> bool:
+def _belongs(first: Ns, recording: Path, latest: Mapping[Path, Ns]) -> bool:
     """Whether a bag can hold messages before, or duplicates of, those of the bags before it.
 
     `latest` is the last log time so far of each recording. Splits of one recording that only share
     a timestamp stay apart: the order of bags already orders them.
     """
-    recording = span.bag.recording
     return any(
-        span.first < last if path == recording else span.first <= last + COPY_HORIZON_NS
+        first < last if path == recording else first <= last + COPY_HORIZON_NS
         for path, last in latest.items()
     )
 
@@ -288,6 +295,8 @@ class Fold(Generic[T]):
         join: adds a digest and its times.
         failures: where `add` and `collect` put messages that cannot be decoded; a digest without
             these is not stored.
+        reduce: makes one digest of several in order, with their times; None where it would lack
+            something. That of a whole segment of bags stays in memory for as long as the segment.
     """
 
     kind: DigestKind[T]
@@ -295,6 +304,7 @@ class Fold(Generic[T]):
     collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]]
     join: Callable[[T, Span], None]
     failures: Sequence[UndecodableError] = ()
+    reduce: Callable[[Sequence[tuple[T, Span]]], tuple[T, Span] | None] | None = None
 
     def over(self, view: View, topic: str, window: TimeWindow) -> Span | None:
         """Folds a window: groups that lie in it by their digests, the others by their messages.
@@ -303,20 +313,83 @@ class Fold(Generic[T]):
         """
         stored = StoredDigests(view, topic, self.kind, window)
         spans: list[Span] = []
-        for group in groups_of(view.stream, topic, window):
-            span: Span | None
-            if not group.is_whole:
-                span = self.add(group.messages())
-            elif (known := stored.of(group)) is not None:
-                digest, span = known
-                self.join(digest, span)
-            else:
-                failed = len(self.failures)
-                made, span = self.collect(group.messages())
-                if made is not None and span is not None:
-                    self.join(made, span)
-                    if failed == len(self.failures):
-                        stored.store(group, made, span)
-            if span is not None:
-                spans.append(span)
+        groups = groups_of(view.stream, topic, window)
+        at = 0
+        while at < len(groups):
+            digests: SegmentDigests | None = None
+            run: Sequence[Group] = groups[at : at + 1]
+            if self.reduce is not None:
+                digests, run = _run(view, topic, window, groups, at)
+            at += len(run)
+            joined = None if digests is None else self._reduced(stored, topic, digests, run)
+            if joined is not None:
+                self.join(*joined)
+                spans.append(joined[1])
+                continue
+            for group in run:
+                span = self._one(stored, group)
+                if span is not None:
+                    spans.append(span)
         return (spans[0][0], spans[-1][1]) if spans else None
+
+    def _one(self, stored: StoredDigests[T], group: Group) -> Span | None:
+        """Folds one group; returns the times of its first and last message, if any."""
+        if not group.is_whole:
+            return self.add(group.messages())
+        known = stored.of(group)
+        if known is not None:
+            self.join(*known)
+            return known[1]
+        failed = len(self.failures)
+        made, span = self.collect(group.messages())
+        if made is not None and span is not None:
+            self.join(made, span)
+            if failed == len(self.failures):
+                stored.store(group, made, span)
+        return span
+
+    def _reduced(
+        self, stored: StoredDigests[T], topic: str, digests: SegmentDigests, run: Sequence[Group]
+    ) -> tuple[T, Span] | None:
+        """Returns the digest of all groups of a run; None where that of some is not stored."""
+        reduce = self.reduce
+        if reduce is None:
+            return None
+        # Bags of other segments decide which bags are one group, so they may be others next time.
+        sizes = hash((run[0].bags[0].bag.file, *[len(group.bags) for group in run]))
+
+        def compute() -> list[tuple[T, Span]] | None:
+            found: list[tuple[T, Span]] = []
+            for group in run:
+                known = stored.of(group)
+                if known is None:
+                    return None
+                found.append(known)
+            one = reduce(found)
+            return [] if one is None else [one]
+
+        # The type of a name is one: it begins with the kind of the digests.
+        kept = digests.derived(f"{self.kind.name} reduced {topic} {sizes}", compute)
+        return kept[0] if kept else None
+
+
+def _run(
+    view: View, topic: str, window: TimeWindow, groups: Sequence[Group], at: int
+) -> tuple[SegmentDigests | None, Sequence[Group]]:
+    """Returns the groups from one on whose bags have entries in one segment.
+
+    With these entries, where the window covers all that the segment has of the topic.
+    """
+    bag = groups[at].bags[0].bag
+    segment, entry = view.snapshot.timeline.segment_of(bag), view.bags.entry(bag)
+    if entry is None or not window.covers(*segment.spans[topic]):
+        return None, groups[at : at + 1]
+    numbers, end = entry[0].numbers, at
+    while end < len(groups):
+        group = groups[end]
+        if group.may_be_relatched or not group.is_whole:
+            break
+        if not all(each.bag.file in numbers for each in group.bags):
+            break
+        end += 1
+    return (entry[0], groups[at:end]) if end > at + 1 else (None, groups[at : at + 1])

@@ -17,7 +17,7 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.topic_events import Toggle
     from ros2_memory.core.model import TimeWindow
@@ -42,18 +42,35 @@ def toggled(topic: str, toggle: Toggle) -> str:
 def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
     """Returns what the messages of a topic report in a window; None where there is no message."""
     builder = TopicEventsBuilder()
-
-    def join(events: TopicEvents | None, span: Span) -> None:
-        if events is not None:
-            builder.join(TopicEvents(*span) if events is NO_EVENTS else events)
-
     Fold(
         TOPIC_EVENTS,
         add=lambda messages: add_events(view, builder, messages),
         collect=partial(collect_events, view),
-        join=join,
+        join=partial(_join, builder),
+        reduce=_reduced,
     ).over(view, topic, window)
     return builder.events()
+
+
+def _join(builder: TopicEventsBuilder, events: TopicEvents | None, span: Span) -> None:
+    if events is NO_EVENTS:
+        builder.join_uneventful(*span)
+    elif events is not None:
+        builder.join(events)
+
+
+def _reduced(
+    found: Sequence[tuple[TopicEvents | None, Span]],
+) -> tuple[TopicEvents | None, Span] | None:
+    """Returns the events of several bags as of one; None where something would be left out."""
+    builder = TopicEventsBuilder()
+    for events, span in found:
+        _join(builder, events, span)
+    whole = builder.events()
+    parts = [each for each, _ in found if each is not None]
+    if whole is None or whole.all_left_out > sum(each.all_left_out for each in parts):
+        return None
+    return whole, (found[0][1][0], found[-1][1][1])
 
 
 def store_shared_events(view: View, topic: str, window: TimeWindow) -> int:
