@@ -20,6 +20,7 @@
       .episodic/requests/          requests of the query server (see `request_queue`)
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
       .episodic/triggers.json      what rules found so far (see `trigger_file`)
+      .episodic/erasing.json       messages that are being taken out of bags (see `erasure_file`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
@@ -55,6 +56,7 @@ RECORDED_FILE: Final = "recorded.jsonl"
 REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
 LOST_FILE: Final = f"{OWN_FOLDER}/lost.jsonl"
 LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
+ERASING_FILE: Final = f"{OWN_FOLDER}/erasing.json"
 TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})

@@ -1,6 +1,7 @@
 """`.episodic/lost.jsonl`: messages that were published and are in no bag, as far as is known.
 
-The recorder appends a line for each hole that it finds in a topic; the query server reads them, for
+The recorder appends a line for each hole that it finds in a topic, and `ros2-memory forget` one for
+each that it makes into the middle of bags; the query server reads them, for
 the notes of answers. Lines of other versions, and a last line that a crash cut short, are ignored.
 """
 
@@ -32,14 +33,14 @@ class Loss:
     """Messages of a topic that are missing between two log times.
 
     `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
-    may never have been published either), or rosbag2's own count.
+    may never have been published either), or rosbag2's own count; or they were deleted by request.
     """
 
     topic: str
     start: Int64
     stop: Int64
     lost: Count
-    by: Literal["counter", "stamps", "rosbag2"]
+    by: Literal["counter", "stamps", "rosbag2", "forgotten"]
 
 
 _LOSS: Final = TypeAdapter(Loss)

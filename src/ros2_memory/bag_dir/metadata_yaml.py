@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.json_fields import integer
 from ros2_memory.bag_dir.layout import COMPRESSED, METADATA_FILE, bag_kind
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     Counts = Mapping[str, int]
 
 _MAX_BYTES: Final = 64 << 20
+_STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
+_PLAIN: Final = frozenset(_STORAGES.values())
 _ROOT: Final = "rosbag2_bagfile_information"
 # Patterns, not YAML: parsing the list of a day of splits takes 0.8 s (8640 files).
 _BAG_NAME: Final = re.compile(
@@ -90,14 +92,14 @@ def read_listing(path: Path | str, directory: int | None = None) -> Listing:
 
 
 class Contents(NamedTuple):
-    """The content of a complete MCAP file of a recording."""
+    """The content of a complete bag file of a recording."""
 
     summary: BagSummary
     channels: Sequence[Channel]
 
 
 def correct(recording: Path, reader: BagReader) -> bool:
-    """Corrects metadata.yaml by the content of the recording's MCAP files.
+    """Corrects metadata.yaml by the content of the recording's files, all `.mcap` or all `.db3`.
 
     Where there is none, or an empty one, it is made if the files are named as rosbag2 names them.
 
@@ -110,11 +112,12 @@ def correct(recording: Path, reader: BagReader) -> bool:
         ValueError: a file is incomplete, or metadata.yaml is of an unknown form; it is unchanged.
     """
     path = recording / METADATA_FILE
-    files = [each for each in recording.glob("*.mcap") if not each.name.startswith(".")]
+    files = [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
     text = ""
     with suppress(FileNotFoundError):
         text = read_small_file(path)
-    if not files or not (text or all(_is_of_rosbag2(each) for each in files)):
+    is_made = all(_is_of_rosbag2(each) and each.suffix == ".mcap" for each in files)
+    if not files or not (text or is_made):
         return False
     contents: dict[str, Contents] = {}
     for each in files:
@@ -127,6 +130,10 @@ def correct(recording: Path, reader: BagReader) -> bool:
     return written != text
 
 
+def _names_of(files: Iterable[str]) -> set[str]:
+    return {"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files}
+
+
 def _is_of_rosbag2(file: Path) -> bool:
     """Returns whether rosbag2 names a file of this recording like this."""
     number = file.stem.removeprefix(f"{file.parent.name}_")
@@ -134,7 +141,7 @@ def _is_of_rosbag2(file: Path) -> bool:
 
 
 def describing(text: str, files: Mapping[str, Contents]) -> str:
-    """Returns the text of a metadata.yaml that describes these MCAP files.
+    """Returns the text of a metadata.yaml that describes these files.
 
     Args:
         text: the old one, whose descriptions of topics remain; empty where there was none.
@@ -146,11 +153,12 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     channels = [channel for each in files.values() for channel in each.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
     info = _information(content)
-    if info.get("storage_identifier") != "mcap" or info.get("compression_mode") == "FILE":
-        raise ValueError("it is not of plain MCAP files")
+    kind = _STORAGES.get(str(info.get("storage_identifier")))
+    if info.get("compression_mode") == "FILE" or any(bag_kind(name) != kind for name in files):
+        raise ValueError(f"it is not of plain {' and '.join(sorted(_names_of(files)))} files")
     version = integer(info, "version")
     if version < _FIRST_OF_FILES:
-        raise ValueError(f"it is of version {version}, which is older than MCAP files")
+        raise ValueError(f"it is of version {version}, which lists no messages of files")
     paths = {bare_name(each): str(each) for each in _list(info, "relative_file_paths")}
     spans = {
         name: (summary.start, summary.end)
@@ -305,6 +313,38 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     info["message_count"] = total
     info.update(_span(min(start for start, _ in spans), max(end for _, end in spans)))
     info["relative_file_paths"], info["files"] = left_paths, left
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+def recounted(text: str, gone: Mapping[str, Counts]) -> str:
+    """Returns the text of a metadata.yaml, as rosbag2 embeds it in a file, with other counts.
+
+    Times stay as they are.
+
+    Args:
+        text: the old one; returned as it is where it is of no known form.
+        gone: by name, the messages of each topic that a file does not hold any more.
+    """
+    try:
+        content = _parse(text)
+        info = _mapping(content, "it")
+        info = _mapping(info.get(_ROOT, info), _ROOT)
+        lost, total = Counter[str](), integer(info, "message_count")
+        for each in [_mapping(each, "files") for each in _list(info, "files")]:
+            counts = gone.get(bare_name(each.get("path")), {})
+            count = integer(each, "message_count")
+            # None, where rosbag2 wrote it before the first message.
+            if counts and count:
+                each["message_count"] = max(count - sum(counts.values()), 0)
+                lost.update(counts)
+        for each in [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]:
+            name = str(_mapping(each.get("topic_metadata"), "topic_metadata").get("name"))
+            each["message_count"] = max(integer(each, "message_count") - lost[name], 0)
+    except ValueError:
+        return text
+    if not lost:
+        return text
+    info["message_count"] = max(total - lost.total(), 0)
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 

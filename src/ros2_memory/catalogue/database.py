@@ -179,7 +179,12 @@ class CatalogueDatabase:
                 self.failures += 1
                 return unknown
             try:
-                return ask(opened.connection)
+                # As one transaction: what is packed is read with the model that it was packed with.
+                opened.connection.execute("BEGIN")
+                try:
+                    return ask(opened.connection)
+                finally:
+                    opened.connection.execute("COMMIT")
             # Rows of a damaged file can hold anything, so decoding them can raise any of these.
             except (sqlite3.Error, ValueError, TypeError, LookupError, MemoryError) as error:
                 self._failed(error)

@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
+from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bootstrap import build_recorder, query_settings_of
 from ros2_memory.cli.info import assumed_active
 from ros2_memory.cli.options import (
@@ -170,6 +171,9 @@ def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Findin
         yield _warning("bag_dir", f"{bag_dir} is not there", do)
     else:
         yield _check_permissions(bag_dir, records=records)
+    if (bag_dir / ERASING_FILE).exists():
+        seen = "an earlier `ros2-memory forget` was interrupted: part of what was to go is there"
+        yield _warning("bag_dir", seen, "`ros2-memory forget` finishes it, whatever it is to do")
     if records:
         yield _check_disk(settings, bag_dir, foreign_bytes)
 

@@ -1,7 +1,11 @@
-"""`ros2-memory forget`: deletes the bags of a time window, as retention deletes bags.
+"""`ros2-memory forget`: deletes the bags of a time window, or some messages of them.
 
-What is deleted and what is kept is decided first, without reading a bag. Then the bags are deleted,
-after the latched messages that later answers need were carried forward.
+Whole bags are deleted as retention deletes them. What is deleted and what is kept is decided first,
+without reading a bag. Then the bags are deleted, after the latched messages that later answers need
+were carried forward.
+
+Messages of topics, or of the time in which the robot was in a place, are taken out of the bags that
+hold them (`retention.eraser`).
 """
 
 from collections import Counter
@@ -9,16 +13,24 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
+from ros2_memory.bag_dir.erasure_file import Erasure, read_erasure
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import METADATA_FILE, MOMENTS_FOLDER, is_kept_apart, other_form
+from ros2_memory.bag_dir.layout import (
+    ERASING_FILE,
+    METADATA_FILE,
+    MOMENTS_FOLDER,
+    is_kept_apart,
+    other_form,
+)
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bootstrap import build_reader, supposed_own
+from ros2_memory.bootstrap import build_reader, catalogue_paths, supposed_own
+from ros2_memory.catalogue.purge import purge
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
@@ -45,14 +57,21 @@ from ros2_memory.core.errors import (
     RecorderError,
 )
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Memory
+from ros2_memory.core.text import counted, listed, match_topics
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import open_view
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.places.scope import times_in_region
+from ros2_memory.places.where import parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
+from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap.writer import McapWriter
+
+PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
+"""Messages so long before the robot entered a place, and after it left, go too."""
 
 
 def forget(
@@ -61,6 +80,16 @@ def forget(
     start: Start = None,
     end: End = None,
     last: Last = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GLOB", help="Only messages of these topics, out of all bags; repeatable."
+        ),
+    ] = None,
+    where: Annotated[
+        str | None,
+        typer.Option(metavar="PLACE", help="Only messages of when the robot was in a named place."),
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say what would be deleted.")
@@ -69,6 +98,9 @@ def forget(
     verbose: Verbose = False,
 ) -> None:
     """Delete the closed bags that lie wholly inside a time window, after asking.
+
+    With --topic or --where, messages are taken out of the bags that hold them: every other message
+    stays as it is. An interrupted one is finished by the next `forget`, which says so.
 
     What reaches beyond it stays, and so do what is being written and, unless
     retention.foreign=delete, bags that this deployment's recorder did not make; all are named.
@@ -84,6 +116,14 @@ def forget(
     if snapshot.problem:
         raise RecorderError(snapshot.problem)
     window = parse_window(memory, start, end, last)
+    with _recorder_locked_out(settings.recording.bag_dir) as recorder:
+        taking = _Taking(settings, memory, recorder, dry_run=dry_run)
+    interrupted = taking.finish()
+    if topic or where is not None:
+        wanted, lines = taking.wanted(window, topic or (), where)
+        if taking.take(wanted, lines, ask=not yes) or interrupted:
+            raise typer.Exit(EXIT_NEGATIVE)
+        return
     plan = plan_deletion(settings, snapshot, window)
     carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
     kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
@@ -100,8 +140,151 @@ def forget(
             typer.confirm("Delete them? This cannot be undone.", abort=True)
         counts = _message_counts(build_reader(settings), plan.to_delete)
         kept += _delete(memory, plan, carrier, counts)
-    if kept:
+    if kept or interrupted:
         raise typer.Exit(EXIT_NEGATIVE)
+
+
+class _Taking:
+    """Takes messages out of bags.
+
+    Args:
+        settings: of this deployment.
+        memory: over its bags.
+        recorder: why a recorder holds the bag directory; None where none does.
+        dry_run: whether it only says what would be done.
+    """
+
+    def __init__(
+        self, settings: Settings, memory: Memory, recorder: str | None, *, dry_run: bool
+    ) -> None:
+        self._settings = settings
+        self._memory = memory
+        self._recorder = recorder
+        self._dry_run = dry_run
+        self._bag_dir = settings.recording.bag_dir
+        snapshot = memory.index.snapshot()
+        written = {aside.path for aside in snapshot.active}
+        written |= {bag.path for bag in snapshot.bags if bag.state is BagState.ACTIVE}
+        own = supposed_own(self._bag_dir) if settings.retention.foreign == "keep" else None
+        self._carrier = Carrier(
+            self._bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics
+        )
+        self._eraser = Eraser(
+            self._bag_dir,
+            build_reader(settings),
+            McapWriter(),
+            own,
+            written=written,
+            recorder=recorder,
+        )
+
+    def finish(self) -> bool:
+        """Finishes an erasure that was interrupted; returns whether something of it stays."""
+        try:
+            begun = read_erasure(self._bag_dir)
+        except ValueError as error:
+            raise RecorderError(
+                f"{self._bag_dir / ERASING_FILE}: {error}; an earlier forget was interrupted: "
+                "delete the file, and forget again what was to go"
+            ) from error
+        if begun is None:
+            return False
+        print_line(f"an earlier forget was interrupted: {_describe_erasure(begun)}")
+        return self.take(begun, [], ask=False)
+
+    def wanted(
+        self, window: TimeWindow, globs: Sequence[str], where: str | None
+    ) -> tuple[Erasure, list[str]]:
+        """Returns what is asked for, and a line for each part of it that stays.
+
+        Raises:
+            InvalidArgumentsError: no such place is named, or no topic matches.
+        """
+        lines: list[str] = []
+        windows = [window]
+        if where is not None:
+            with spinner(f"looking when the robot was in {where}"):
+                view = open_view(self._memory, Call(), None)
+                place = parse_where(self._memory.limits.places, where)
+                times = times_in_region(view, place, window)
+            around = [
+                TimeWindow(each.start - PLACE_MARGIN_NS, each.stop + PLACE_MARGIN_NS + 1)
+                for each in times
+            ]
+            windows = [each.intersect(window) for each in around]
+            lines += [f"what is not known: {each}" for each in view.notes.sentences()]
+        with spinner("looking which topics there are"):
+            known = self._eraser.topics()
+        latched = known.intersection(self._carrier.topics(self._memory.index.snapshot()))
+        if globs:
+            topics = {each for glob in globs for each in match_topics(known, glob)}
+            if not topics:
+                raise InvalidArgumentsError(f"no recorded topic is named {listed([*globs])}")
+        else:
+            topics = {*known} - latched
+            if latched and windows:
+                print_line(
+                    "latched messages stay, since they hold for later, too (name a topic to forget "
+                    f"it): {listed(sorted(latched))}"
+                )
+        if self._recorder is not None and topics & latched:
+            lines.append(
+                f"{listed(sorted(topics & latched))}: latched messages, which the recorder carries "
+                f"on: {self._recorder}; stop it for a moment, and forget again"
+            )
+            topics -= latched
+        return Erasure.of(topics, windows, topics & latched), lines
+
+    def take(self, erasure: Erasure, lines: Sequence[str], *, ask: bool) -> bool:
+        """Takes messages out, after asking; returns whether something of them stays."""
+        kept = [*lines]
+        survey = Survey((), ())
+        if erasure.topics and erasure.windows:
+            with spinner("looking which bags hold some"):
+                survey = self._eraser.survey(erasure)
+        kept += survey.kept
+        _print_kept(kept)
+        if not survey.holders and not erasure.files:
+            print_line("no message of that lies in the window")
+            return bool(kept)
+        size = sum(path.stat().st_size for path in {each.paths[0] for each in survey.holders})
+        what = (
+            f"{counted(survey.counts.total(), 'message')} of "
+            f"{counted(len(survey.counts), 'topic')}, by writing "
+            f"{counted(len(survey.holders), 'bag')} anew ({size / MB:.1f} MB)"
+        )
+        print_line(f"would be deleted: {what}" if self._dry_run else f"to be deleted: {what}")
+        for topic, count in sorted(survey.counts.items()):
+            print_line(f"  {topic}: {counted(count, 'message')}")
+        if self._dry_run:
+            return bool(kept)
+        if ask:
+            typer.confirm("Delete them? This cannot be undone.", abort=True)
+        with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
+            if recorder is not None and self._recorder is None:
+                raise RecorderError(f"nothing was deleted: {recorder}; forget again")
+            result = self._eraser.erase(erasure, survey, self._forget_derived)
+        print_line(
+            "not all is deleted" if result.kept else f"deleted: {survey.counts.total()} messages"
+        )
+        _print_kept(result.kept)
+        for note in result.notes:
+            print_line(note)
+        return bool(kept or result.kept)
+
+    def _forget_derived(self, erasure: Erasure) -> None:
+        self._memory.index.refresh()
+        if self._memory.recall is not None:
+            self._memory.recall.catalogue.close()
+        for path in catalogue_paths(self._settings):
+            purge(path, erasure.files)
+
+
+def _describe_erasure(erasure: Erasure) -> str:
+    first, last = erasure.windows[0][0], erasure.windows[-1][1]
+    span = TimeWindow(first, last)
+    ends = [format_time(unix_from_ns(each)) for each in span.asked()]
+    return f"{listed(erasure.topics)} from {ends[0]} to {ends[1]}"
 
 
 @dataclass(frozen=True, slots=True)

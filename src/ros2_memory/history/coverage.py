@@ -77,15 +77,20 @@ def note_unread(
 
 
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on messages that are known to be missing of a window."""
-    topics: dict[str, int] = {}
-    for loss in read_losses(bag_dir, window.start, window.stop):
-        topics[loss.topic] = topics.get(loss.topic, 0) + loss.lost
-    if topics:
-        most = sorted(topics, key=lambda topic: (-topics[topic], topic))
-        named = listed([f"{topic} ({topics[topic]})" for topic in most])
-        messages = counted(sum(topics.values()), "message")
-        yield f"{messages} lost before they were recorded, or never published: {named}"
+    """Yields a sentence on messages that are known to be missing of a window, one on forgotten."""
+    losses = read_losses(bag_dir, window.start, window.stop)
+    for forgotten, what in (
+        (False, "lost before they were recorded, or never published"),
+        (True, "deleted by request"),
+    ):
+        topics: dict[str, int] = {}
+        for loss in losses:
+            if (loss.by == "forgotten") == forgotten:
+                topics[loss.topic] = topics.get(loss.topic, 0) + loss.lost
+        if topics:
+            most = sorted(topics, key=lambda topic: (-topics[topic], topic))
+            named = listed([f"{topic} ({topics[topic]})" for topic in most])
+            yield f"{counted(sum(topics.values()), 'message')} {what}: {named}"
 
 
 def note_edges(view: View, window: TimeWindow) -> None:

@@ -140,7 +140,7 @@ class Carrier:
         found: dict[str, BagFile] = {}
         wanted = {str(path) for path in paths}
         everything = TimeWindow.everything()
-        for topic in self._topics(snapshot):
+        for topic in self.topics(snapshot):
             extents = snapshot.timeline.extents(topic, everything)
             found.update((bag.file, bag) for bag, *_ in extents if bag.file in wanted)
         return tuple(found.values())
@@ -160,7 +160,7 @@ class Carrier:
         with_messages = self.with_latched(snapshot, to_delete)
         if not with_messages:
             return None
-        topics = self._topics(snapshot)
+        topics = self.topics(snapshot)
         gone = {*to_delete} - {*saved}
         kept = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
         carried = {
@@ -184,7 +184,7 @@ class Carrier:
         self._write(fetched)
         return len(wanted)
 
-    def _topics(self, snapshot: Snapshot) -> tuple[str, ...]:
+    def topics(self, snapshot: Snapshot) -> tuple[str, ...]:
         """Returns the latched topics, also frequent ones: their last message may still be valid."""
         return tuple(
             topic

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
@@ -269,6 +270,34 @@ class BagWriter(ABC):
             BagVanishedError: the source is not there.
             BagError: nothing of the source can be read, or the target cannot be written, or it
                 does not hold what was readable.
+        """
+
+    @abstractmethod
+    def cut(
+        self,
+        source: Path,
+        target: Path,
+        takes: Callable[[str, Ns, Ns], bool],
+        retell: Callable[[str], str],
+    ) -> Counter[str]:
+        """Writes a whole file again, of any kind but compressed ones, without some messages.
+
+        All else is unchanged, as by `rewrite`, but for the counts that rosbag2 embeds. The target
+        was read back and compared, and is on the disk, when this returns. There must be no file of
+        its name; the source is only read.
+
+        Args:
+            source: a file that its writer finished.
+            target: the new one.
+            takes: whether a message is left out, by topic, log time and publish time.
+            retell: returns the text of an embedded metadata.yaml as it is to be.
+
+        Returns:
+            How many messages of each topic were left out.
+
+        Raises:
+            BagVanishedError: the source is not there.
+            BagError: not all of the source can be read, or the target cannot be written.
         """
 
 

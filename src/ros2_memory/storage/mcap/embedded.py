@@ -1,4 +1,4 @@
-"""Reads the metadata record that rosbag2 embeds in each MCAP file, with its metadata.yaml.
+"""Reads and changes the record with metadata.yaml that rosbag2 embeds in each MCAP file.
 
 It follows the header, is repeated before the end, and has the custom data of `ros2 bag record
 --custom-data` (seen in the files of Jazzy; Humble has no such option).
@@ -20,7 +20,7 @@ from ros2_memory.storage.mcap.salvage import decode_record
 from ros2_memory.storage.mcap.walk import file_records
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from mcap.records import McapRecord
@@ -58,6 +58,14 @@ def custom_data(path: Path) -> dict[str, str] | None:
     except UnreadableError:
         return None
     return {}
+
+
+def retold(record: Metadata, retell: Callable[[str], str]) -> Metadata:
+    """Returns a metadata record; that of rosbag2 with its text changed."""
+    text = record.metadata.get(_KEY)
+    if record.name != _NAME or text is None:
+        return record
+    return Metadata(name=record.name, metadata={**record.metadata, _KEY: retell(text)})
 
 
 def _before_messages(file: OpenFile) -> Iterator[McapRecord]:

@@ -1,8 +1,9 @@
-"""Writes MCAP files: closed, indexed, checked, and on the disk."""
+"""Writes MCAP files: closed, indexed, checked, and on the disk; also others anew, without some."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
@@ -16,7 +17,10 @@ from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
+from ros2_memory.storage.mcap.embedded import retold
+from ros2_memory.storage.mcap.records import is_finished
 from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage
+from ros2_memory.storage.sqlite_cut import cut_sqlite
 from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
@@ -24,11 +28,14 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import IO
 
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel, Record, Schema
 
 CHUNK_BYTES: Final = 64 << 10
 """Small, since a reader decompresses a whole chunk for one message."""
 LIBRARY: Final = "ros2-memory"
+_REWRITTEN: Final = f", rewritten by {LIBRARY}"
 _ROS2_ENCODINGS: Final = frozenset(("ros2msg", "ros2idl", ""))
 """Empty if the recorder found no definition."""
 
@@ -81,21 +88,78 @@ class McapWriter(BagWriter):
             notes = self._compare(source, target, digest)
         return Rewritten(digest.messages, salvage.lost_bytes, notes)
 
-    def _compare(self, source: Path, target: Path, digest: ContentDigest) -> tuple[str, ...]:
-        """Compares the target, read back, with the source; returns the notes on the source."""
-        bags = McapBags(cache_mb=1, max_chunk_mb=self._max_chunk_mb)
-        with reading(source):
-            before = bags.summarize(source)
-        after = bags.summarize(target)
+    def cut(
+        self,
+        source: Path,
+        target: Path,
+        takes: Callable[[str, Ns, Ns], bool],
+        retell: Callable[[str], str],
+    ) -> Counter[str]:
+        """Writes a whole file again without some messages."""
+        if source.suffix.lower() != ".mcap":
+            with _written(target) as stream, reading(source):
+                return cut_sqlite(source, target, stream, takes, retell)
+        taken = Counter[str]()
+        with _written(target) as stream:
+            with reading(source), OpenFile(source) as file:
+                if not is_finished(file):
+                    raise UnreadableError("its writer did not finish it")
+                salvage = Salvage(file, self._max_chunk_mb << 20)
+                copy, digest = _Copy(_writer(stream)), ContentDigest()
+                for record in _without(salvage, takes, taken):
+                    if isinstance(record, mcap_records.Metadata):
+                        record = retold(record, retell)  # noqa: PLW2901 - in its place
+                    if digest.add(record):
+                        copy.put(record)
+                    elif isinstance(record, mcap_records.Message):
+                        raise UnreadableError("damaged: a message without a channel or a time")
+                was = sum(each.count for each in self._bags().summarize(source).topics)
+                if salvage.lost_bytes or was != digest.messages + taken.total():
+                    raise UnreadableError("damaged: not all of its messages can be read")
+            copy.finish()
+            stream.flush()
+            self._require_content(target, digest)
+        return taken
+
+    def _bags(self) -> McapBags:
+        return McapBags(cache_mb=1, max_chunk_mb=self._max_chunk_mb)
+
+    def _require_content(self, target: Path, digest: ContentDigest) -> BagSummary:
+        """Reads a target back, compares it with what was to be written, and returns its summary."""
+        after = self._bags().summarize(target)
         if not after.complete or after.notes:
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
         again = ContentDigest()
         with OpenFile(target) as file:
             for record in Salvage(file, self._max_chunk_mb << 20).records():
                 again.add(record)
-        if (after.topics, again.digests) != (before.topics, digest.digests):
+        if again.digests != digest.digests:
+            raise UnreadableError("what was written is not what could be read")
+        return after
+
+    def _compare(self, source: Path, target: Path, digest: ContentDigest) -> tuple[str, ...]:
+        """Compares the target, read back, with the source; returns the notes on the source."""
+        with reading(source):
+            before = self._bags().summarize(source)
+        if self._require_content(target, digest).topics != before.topics:
             raise UnreadableError("what was written is not what could be read")
         return before.notes
+
+
+def _without(
+    salvage: Salvage, takes: Callable[[str, Ns, Ns], bool], taken: Counter[str]
+) -> Iterator[mcap_records.McapRecord]:
+    """Yields all records but the messages that are taken, which are counted by topic."""
+    topics: dict[int, str] = {}
+    for record in salvage.records():
+        if isinstance(record, mcap_records.Channel):
+            topics.setdefault(record.id, record.topic)
+        elif isinstance(record, mcap_records.Message):
+            topic = topics.get(record.channel_id)
+            if topic is not None and takes(topic, record.log_time, record.publish_time):
+                taken[topic] += 1
+                continue
+        yield record
 
 
 class _Copy:
@@ -110,7 +174,8 @@ class _Copy:
     def put(self, record: mcap_records.McapRecord) -> None:
         """Writes one record, whose schema or channel must have come before."""
         if isinstance(record, mcap_records.Header):
-            self._start(record.profile, f"{record.library}, rewritten by {LIBRARY}")
+            library = record.library.removesuffix(_REWRITTEN)
+            self._start(record.profile, f"{library}{_REWRITTEN}")
             return
         self._start(ROS2_PROFILE, LIBRARY)
         if isinstance(record, mcap_records.Message):

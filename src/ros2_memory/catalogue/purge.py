@@ -1,0 +1,139 @@
+"""Has a catalogue's file forget bags, so that no byte of it tells of what they held.
+
+Deleting rows is not enough: answers were computed from them, payloads and models are shared between
+bags, and SQLite leaves deleted rows in free pages and in its write-ahead log. A model is what the
+first bag said of a topic; where no bag that is left says so, another is chosen, and what was packed
+with it is packed anew.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.catalogue.database import ROW_ID_BITS, VERSION
+from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed, unpacked
+from ros2_memory.catalogue.sql import (
+    NO_TOPIC,
+    POSES,
+    SIGHTS,
+    STANDSTILLS,
+    STORY,
+    TRACK,
+    ZONE_MAP,
+    delete_entries,
+)
+from ros2_memory.core.errors import BagError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+PATIENCE_S: Final = 10.0
+"""How long other programs may use the file before it is given up to empty its log."""
+_PAUSE_S: Final = 0.05
+_ASIDE: Final = ".aside"
+_OF_TOPIC: Final = {ZONE_MAP: "held", POSES: "held", STANDSTILLS: "tales", STORY: "tales"}
+_OF_MAP: Final = (TRACK, SIGHTS)
+
+
+def purge(file: Path, bags: Sequence[str]) -> None:
+    """Has a catalogue's file forget bags, and deletes catalogues that were set aside.
+
+    Args:
+        file: the catalogue; nothing is done where it is not there, or is of another version.
+        bags: their paths, as entries name them.
+
+    Raises:
+        BagError: it cannot be changed, or another program uses it all the time.
+    """
+    try:
+        for each in (*file.parent.glob(f"{file.name}{_ASIDE}*"), *_copies(file)):
+            each.unlink(missing_ok=True)
+        if file.is_file() and not file.is_symlink():
+            _purge(file, bags)
+    except (OSError, sqlite3.Error, ValueError) as error:
+        reason = f"the catalogue may still tell of what was deleted ({error}); delete the file"
+        raise BagError(str(file), f"{file.name}: {reason}") from error
+
+
+def _copies(file: Path) -> list[Path]:
+    """Returns copies that were being made when a program ended."""
+    return [*file.parent.glob(f".{file.name}.*.tmp*")]
+
+
+def _purge(file: Path, bags: Sequence[str]) -> None:
+    address = f"{file.absolute().as_uri()}?mode=rw"
+    with closing(
+        sqlite3.connect(address, uri=True, timeout=PATIENCE_S, isolation_level=None)
+    ) as base:
+        if base.execute("PRAGMA user_version").fetchone()[0] != VERSION:
+            raise ValueError("it is of another version")
+        base.execute("PRAGMA secure_delete = ON")
+        base.execute("BEGIN IMMEDIATE")
+        try:
+            listed = json.dumps(bags)
+            rows = base.execute(
+                "SELECT id FROM bags WHERE path IN (SELECT value FROM json_each(?))", (listed,)
+            )
+            delete_entries(base, [row[0] for row in rows.fetchall()])
+            base.execute("DELETE FROM remembered")
+            base.execute("DELETE FROM payloads WHERE id NOT IN (SELECT payload FROM kept)")
+            for topic, kind, model in base.execute("SELECT * FROM models").fetchall():
+                _renew_model(base, topic, kind, model)
+            base.execute("COMMIT")
+        except BaseException:
+            base.execute("ROLLBACK")
+            raise
+        give_up_s = time.monotonic() + PATIENCE_S
+        for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
+            while not _done(base, statement):
+                if time.monotonic() > give_up_s:
+                    raise sqlite3.OperationalError("other programs use it all the time")
+                time.sleep(_PAUSE_S)
+
+
+def _done(base: sqlite3.Connection, statement: str) -> bool:
+    """Executes a statement; returns whether nobody was in its way."""
+    try:
+        row = base.execute(statement).fetchone()
+    except sqlite3.OperationalError as error:
+        if (error.sqlite_errorcode & 0xFF) not in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+            raise
+        return False
+    return row is None or not row[0]
+
+
+def _renew_model(base: sqlite3.Connection, topic: int, kind: str, model: bytes) -> None:
+    """Replaces a model that nothing which is left says, and packs that with another."""
+    if topic == NO_TOPIC and kind not in _OF_MAP:
+        base.execute("DELETE FROM models WHERE topic = ? AND kind = ?", (topic, kind))
+        return
+    if topic == NO_TOPIC:
+        table, key, bounds = "maps", "bag", (0, 1 << ROW_ID_BITS)
+    else:
+        table, key = _OF_TOPIC[kind], "id"
+        bounds = (topic << ROW_ID_BITS, (topic + 1) << ROW_ID_BITS)
+    rows = base.execute(
+        f"SELECT {key}, {kind} FROM {table} WHERE {key} >= ? AND {key} < ?"
+        f" AND length({kind}) > 0 ORDER BY {key}",
+        bounds,
+    )
+    plain: list[tuple[int, bytes]] = []
+    for number, stored in rows:
+        said = unpacked(stored, model)
+        if said[:MAX_MODEL_BYTES] == model:
+            return
+        plain.append((number, said))
+    base.execute("DELETE FROM models WHERE topic = ? AND kind = ?", (topic, kind))
+    if not plain:
+        return
+    new = plain[0][1][:MAX_MODEL_BYTES]
+    base.execute("INSERT INTO models VALUES (?, ?, ?)", (topic, kind, new))
+    base.executemany(
+        f"UPDATE {table} SET {kind} = ? WHERE {key} = ?",
+        [(packed(said, new), number) for number, said in plain],
+    )

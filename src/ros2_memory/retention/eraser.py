@@ -1,0 +1,459 @@
+"""Takes messages out of bags by writing these anew, with all that names or repeats them.
+
+What goes is written down first (`bag_dir.erasure_file`), so that an erasure that is interrupted can
+be finished. Then for each bag: its messages leave the sidecar; the bag is written anew beside
+itself, read back, compared and flushed; and the new file takes the name of the old one, wherever a
+hard link in a moment has it. It is done when no name of the old one is left.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections import Counter, defaultdict
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ros2_memory.bag_dir.durable_write import flush
+from ros2_memory.bag_dir.erasure_file import Erased, Erasure, remove_erasure, write_erasure
+from ros2_memory.bag_dir.handover_file import handover_to_change, message_id, write_handover
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.layout import (
+    CARRY_FILE,
+    CARRY_FOLDER,
+    COMPRESSED,
+    HANDOVER_FILE,
+    METADATA_FILE,
+    bag_kind,
+    is_carried,
+    is_kept_apart,
+)
+from ros2_memory.bag_dir.lost_file import Loss, append_losses, read_losses
+from ros2_memory.bag_dir.metadata_yaml import correct, recounted
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, EpisodicError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.retention.delete import repair_name
+from ros2_memory.retention.repair import open_files
+from ros2_memory.storage.base import Closing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+
+    from ros2_memory.bag_dir.handover_file import MessageList
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import BagReader, BagWriter
+
+Identity = tuple[int, int]
+Ids = dict[str, set[str]]
+
+
+@dataclass(slots=True)
+class Holder:
+    """A bag file that holds messages which go.
+
+    Attributes:
+        paths: all its names in the bag directory that may be changed.
+        inode: device and inode.
+        counts: the messages that go, by topic.
+        windows: likewise, by topic and window.
+        ids: what identifies them in sidecars, by topic.
+    """
+
+    paths: tuple[Path, ...]
+    inode: Identity
+    counts: Counter[str] = field(default_factory=Counter)
+    windows: Counter[tuple[str, Ns, Ns]] = field(default_factory=Counter)
+    ids: Ids = field(default_factory=dict)
+
+
+class Survey(NamedTuple):
+    """Which bags hold messages that go, and a line with the reason for each that is kept."""
+
+    holders: tuple[Holder, ...]
+    kept: tuple[str, ...]
+
+    @property
+    def counts(self) -> Counter[str]:
+        """The messages that go, by topic."""
+        return sum((each.counts for each in self.holders), Counter[str]())
+
+
+class Kept(NamedTuple):
+    """A line for each thing of which something stays, and other lines on what was done."""
+
+    kept: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+class Eraser:
+    """Takes messages out of the bags of one bag directory.
+
+    Args:
+        bag_dir: where the bags lie.
+        reader: reads files as they are, also what does not count in answers.
+        writer: writes them anew.
+        own: the recordings that may be changed; None: all.
+        written: files that are still being written.
+        recorder: why a recorder holds the directory; None where none does, nor can begin to.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        reader: BagReader,
+        writer: BagWriter,
+        own: OwnRecordings | None,
+        *,
+        written: Collection[Path] = (),
+        recorder: str | None = None,
+    ) -> None:
+        self._bag_dir = bag_dir
+        self._reader = reader
+        self._writer = writer
+        self._own = own
+        self._written = frozenset(written)
+        self._recorder = recorder
+        self._carried = bag_dir / CARRY_FOLDER / CARRY_FILE
+
+    def topics(self) -> frozenset[str]:
+        """Returns the topics of all bags that can be read; of those that do not count too."""
+        found: set[str] = set()
+        for paths in self._files().values():
+            with suppress(BagError):
+                found.update(topic.topic for topic in self._reader.summarize(paths[0]).topics)
+        return frozenset(found)
+
+    def survey(self, erasure: Erasure) -> Survey:
+        """Returns which bags hold messages that go; changes nothing."""
+        holders: list[Holder] = []
+        kept: list[str] = []
+        for inode, paths in sorted(self._files().items(), key=lambda each: each[1]):
+            try:
+                found = self._look_into(erasure, paths, inode)
+            except BagError as error:
+                if not any(map(self._may_change, paths)):
+                    continue
+                found = f"what it holds is not known: {error.reason}"
+            if isinstance(found, str):
+                kept.append(f"{self._name(paths[0])}: {found}")
+            elif found is not None:
+                holders.append(found)
+                foreign = [self._name(each) for each in paths if each not in found.paths]
+                kept.extend(f"{each}: this recorder did not make it" for each in foreign)
+        return Survey(tuple(holders), tuple(kept))
+
+    def _look_into(
+        self, erasure: Erasure, paths: Sequence[Path], inode: Identity
+    ) -> Holder | str | None:
+        """Returns what of a file goes; why it is kept; or None where it holds nothing that goes.
+
+        Raises:
+            BagError: it cannot be read.
+        """
+        if not self._reader.reads(paths[0]):
+            return "storage=rosbag2 reads it, which is not configured"
+        if self._written.intersection(paths):
+            with suppress(BagError):
+                summary = self._reader.summarize(paths[0])
+                if not summary.empty and summary.start >= erasure.windows[-1][1]:
+                    return None
+            return "it is being written; forget again when it is closed"
+        summary = self._reader.summarize(paths[0])
+        if not any(_may_take(erasure, summary, each) for each in erasure.topics):
+            return None
+        holder = self._holder(erasure, paths, inode)
+        if not holder.counts:
+            return None
+        return self._reason_to_keep(paths, inode, summary) or holder
+
+    def erase(self, erasure: Erasure, survey: Survey, forgotten: Callable[[Erasure], None]) -> Kept:
+        """Takes the messages out, durably; returns what of them stays, and why.
+
+        Args:
+            erasure: which; where it was interrupted, with its files.
+            survey: what holds them now.
+            forgotten: has everything derived from the files forget them. It may raise an
+                `EpisodicError`, and then the erasure counts as not finished.
+
+        Raises:
+            OSError: what goes cannot be written down; nothing is changed then.
+        """
+        if not erasure.files:
+            erasure = self._with_files(erasure, survey)
+        write_erasure(self._bag_dir, erasure)
+        kept: list[str] = []
+        gone: defaultdict[Path, dict[str, Counter[str]]] = defaultdict(dict)
+        for holder in survey.holders:
+            recording = holder.paths[0].parent
+            gone[recording][holder.paths[0].name] = holder.counts
+            try:
+                self._erase_in(holder, erasure, gone[recording], kept)
+            except (EpisodicError, OSError) as error:
+                kept.append(f"{self._name(holder.paths[0])}: {_reason_of(error)}")
+        files = [self._bag_dir / each for each in erasure.files]
+        notes = [*self._correct_metadata({each.parent for each in files})]
+        try:
+            for path in files:
+                self._remove_leftover(path)
+            forgotten(erasure)
+            self._tell(erasure)
+            if not kept:
+                remove_erasure(self._bag_dir)
+        except (EpisodicError, OSError) as error:
+            kept.append(_reason_of(error))
+        return Kept(tuple(kept), tuple(notes))
+
+    def _tell(self, erasure: Erasure) -> None:
+        """Has answers say that messages were deleted.
+
+        Raises:
+            OSError: it cannot be written down.
+        """
+        told = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
+        counts = [(each.topic, each.start, each.stop, each.count) for each in erasure.counts]
+        losses = [Loss(*each, "forgotten") for each in counts]
+        append_losses(self._bag_dir, [each for each in losses if each not in told])
+
+    def _files(self) -> dict[Identity, list[Path]]:
+        """Returns the paths of every bag file by device and inode, the recorded one first."""
+        found: defaultdict[Identity, list[Path]] = defaultdict(list)
+        for folder, entries in directories.walk(self._bag_dir):
+            for entry in entries:
+                if bag_kind(entry.name) and not entry.is_symlink():
+                    with suppress(OSError):
+                        status = entry.stat(follow_symlinks=False)
+                        if stat.S_ISREG(status.st_mode) and status.st_size:
+                            found[status.st_dev, status.st_ino].append(Path(folder, entry.name))
+        for paths in found.values():
+            paths.sort(key=lambda path: (is_kept_apart(self._name(path)), path))
+        return dict(found)
+
+    def _reason_to_keep(
+        self, paths: Sequence[Path], inode: Identity, summary: BagSummary
+    ) -> str | None:
+        path, reason = paths[0], None
+        if not any(map(self._may_change, paths)):
+            reason = "this recorder did not make it; `ros2-memory adopt` takes its folder"
+        elif path.name.endswith(COMPRESSED):
+            reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
+        elif self._reader.closing(path) is Closing.OPEN or not summary.complete:
+            reason = "a crash left it open; ros2-memory recover closes it"
+        # Nothing in such a file says that its writer has finished.
+        elif path.suffix == ".db3" and inode in open_files():
+            reason = "a program has it open; forget again when none does"
+        elif summary.notes:
+            reason = f"it cannot be written anew whole: {'; '.join(summary.notes)}"
+        elif is_carried(path) and self._recorder is not None:
+            reason = (
+                f"nobody else may change it beside a recorder: {self._recorder}; stop it for a "
+                "moment, and forget again"
+            )
+        return reason
+
+    def _may_change(self, path: Path) -> bool:
+        if self._own is None:
+            return True
+        name = self._own.name_of(path.parent)
+        return is_kept_apart(name) or self._own.owns(path.parent)
+
+    def _holder(self, erasure: Erasure, paths: Sequence[Path], inode: Identity) -> Holder:
+        """Reads which messages of a file go."""
+        holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
+        for topic in erasure.topics:
+            first, last = erasure.windows[0][0], erasure.windows[-1][1]
+            span = (
+                TimeWindow(MIN_NS, MAX_NS) if topic in erasure.latched else TimeWindow(first, last)
+            )
+            for record in self._reader.records(paths[0], (topic,), span):
+                window = erasure.window_of(topic, record.log_time, record.publish_time)
+                if window is not None:
+                    holder.counts[topic] += 1
+                    holder.windows[topic, *window] += 1
+                    known = holder.ids.setdefault(topic, set())
+                    known.add(message_id(record.publish_time, record.payload))
+        return holder
+
+    def _with_files(self, erasure: Erasure, survey: Survey) -> Erasure:
+        counts = Counter[tuple[str, int, int]]()
+        for holder in survey.holders:
+            counts.update(holder.windows)
+        files = [self._name(path) for each in survey.holders for path in each.paths]
+        return replace(
+            erasure,
+            files=tuple(files),
+            counts=tuple(Erased(*key, count) for key, count in sorted(counts.items())),
+        )
+
+    def _erase_in(
+        self,
+        holder: Holder,
+        erasure: Erasure,
+        gone: Mapping[str, Counter[str]],
+        kept: list[str],
+    ) -> None:
+        """Writes one file anew, in place of all its names.
+
+        Raises:
+            EpisodicError: it cannot be written anew.
+            OSError: likewise, or it is another file now.
+        """
+        for path in holder.paths:
+            self._clear_sidecar(path, holder.ids)
+        path = holder.paths[0]
+        with path.open("rb") as old:
+            before = os.fstat(old.fileno())
+            if (before.st_dev, before.st_ino) != holder.inode:
+                raise BagError(str(path), "it is another file now; forget again")
+            with directories.opened(self._bag_dir, path.parent) as folder:
+                here = Path(f"/proc/self/fd/{folder}", path.name)
+                beside = here.with_name(repair_name(path.name))
+                beside.unlink(missing_ok=True)
+                try:
+                    taken = self._writer.cut(
+                        here, beside, erasure.takes, lambda text: recounted(text, gone)
+                    )
+                    if taken != holder.counts:
+                        raise BagError(str(path), "it does not hold what it held just now")
+                    beside.chmod(stat.S_IMODE(before.st_mode))
+                    with suppress(OSError):
+                        os.chown(beside, before.st_uid, before.st_gid)
+                    # A nanosecond later: nobody may take the new file for the old one.
+                    os.utime(beside, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+                    for other in holder.paths[1:]:
+                        self._link(beside, other, holder.inode)
+                    _replace(beside, here, holder.inode)
+                finally:
+                    beside.unlink(missing_ok=True)
+            if os.fstat(old.fileno()).st_nlink:
+                # A recorder may have kept the old file in a moment meanwhile.
+                for late in filter(self._may_change, self._files().get(holder.inode, ())):
+                    self._link(path, late, holder.inode)
+            left = os.fstat(old.fileno()).st_nlink
+        if left:
+            links = counted(left, "more hard link", "more hard links")
+            kept.append(f"{self._name(path)}: all of it is still in {links} of it")
+        elif is_carried(path) and self._reader.summarize(path).empty:
+            path.unlink()
+            flush(path.parent)
+
+    def _link(self, new: Path, path: Path, inode: Identity) -> None:
+        """Puts a new file in place of one name of the old one."""
+        with directories.opened(self._bag_dir, path.parent) as folder:
+            here = Path(f"/proc/self/fd/{folder}", path.name)
+            beside = here.with_name(repair_name(path.name))
+            beside.unlink(missing_ok=True)
+            os.link(new, beside, follow_symlinks=False)
+            try:
+                _replace(beside, here, inode)
+            finally:
+                beside.unlink(missing_ok=True)
+
+    def _clear_sidecar(self, path: Path, ids: Ids) -> None:
+        """Takes messages of a file out of the sidecar in its folder.
+
+        Its time stays: what counts of the other files stays, too.
+
+        Raises:
+            EpisodicError: it cannot be changed.
+            OSError: likewise.
+        """
+        folder = path.parent
+        target = folder / HANDOVER_FILE
+        if not target.is_file() or target.is_symlink():
+            return
+        with directories.opened(self._bag_dir, folder):
+            before = target.stat()
+            handover = handover_to_change(folder)
+            lists = [
+                _without(each, path.name, ids)
+                for each in (handover.also_counts, handover.counts_elsewhere)
+            ]
+            if lists == [handover.also_counts, handover.counts_elsewhere]:
+                return
+            if (
+                self._own is None
+                or self._own.name_of(folder) in read_heartbeat(self._bag_dir).recordings
+            ):
+                raise BagError(str(target), "its recorder still writes it; forget again later")
+            also, elsewhere = lists
+            write_handover(folder, replace(handover, also_counts=also, counts_elsewhere=elsewhere))
+            os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+    def _correct_metadata(self, recordings: Collection[Path]) -> Iterator[str]:
+        """Corrects each recording's metadata.yaml by what is left; yields a line for each."""
+        for recording in sorted(recordings):
+            name = f"{self._name(recording)}/{METADATA_FILE}"
+            if not (recording / METADATA_FILE).exists():
+                if recording.name in read_heartbeat(self._bag_dir).recordings:
+                    yield f"{name} will count what was deleted: its recorder writes it at the end"
+                continue
+            try:
+                with directories.opened(self._bag_dir, recording):
+                    if correct(recording, self._reader):
+                        yield f"{name} counts what is left"
+            except (BagError, OSError, ValueError) as error:
+                yield (
+                    f"{name} still counts what was deleted ({error}); `ros2 bag reindex "
+                    f"{recording}` writes it anew"
+                )
+
+    def _remove_leftover(self, path: Path) -> None:
+        """Deletes what an interrupted erasure left beside a bag.
+
+        Raises:
+            OSError: it cannot be deleted.
+        """
+        with (
+            suppress(FileNotFoundError, NotADirectoryError),
+            directories.opened(self._bag_dir, path.parent) as folder,
+        ):
+            os.unlink(repair_name(path.name), dir_fd=folder)
+
+    def _name(self, path: Path) -> str:
+        return os.path.relpath(path, self._bag_dir)
+
+
+def _may_take(erasure: Erasure, summary: BagSummary, topic: str) -> bool:
+    """Returns whether a file may hold messages of a topic that go."""
+    return any(
+        topic in erasure.latched or (start <= each.last and each.first < stop)
+        for each in summary.of(topic)
+        for start, stop in erasure.windows
+    )
+
+
+def _replace(new: Path, path: Path, inode: Identity) -> None:
+    """Gives a file the name of another, which must still be the one that was read.
+
+    Raises:
+        OSError: it is not, or has gone.
+    """
+    status = path.lstat()
+    if (status.st_dev, status.st_ino) != inode:
+        raise OSError(f"{path.name} is not the file that was read")
+    new.replace(path)
+    flush(path.parent)
+
+
+def _without(listed: MessageList, file: str, ids: Ids) -> MessageList:
+    """Returns lists of a sidecar without messages of a file."""
+    topics = {
+        topic: tuple(each for each in known if each not in ids.get(topic, ()))
+        for topic, known in listed.get(file, {}).items()
+    }
+    left = {topic: known for topic, known in topics.items() if known}
+    others = {name: each for name, each in listed.items() if name != file}
+    return {**others, file: left} if left else others
+
+
+def _reason_of(error: Exception) -> str:
+    if isinstance(error, BagError):
+        return error.reason
+    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -1,0 +1,531 @@
+"""`ros2-memory forget --topic`, `--where`: some messages of bags go without a trace, others stay.
+
+What stays is read by plain rosbags, before and after; what goes is looked for in every byte of the
+bag directory, in decompressed chunks and in what the catalogue unpacks.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+from mcap.reader import NonSeekingReader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType
+from rosbags.rosbag2 import Reader
+
+from ros2_memory import cli
+from ros2_memory.bag_dir.erasure_file import read_erasure
+from ros2_memory.bag_dir.handover_file import message_id
+from ros2_memory.bag_dir.lock import BagDirLock
+from ros2_memory.bag_dir.lost_file import read_losses
+from ros2_memory.bag_dir.metadata_yaml import Contents, describing
+from ros2_memory.catalogue.packing import unpacked
+from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.cli import forget as cli_forget
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.retention import eraser
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    odom,
+    text,
+    tf,
+    transform,
+    write_db3,
+    write_mcap,
+)
+from tests.support.housekeepers import own_all
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+S = NS_PER_S
+T0 = 1_700_000_000 * S
+SAID = "open-the-bathroom-door"
+CAMERA, MIC = "/camera/front", "/mic"
+Capture = pytest.CaptureFixture[str]
+Stored = tuple[str, str, int, bytes]
+
+
+def messages(number: int) -> list[Msg]:
+    """Of a split of ten seconds: odometry, a camera and a microphone that say a secret each s."""
+    start = T0 + number * 10 * S
+    found: list[Msg] = []
+    if number == 0:
+        mount = transform(start, "base_link", "laser", (0.1, 0.0, 0.2))
+        found.append(tf(start, mount, topic="/tf_static"))
+    for n in range(10):
+        at = start + n * S
+        found += [odom(at, number + n / 10, 0.0), boolean(at + 5, n % 2 == 0)]
+        found += [text(at + 7, f"{SAID} {number} {n}", CAMERA), text(at + 9, f"hum {n}", MIC)]
+    return found
+
+
+def left(path: Path) -> Path:
+    """Nobody has written to the file for an hour."""
+    hour_ago = time.time() - 3600
+    os.utime(path, (hour_ago, hour_ago))
+    return path
+
+
+LAYOUTS = {
+    "zstd": McapLayout(chunk_size=2048, compression=CompressionType.ZSTD),
+    "lz4": McapLayout(chunk_size=2048, compression=CompressionType.LZ4),
+    "unchunked": McapLayout(chunk_size=None),
+}
+
+
+def recorded(bag_dir: Path, layout: McapLayout | None = None) -> list[Path]:
+    """One recording of three splits, with metadata.yaml."""
+    layout = layout or LAYOUTS["zstd"]
+    made = [
+        write_mcap(bag_dir / "rec_a" / f"rec_a_{n}.mcap", messages(n), layout) for n in range(3)
+    ]
+    reader = McapReader()
+    contents = {each.name: Contents(reader.summarize(each), reader.channels(each)) for each in made}
+    (bag_dir / "rec_a" / "metadata.yaml").write_text(describing("", contents))
+    return [left(each) for each in made]
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    bag_dir = tmp_path / "bags"
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    recorded(bag_dir)
+    own_all(bag_dir)
+    return bag_dir
+
+
+def forget(first: float, last: float, *more: str) -> int:
+    start, end = T0 / S + first, T0 / S + last
+    return cli.main(["forget", "--start", str(start), "--end", str(end), "--yes", *more])
+
+
+def stored(recording: Path) -> list[Stored]:
+    """Everything that plain rosbags reads of a recording."""
+    with Reader(recording) as reader:
+        return [
+            (connection.topic, connection.msgtype, at, bytes(data))
+            for connection, at, data in reader.messages()
+        ]
+
+
+def whole(bag: Path) -> list[tuple[object, ...]]:
+    """Everything that plain mcap reads of each message of a file, in file order."""
+    with bag.open("rb") as stream:
+        return [
+            (
+                *(schema.name, schema.encoding, schema.data),
+                *(channel.topic, channel.message_encoding, sorted(channel.metadata.items())),
+                *(message.sequence, message.log_time, message.publish_time, message.data),
+            )
+            for schema, channel, message in NonSeekingReader(stream).iter_messages(
+                log_time_order=False
+            )
+            if schema is not None
+        ]
+
+
+def traces(root: Path, needle: str) -> list[str]:
+    """Where a text is below a directory: in bytes of files, in chunks, in what is packed."""
+    found: list[str] = []
+    for path in (each for each in root.rglob("*") if each.is_file()):
+        parts = [path.read_bytes()]
+        if path.suffix in {".mcap", ".repair"} and parts[0].startswith(b"\x89MCAP"):
+            with path.open("rb") as stream:
+                for record in StreamReader(stream, emit_chunks=True).records:
+                    if isinstance(record, Chunk):
+                        inner = breakup_chunk(record)
+                        parts += [getattr(each, "data", b"") for each in inner]
+        if path.name == FILE:
+            parts += packed_in(path)
+        if any(needle.encode() in part for part in parts):
+            found.append(str(path.relative_to(root)))
+    return found
+
+
+def packed_in(catalogue: Path) -> Iterator[bytes]:
+    """All that a catalogue packs, unpacked."""
+    with closing(sqlite3.connect(catalogue)) as base:
+        for topic, kind, model in base.execute("SELECT * FROM models").fetchall():
+            yield bytes(model)
+            if kind in {"zones", "poses", "rests", "story"}:
+                table = "held" if kind in {"zones", "poses"} else "tales"
+                rows = base.execute(
+                    f"SELECT {kind} FROM {table} WHERE id >> 40 = ?",  # noqa: S608 - constants
+                    (topic,),
+                )
+                yield from (unpacked(each, model) for (each,) in rows if each)
+
+
+def indexed() -> None:
+    assert cli.main(["index"]) == 0
+
+
+def in_window(message: Stored, first: float, last: float, topics: tuple[str, ...]) -> bool:
+    return message[0] in topics and T0 + first * S <= message[2] <= T0 + last * S
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_is_not_forgotten_stays_to_the_byte(
+    tmp_path: Path, bag_dir: Path, layout: str
+) -> None:
+    splits = recorded(bag_dir, LAYOUTS[layout])
+    before = stored(bag_dir / "rec_a")
+    full = [whole(each) for each in splits]
+    untouched = splits[2].read_bytes()
+    assert forget(3.5, 15.5, "--topic", "/camera/*") == 0
+    expected = [each for each in before if not in_window(each, 3.5, 15.5, (CAMERA,))]
+    assert len(before) - len(expected) == 12
+    assert stored(bag_dir / "rec_a") == expected
+    bounds = (T0 + 3.5 * S, T0 + 15.5 * S)
+    for split, was in zip(splits, full, strict=True):
+        rest = [e for e in was if e[3] != CAMERA or not bounds[0] <= int(str(e[7])) <= bounds[1]]
+        assert whole(split) == rest
+    assert splits[2].read_bytes() == untouched
+
+
+def test_nothing_of_it_is_left_anywhere(
+    tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    indexed()
+    assert traces(tmp_path, SAID)
+    catalogue = bag_dir / FOLDER / FILE
+    # A query server has the catalogue open, so that its log lies beside it.
+    with closing(sqlite3.connect(catalogue)) as server:
+        server.execute("SELECT count(*) FROM bags").fetchone()
+        assert forget(0, 100, "--topic", CAMERA) == 0
+        assert traces(tmp_path, SAID) == []
+    indexed()
+    assert traces(tmp_path, SAID) == []
+    assert not [*bag_dir.rglob("*.repair"), *bag_dir.rglob("*.tmp")]
+
+
+def test_hard_links_in_moments_follow(tmp_path: Path, bag_dir: Path) -> None:
+    source = bag_dir / "rec_a" / "rec_a_1.mcap"
+    link = bag_dir / "moments" / "20260101T000000Z-dance" / "rec_a" / source.name
+    link.parent.mkdir(parents=True)
+    os.link(source, link)
+    assert forget(0, 100, "--topic", CAMERA) == 0
+    assert traces(tmp_path, SAID) == []
+    assert link.samefile(source)
+
+
+def test_a_hard_link_elsewhere_is_named(tmp_path: Path, bag_dir: Path, capsys: Capture) -> None:
+    os.link(bag_dir / "rec_a" / "rec_a_1.mcap", tmp_path / "copy.mcap")
+    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert "rec_a_1.mcap: all of it is still in 1 more hard link of it" in capsys.readouterr().out
+    assert traces(bag_dir, SAID) == []
+
+
+def test_counts_follow(bag_dir: Path) -> None:
+    assert forget(-0.5, 14.5, "--topic", CAMERA, "--topic", MIC) == 0
+    content = yaml.safe_load((bag_dir / "rec_a" / "metadata.yaml").read_text())
+    info = content["rosbag2_bagfile_information"]
+    by_topic = {
+        each["topic_metadata"]["name"]: each["message_count"]
+        for each in info["topics_with_message_count"]
+    }
+    assert by_topic[CAMERA] == by_topic[MIC] == 30 - 15
+    assert [each["message_count"] for each in info["files"]] == [21, 30, 40]
+    assert info["message_count"] == sum(by_topic.values()) == 91
+
+
+def test_sidecars_follow(bag_dir: Path) -> None:
+    going, staying = messages(1)[2], messages(1)[0]
+    assert going.topic == CAMERA
+    ids = {each.topic: [message_id(each.published, each.payload)] for each in (going, staying)}
+    sidecar = bag_dir / "rec_a" / "handover.json"
+    listed = {"rec_a_1.mcap": ids, "rec_a_2.mcap": {CAMERA: ids[CAMERA]}}
+    sidecar.write_text(json.dumps({"format": 1, "state": "counts", "counts_elsewhere": listed}))
+    left(sidecar)
+    written = sidecar.stat().st_mtime_ns
+    assert forget(9.5, 15, "--topic", CAMERA) == 0
+    told = json.loads(sidecar.read_text())["counts_elsewhere"]
+    assert told == {
+        "rec_a_1.mcap": {staying.topic: ids[staying.topic]},
+        "rec_a_2.mcap": {CAMERA: ids[CAMERA]},
+    }
+    assert sidecar.stat().st_mtime_ns == written
+
+
+def test_answers_say_that_messages_were_deleted(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(2.5, 4.5, "--topic", CAMERA) == 0
+    losses = read_losses(bag_dir, MIN_NS, MAX_NS)
+    assert [(each.topic, each.lost, each.by) for each in losses] == [(CAMERA, 2, "forgotten")]
+    capsys.readouterr()
+    cli.main(
+        [
+            "ask",
+            "get_topic_in_range",
+            f"topic={CAMERA}",
+            f"start={T0 / S}",
+            f"end={T0 / S + 8}",
+            "--json",
+        ]
+    )
+    assert f"2 messages deleted by request: {CAMERA} (2)" in capsys.readouterr().out
+
+
+class TestLatched:
+    @pytest.fixture
+    def carried(self, bag_dir: Path) -> Path:
+        assert forget(-1, 9.9) == 0
+        path = bag_dir / "latched" / "carried.mcap"
+        assert path.exists()
+        return path
+
+    def test_carried_messages_follow_where_their_topic_is_named(
+        self, bag_dir: Path, carried: Path
+    ) -> None:
+        assert forget(-1, 100, "--topic", "/tf_static") == 0
+        assert not carried.exists()
+        assert traces(bag_dir, "laser") == []
+
+    def test_beside_a_recorder_they_stay_and_are_named(
+        self, bag_dir: Path, carried: Path, capsys: Capture
+    ) -> None:
+        lock = BagDirLock.acquire(bag_dir, patience_s=0.0)
+        try:
+            assert forget(-1, 100, "--topic", "/tf_static") == 1
+        finally:
+            lock.release()
+        assert "stays: /tf_static: latched messages, which the recorder" in capsys.readouterr().out
+        assert carried.exists()
+
+
+def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> None:
+    again = tf(
+        T0,
+        transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)),
+        topic="/tf_static",
+        log_time=T0 + 50 * S,
+    )
+    again = Msg(again.topic, again.type, again.log_time, again.body, publish_time=T0)
+    left(write_mcap(bag_dir / "rec_b" / "rec_b_0.mcap", [again, odom(T0 + 51 * S, 0.0, 0.0)]))
+    own_all(bag_dir)
+    assert forget(-1, 5, "--topic", "/tf_static") == 0
+    assert traces(bag_dir, "laser") == []
+
+
+def test_a_dry_run_changes_nothing(bag_dir: Path, capsys: Capture) -> None:
+    before = {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")}
+    assert forget(0, 100, "--topic", CAMERA, "--dry-run") == 0
+    assert "would be deleted: 30 messages of 1 topic" in capsys.readouterr().out
+    assert {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")} == before
+
+
+def test_foreign_bags_stay_and_are_named(bag_dir: Path, capsys: Capture) -> None:
+    foreign = left(write_mcap(bag_dir / "theirs" / "theirs_0.mcap", messages(0)))
+    before = foreign.read_bytes()
+    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert "stays: theirs/theirs_0.mcap: this recorder did not make it" in capsys.readouterr().out
+    assert foreign.read_bytes() == before
+
+
+def test_a_topic_that_nobody_recorded_is_an_error(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(0, 100, "--topic", "/camra/*") == 2
+    assert "no recorded topic is named /camra/*" in capsys.readouterr().err
+
+
+def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Capture) -> None:
+    path = bag_dir / "rec_a" / "rec_a_1.mcap"
+    data = bytearray(path.read_bytes())
+    middle = data.index(b"zstd") + 200
+    data[middle : middle + 40] = bytes(40)
+    path.write_bytes(data)
+    left(path)
+    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert "stays: rec_a/rec_a_1.mcap: " in capsys.readouterr().out
+    assert path.read_bytes() == data
+
+
+def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
+    path = left(write_db3(bag_dir / "rec_s" / "rec_s_0.db3", messages(0)))
+    own_all(bag_dir)
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("INSERT INTO metadata VALUES (1, 9, ?)", (EMBEDDED,))
+        base.commit()
+        every = "SELECT * FROM messages ORDER BY id"
+        before = base.execute(every).fetchall()
+    left(path)
+    assert forget(3.5, 100, "--topic", CAMERA, "storage=rosbag2") == 0
+    with closing(sqlite3.connect(path)) as base:
+        (number,) = base.execute("SELECT id FROM topics WHERE name = ?", (CAMERA,)).fetchone()
+        rest = [each for each in before if each[1] != number or each[2] < T0 + 3.5 * S]
+        assert base.execute(every).fetchall() == rest
+        told = yaml.safe_load(base.execute("SELECT metadata FROM metadata").fetchone()[0])
+    assert told["message_count"] == told["files"][0]["message_count"] == 41 - 6
+    assert f"{SAID} 0 4".encode() not in path.read_bytes()
+    assert f"{SAID} 0 3".encode() in path.read_bytes()
+
+
+EMBEDDED = yaml.safe_dump(
+    {
+        "version": 9,
+        "message_count": 41,
+        "topics_with_message_count": [
+            {"topic_metadata": {"name": CAMERA}, "message_count": 10},
+            {"topic_metadata": {"name": "/odom"}, "message_count": 10},
+        ],
+        "files": [{"path": "rec_s_0.db3", "message_count": 41}],
+        "custom_data": {"recorded_by": "ros2-memory"},
+    },
+    sort_keys=False,
+)
+
+
+class TestPlaces:
+    """The robot drives along X at 1 m/s in the first split; the bathroom is from 3 m to 5 m."""
+
+    @pytest.fixture
+    def home(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        home = tmp_path / "home"
+        start = T0
+        found: list[Msg] = []
+        for n in range(100):
+            at = start + n * S // 10
+            found += [odom(at, n / 10, 0.0), text(at + 7, f"{SAID} {n:02}", CAMERA)]
+        found.insert(
+            0, tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static")
+        )
+        left(write_mcap(home / "rec_h" / "rec_h_0.mcap", found))
+        own_all(home)
+        places = tmp_path / "places.yaml"
+        places.write_text("places:\n  bathroom: {frame: odom, x: [3.0, 5.0], y: [-1.0, 1.0]}\n")
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(home))
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        self.places = f"data.places_file={places}"
+        return home
+
+    def test_the_time_in_it_goes_with_a_second_on_either_side(
+        self, home: Path, capsys: Capture
+    ) -> None:
+        indexed()
+        assert forget(0, 100, "--where", "bathroom", self.places) == 0
+        assert "latched messages stay" in capsys.readouterr().out
+        bag = home / "rec_h" / "rec_h_0.mcap"
+        times = {}  # type: dict[str, set[int]]
+        for each in whole(bag):
+            times.setdefault(str(each[3]), set()).add((int(str(each[7])) - T0) // 10**8)
+        outside = {n for n in range(100) if not 20 <= n <= 60}
+        # The track knows to a few centimetres where the robot was, and the robot drives 1 m/s.
+        for topic in ("/odom", CAMERA):
+            assert times[topic] <= outside | {20, 21, 59, 60}
+            assert times[topic] >= outside - {19, 61}
+        assert times["/tf_static"] == {0}
+        assert traces(home, f"{SAID} 40") == []
+        assert traces(home, f"{SAID} 70")
+
+    def test_a_topic_alone(self, home: Path) -> None:
+        assert forget(0, 100, "--where", "Bathroom", "--topic", CAMERA, self.places) == 0
+        topics = [each[3] for each in whole(home / "rec_h" / "rec_h_0.mcap")]
+        assert topics.count("/odom") == 100
+        assert topics.count(CAMERA) < 65
+
+    def test_a_place_that_is_not_named_is_an_error(self, home: Path, capsys: Capture) -> None:
+        assert forget(0, 100, "--where", "cellar", self.places) == 2
+        assert "cellar" in capsys.readouterr().err
+
+
+class TestInterruption:
+    """The power goes between any two steps that change a file."""
+
+    def test_whatever_was_done_the_next_one_finishes_it_and_says_so(
+        self,
+        tmp_path: Path,
+        bag_dir: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: Capture,
+    ) -> None:
+        source = bag_dir / "rec_a" / "rec_a_1.mcap"
+        link = bag_dir / "moments" / "20260101T000000Z-dance" / "rec_a" / source.name
+        link.parent.mkdir(parents=True)
+        os.link(source, link)
+        indexed()
+        others = [each for each in stored(bag_dir / "rec_a") if each[0] != CAMERA]
+        image = tmp_path / "image"
+        save(bag_dir, image)
+        for steps in itertools.count():
+            restore(image, bag_dir)
+            own_all(bag_dir)
+            with monkeypatch.context() as patch:
+                cut_off_after(patch, steps)
+                try:
+                    forget(0, 100, "--topic", CAMERA)
+                except PowerCutError:
+                    finished = False
+                else:
+                    finished = True
+            begun = read_erasure(bag_dir)
+            if not finished and begun is None:
+                # Nothing was begun, or everything was done.
+                assert len(traces(bag_dir, SAID)) in {0, len(traces(image, SAID))}, steps
+            capsys.readouterr()
+            if steps == 1:
+                assert cli.main(["doctor"]) > 0
+                assert "was interrupted" in capsys.readouterr().out
+            assert forget(500, 501, "--topic", MIC) == 0
+            if begun is not None:
+                assert "an earlier forget was interrupted" in capsys.readouterr().out
+                assert traces(bag_dir, SAID) == [], steps
+                assert stored(bag_dir / "rec_a") == others
+                assert read_erasure(bag_dir) is None
+            if finished:
+                break
+        assert steps > 8
+
+
+class PowerCutError(BaseException):
+    """Ends the program between two steps."""
+
+
+def save(bag_dir: Path, image: Path) -> None:
+    """Copies what recordings and moments hold, hard links as such."""
+    subprocess.run(["cp", "-a", bag_dir, image], check=True)
+
+
+def restore(image: Path, bag_dir: Path) -> None:
+    shutil.rmtree(bag_dir)
+    subprocess.run(["cp", "-a", image, bag_dir], check=True)
+
+
+def cut_off_after(patch: pytest.MonkeyPatch, steps: int) -> None:
+    """Lets so many files be replaced, removed or flushed."""
+    done = itertools.count()
+
+    def counting(real: Callable[..., object]) -> Callable[..., object]:
+        def step(*arguments: object, **named: object) -> object:
+            if next(done) >= steps:
+                raise PowerCutError
+            return real(*arguments, **named)
+
+        return step
+
+    for place, name in (
+        (Path, "replace"),
+        (os, "link"),
+        (eraser, "flush"),
+        (eraser, "correct"),
+        (eraser, "append_losses"),
+        (eraser, "remove_erasure"),
+        (cli_forget, "purge"),
+    ):
+        patch.setattr(place, name, counting(getattr(place, name)))
