@@ -58,7 +58,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
-from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import open_view
 from ros2_memory.index.snapshot import Snapshot
@@ -163,8 +163,10 @@ class _Taking:
         self._dry_run = dry_run
         self._bag_dir = settings.recording.bag_dir
         snapshot = memory.index.snapshot()
-        written = {aside.path for aside in snapshot.active}
-        written |= {bag.path for bag in snapshot.bags if bag.state is BagState.ACTIVE}
+        written = {aside.path: snapshot.unread_spans[aside] for aside in snapshot.active}
+        for bag in snapshot.bags:
+            if bag.state is BagState.ACTIVE:
+                written[bag.path] = TimeWindow(bag.start, MAX_NS)
         own = supposed_own(self._bag_dir) if settings.retention.foreign == "keep" else None
         self._carrier = Carrier(
             self._bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics

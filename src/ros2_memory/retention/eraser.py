@@ -14,7 +14,8 @@ from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.erasure_file import Erased, Erasure, remove_erasure, write_erasure
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader, BagWriter
 
+NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
 Identity = tuple[int, int]
 Ids = dict[str, set[str]]
 
@@ -100,7 +102,7 @@ class Eraser:
         reader: reads files as they are, also what does not count in answers.
         writer: writes them anew.
         own: the recordings that may be changed; None: all.
-        written: files that are still being written.
+        written: files that are still being written, and what they may hold; None: unknown.
         recorder: why a recorder holds the directory; None where none does, nor can begin to.
     """
 
@@ -111,14 +113,14 @@ class Eraser:
         writer: BagWriter,
         own: OwnRecordings | None,
         *,
-        written: Collection[Path] = (),
+        written: Mapping[Path, TimeWindow | None] = NOTHING_WRITTEN,
         recorder: str | None = None,
     ) -> None:
         self._bag_dir = bag_dir
         self._reader = reader
         self._writer = writer
         self._own = own
-        self._written = frozenset(written)
+        self._written = written
         self._recorder = recorder
         self._carried = bag_dir / CARRY_FOLDER / CARRY_FILE
 
@@ -137,10 +139,10 @@ class Eraser:
         for inode, paths in sorted(self._files().items(), key=lambda each: each[1]):
             try:
                 found = self._look_into(erasure, paths, inode)
-            except BagError as error:
+            except (BagError, OSError) as error:
                 if not any(map(self._may_change, paths)):
                     continue
-                found = f"what it holds is not known: {error.reason}"
+                found = f"what it holds is not known: {_reason_of(error)}"
             if isinstance(found, str):
                 kept.append(f"{self._name(paths[0])}: {found}")
             elif found is not None:
@@ -156,19 +158,20 @@ class Eraser:
 
         Raises:
             BagError: it cannot be read.
+            OSError: it has gone.
         """
         if not self._reader.reads(paths[0]):
             return "storage=rosbag2 reads it, which is not configured"
-        if self._written.intersection(paths):
-            with suppress(BagError):
-                summary = self._reader.summarize(paths[0])
-                if not summary.empty and summary.start >= erasure.windows[-1][1]:
-                    return None
+        if paths[0] in self._written:
+            span = self._written[paths[0]]
+            if span is not None and span.start >= erasure.windows[-1][1]:
+                return None
             return "it is being written; forget again when it is closed"
-        summary = self._reader.summarize(paths[0])
-        if not any(_may_take(erasure, summary, each) for each in erasure.topics):
+        if not paths[0].lstat().st_size:
             return None
-        holder = self._holder(erasure, paths, inode)
+        summary = self._reader.summarize(paths[0])
+        topics = [each for each in erasure.topics if _may_take(erasure, summary, each)]
+        holder = self._holder(erasure, topics, paths, inode)
         if not holder.counts:
             return None
         return self._reason_to_keep(paths, inode, summary) or holder
@@ -229,7 +232,7 @@ class Eraser:
                 if bag_kind(entry.name) and not entry.is_symlink():
                     with suppress(OSError):
                         status = entry.stat(follow_symlinks=False)
-                        if stat.S_ISREG(status.st_mode) and status.st_size:
+                        if stat.S_ISREG(status.st_mode):
                             found[status.st_dev, status.st_ino].append(Path(folder, entry.name))
         for paths in found.values():
             paths.sort(key=lambda path: (is_kept_apart(self._name(path)), path))
@@ -263,10 +266,12 @@ class Eraser:
         name = self._own.name_of(path.parent)
         return is_kept_apart(name) or self._own.owns(path.parent)
 
-    def _holder(self, erasure: Erasure, paths: Sequence[Path], inode: Identity) -> Holder:
+    def _holder(
+        self, erasure: Erasure, topics: Sequence[str], paths: Sequence[Path], inode: Identity
+    ) -> Holder:
         """Reads which messages of a file go."""
         holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
-        for topic in erasure.topics:
+        for topic in topics:
             first, last = erasure.windows[0][0], erasure.windows[-1][1]
             span = (
                 TimeWindow(MIN_NS, MAX_NS) if topic in erasure.latched else TimeWindow(first, last)

@@ -339,6 +339,16 @@ def test_foreign_bags_stay_and_are_named(bag_dir: Path, capsys: Capture) -> None
     assert foreign.read_bytes() == before
 
 
+@pytest.mark.parametrize("size", [None, 0])
+def test_what_is_being_written_is_named(bag_dir: Path, capsys: Capture, size: int | None) -> None:
+    active = bag_dir / "rec_a" / "rec_a_3.mcap"
+    write_mcap(active, messages(3), McapLayout(finish=False))
+    if size is not None:
+        os.truncate(active, size)
+    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert "stays: rec_a/rec_a_3.mcap: it is being written" in capsys.readouterr().out
+
+
 def test_a_topic_that_nobody_recorded_is_an_error(bag_dir: Path, capsys: Capture) -> None:
     assert forget(0, 100, "--topic", "/camra/*") == 2
     assert "no recorded topic is named /camra/*" in capsys.readouterr().err
