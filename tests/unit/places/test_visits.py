@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import random
 from dataclasses import replace
 from itertools import pairwise
@@ -31,7 +32,7 @@ from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import asked, memory_of, recalling
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -414,3 +415,22 @@ def test_of_poses_of_which_none_can_be_decoded_it_is_reported_that(tmp_path: Pat
     way = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
     with pytest.raises(UndecodableError, match="does not fit"):
         visits(remembering(tmp_path, way), Call(), 0.0, 0.0)
+
+
+def test_a_bag_left_open_is_named_only_where_its_time_is_asked_for(tmp_path: Path) -> None:
+    for nth in range(2):
+        begin = 1_784_000_000 + 1000 * nth
+        messages = [odom((begin + at) * 10**9, 0.0, 0.0) for at in range(20)]
+        write_mcap(tmp_path / f"rec_{nth}" / f"rec_{nth}_0.mcap", messages)
+    cut = tmp_path / "rec_0" / "rec_0_0.mcap"
+    cut.write_bytes(cut.read_bytes()[:-60])
+    os.utime(cut, (1_784_000_020, 1_784_000_020))
+    memory = memory_of(tmp_path)
+
+    def is_named(start: float) -> bool:
+        around = {"start": start, "end": start + 20.0}
+        reply = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0, **around)
+        return any("left open by a crash" in note for note in reply.get("notes", []))
+
+    assert is_named(1_784_000_000.0)
+    assert not is_named(1_784_001_000.0)
