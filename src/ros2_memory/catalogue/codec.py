@@ -1,8 +1,8 @@
-"""Encodes digests as the bytes and texts in the catalogue. Exact: floats stay bit by bit.
+"""Encodes digests as the bytes and texts in the catalogue.
 
-JSON, and packed numbers (little-endian) where there are many; times count from the first message,
-so that what happened likewise in two bags is equal, and `packing` stores it once. The layouts
-belong to the catalogue's schema version.
+Exact: floats stay bit by bit, but for boxes, which grow. JSON, and packed numbers (little-endian)
+where there are many; times count from the first message, so that what happened likewise in two bags
+is equal, and `packing` stores it once. The layouts belong to the catalogue's schema version.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ import struct
 from dataclasses import fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from ros2_memory.analysis.intervals import IntervalTable, moved_rows
 from ros2_memory.analysis.motion.odometry import (
@@ -34,9 +36,12 @@ from ros2_memory.analysis.state_changes import (
 )
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
 from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
+from ros2_memory.catalogue.field_columns import outward
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.analysis.motion.odometry import Vertex
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import JsonValue, Vector3
@@ -44,7 +49,8 @@ if TYPE_CHECKING:
 _VERTEX: Final = struct.Struct("<qdddd")
 _EVENTS: Final = struct.Struct("<qqqqqI")
 _ZONES: Final = struct.Struct("<Bdd")
-_BOUNDS: Final = struct.Struct("<6d")
+_BOUNDS: Final = struct.Struct("<6f")
+_SIDES: Final = (-math.inf, math.inf) * 3
 _OPEN, _TEXTS, _FALSE, _TRUE, _WORDS, _BOX = 1, 2, 4, 8, 16, 32
 
 
@@ -125,7 +131,7 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
 
 
 def encode_zone_map(zones: ZoneMap) -> bytes:
-    """Encodes a zone map."""
+    """Encodes a zone map, the bounds of its box as float32, rounded outwards."""
     flags = (
         zones.open * _OPEN
         | zones.texts * _TEXTS
@@ -138,7 +144,7 @@ def encode_zone_map(zones: ZoneMap) -> bytes:
     return b"".join(
         (
             _ZONES.pack(flags, zones.low, zones.high),
-            b"" if zones.box is None else _BOUNDS.pack(*zones.box),
+            b"" if zones.box is None else _BOUNDS.pack(*map(outward, zones.box, _SIDES)),
             numbers.encode(),
             b"\n",
             (zones.words or "").encode("utf-8", "surrogatepass"),
@@ -348,3 +354,37 @@ def decode_schema(text: str) -> SummarySchema:
         for topic, type_name, encoding, latched in topics
     )
     return shared_schema(tuple(headers), tuple(silent), bool(complete), tuple(notes), int(set_back))
+
+
+def encode_counts(numbers: bytes) -> bytes:
+    """Encodes count, first and last of each topic: the earliest time, then all relative to it.
+
+    Of `last`, how much later than `first` it is.
+    """
+    table = np.frombuffer(numbers, "<i8").reshape(-1, 3).copy()
+    if not table.size:
+        return b""
+    start = table[:, 1].min()
+    table[:, 2] -= table[:, 1]
+    table[:, 1] -= start
+    return b"".join((start.tobytes(), table.tobytes()))
+
+
+def decode_counts(
+    encoded: Sequence[bytes], topics: int
+) -> np.ndarray[tuple[int, int, int], np.dtype[np.int64]]:
+    """Decodes count, first and last of each of so many topics, for each bag.
+
+    Raises:
+        ValueError: some are not those of so many topics.
+    """
+    size = 8 * (1 + 3 * topics) if topics else 0
+    if any(len(each) != size for each in encoded):
+        raise ValueError(f"not the numbers of bags that hold {topics} topics")
+    if not size:
+        return np.zeros((len(encoded), 0, 3), np.int64)
+    rows = np.frombuffer(b"".join(encoded), "<i8").reshape(len(encoded), -1)
+    table = rows[:, 1:].reshape(len(encoded), topics, 3).copy()
+    table[:, :, 1] += rows[:, :1]
+    table[:, :, 2] += table[:, :, 1]
+    return table

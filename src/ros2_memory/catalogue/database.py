@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-VERSION: Final = 7
+VERSION: Final = 8
 """Version of the tables below and of their content; a file of any other version is set aside."""
 
 BUSY_S: Final = 1.0
@@ -44,23 +44,23 @@ _SUFFIXES: Final = ("-wal", "-shm")
 _FIRST_ROWS: Final = """
 SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
   (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes),
-  (SELECT 1 FROM maps), (SELECT 1 FROM ranges), (SELECT 1 FROM fields), (SELECT 1 FROM models)
+  (SELECT 1 FROM maps), (SELECT 1 FROM fields), (SELECT 1 FROM models),
+  (SELECT 1 FROM configs)
 """
 _TABLES: Final = """
-CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
-  size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
+CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config INTEGER NOT NULL,
+  path TEXT NOT NULL, size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
   shape INTEGER NOT NULL, counts BLOB NOT NULL, UNIQUE (config, path));
+CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
 CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
-  kept INTEGER, undecodable TEXT, zones BLOB, poses BLOB);
+  kept INTEGER, undecodable TEXT, fields INTEGER, ranges BLOB, zones BLOB, poses BLOB);
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB, story BLOB);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
 CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
   sights BLOB NOT NULL);
-CREATE TABLE ranges (topic INTEGER NOT NULL, bag INTEGER NOT NULL, fields INTEGER NOT NULL,
-  numbers BLOB NOT NULL, PRIMARY KEY (topic, bag)) WITHOUT ROWID;
 CREATE TABLE fields (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,

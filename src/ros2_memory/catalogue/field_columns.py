@@ -89,15 +89,16 @@ def _kind(found: FieldRange) -> str:
 def _packed(found: FieldRange, kind: str) -> bytes:
     layout = _LAYOUTS[kind]
     values = {
-        "low": found.low if kind == _CONSTANT else _outward(found.low, -np.inf),
-        "high": _outward(found.high, np.inf),
+        "low": found.low if kind == _CONSTANT else outward(found.low, -np.inf),
+        "high": outward(found.high, np.inf),
         "total": found.total,
         "count": found.size or 0,
     }
     return np.array([tuple(values[name] for name in layout.names or ())], layout).tobytes()
 
 
-def _outward(number: float, towards: float) -> np.float32:
+def outward(number: float, towards: float) -> np.float32:
+    """Returns a float32 near a number that lies no less towards an infinity."""
     with np.errstate(over="ignore"):
         near = np.float32(number)
     beyond = float(near) > number if towards < 0 else float(near) < number

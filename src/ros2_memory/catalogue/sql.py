@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.topic_events import TopicEvents
 from ros2_memory.catalogue.codec import (
+    encode_counts,
     encode_poses,
     encode_schema,
     encode_standstills,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 NO_TOPIC: Final = 0
 """Stands for the topic of models of what belongs to no topic."""
+OWN_CONFIG: Final = "(SELECT id FROM configs WHERE text = ?)"
 _TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 
@@ -48,13 +50,18 @@ UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 TRACK: Final = "track"
 SIGHTS: Final = "sights"
 
+RANGES: Final = "ranges"
+COUNTS: Final = "counts"
+"""Its models have the number of a shape as their topic."""
+
 
 def entry_rows(
     connection: sqlite3.Connection, config: str, paths: Sequence[str]
 ) -> list[sqlite3.Row]:
     """Returns row id, path, size, mtime and sidecar's mtime of the entries of these files."""
     return connection.execute(
-        f"SELECT id, path, size, mtime, sidecar FROM bags WHERE config = ? AND path {_AMONG}",
+        f"SELECT id, path, size, mtime, sidecar FROM bags"
+        f" WHERE config = {OWN_CONFIG} AND path {_AMONG}",
         (config, json.dumps(paths)),
     ).fetchall()
 
@@ -121,10 +128,7 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
                 f"DELETE FROM {table} WHERE id IN (SELECT value + ? FROM json_each(?))",
                 (topic << ROW_ID_BITS, listed),
             )
-        for table in ("ranges", "kept"):
-            connection.execute(
-                f"DELETE FROM {table} WHERE topic = ? AND bag {_AMONG}", (topic, listed)
-            )
+        connection.execute(f"DELETE FROM kept WHERE topic = ? AND bag {_AMONG}", (topic, listed))
     connection.execute(f"DELETE FROM maps WHERE bag {_AMONG}", (listed,))
     connection.execute(f"DELETE FROM bags WHERE id {_AMONG}", (listed,))
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
@@ -135,10 +139,12 @@ def insert_entry(
 ) -> None:
     """Inserts an entry; `key` is path, size, mtime and sidecar's mtime."""
     schema = _id_of(connection, "shapes", "text", encode_schema(digest.summary.schema))
+    counts = encode_counts(digest.summary.numbers)
+    own = _id_of(connection, "configs", "text", config)
     cursor = connection.execute(
         "INSERT INTO bags (config, path, size, mtime, sidecar, shape, counts)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (config, *key, schema, digest.summary.numbers),
+        (own, *key, schema, packed_by_model(connection, schema, COUNTS, counts)),
     )
     bag = int(cursor.lastrowid or 0)
     if digest.in_map is not None:
@@ -147,7 +153,6 @@ def insert_entry(
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
         _insert_events(connection, (number, bag), topic, digest.summary)
-        _insert_ranges(connection, (number, bag), topic)
         for nth, record in enumerate(topic.kept or ()):
             _insert_record(connection, (bag, number, nth), record)
 
@@ -178,7 +183,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
     edges, poses = topic.edges, topic.poses
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 8)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 10)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
@@ -186,6 +191,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
             None if edges is None else edges.last_stamp,
             topic.kept is not None,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
+            *_ranges(connection, number, topic),
             packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),
             poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
         ),
@@ -211,28 +217,28 @@ def _insert_events(
     )
 
 
-def _insert_ranges(
-    connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest
-) -> None:
-    """Inserts the ranges of the topic's fields; no row where it has no number."""
-    if topic.fields is None or topic.fields:
-        text, packed = encode_field_ranges(topic.fields)
-        fields = _id_of(connection, "fields", "text", text)
-        connection.execute("INSERT INTO ranges VALUES (?, ?, ?, ?)", (*key, fields, packed))
+def _ranges(
+    connection: sqlite3.Connection, number: int, topic: TopicDigest
+) -> tuple[int | None, bytes | None]:
+    """Returns the id of the topic's fields, and their ranges; None where it has no number."""
+    if topic.fields is not None and not topic.fields:
+        return None, None
+    text, ranges = encode_field_ranges(topic.fields)
+    fields = _id_of(connection, "fields", "text", text)
+    return fields, packed_by_model(connection, number, RANGES, ranges)
 
 
 def range_rows(
-    connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
+    connection: sqlite3.Connection, topic: int, row_ids: Sequence[int]
 ) -> list[sqlite3.Row]:
-    """Returns row id, text of the fields and numbers of the ranges of a topic in entries.
+    """Returns row id, text of the fields and packed numbers of a topic's ranges in entries.
 
     NULL for entries of bags in which it has no number; none for those that were deleted.
     """
     return connection.execute(
-        "SELECT bags.id, text, numbers FROM json_each(?) JOIN bags ON bags.id = value"
-        f" LEFT JOIN ranges ON topic = {_TOPIC} AND bag = bags.id"
-        " LEFT JOIN fields ON fields.id = ranges.fields",
-        (json.dumps(row_ids), topic),
+        "SELECT bags.id, text, ranges FROM json_each(?) JOIN bags ON bags.id = value"
+        " LEFT JOIN held ON held.id = ? + bags.id LEFT JOIN fields ON fields.id = held.fields",
+        (json.dumps(row_ids), topic << ROW_ID_BITS),
     ).fetchall()
 
 

@@ -14,10 +14,9 @@ import os
 import time
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
-import numpy as np
-
 from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.codec import (
+    decode_counts,
     decode_poses,
     decode_schema,
     decode_standstills,
@@ -29,9 +28,12 @@ from ros2_memory.catalogue.field_columns import field_column
 from ros2_memory.catalogue.map_digest import decode_map_track
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.sql import (
+    COUNTS,
     EDGES,
     NO_TOPIC,
+    OWN_CONFIG,
     POSES,
+    RANGES,
     SIGHTS,
     STANDSTILLS,
     STORY,
@@ -59,6 +61,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    import numpy as np
+
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
@@ -66,7 +70,6 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
-    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.timebase import Ns
 
 FOLDER: Final = ".episodic"
@@ -141,16 +144,20 @@ class Catalogue(CatalogueDatabase):
             found: dict[str, BagFile] = {}
             for number, text in connection.execute("SELECT id, text FROM shapes").fetchall():
                 schema = decode_schema(text)
+                model = model_of(connection, number, COUNTS)
                 cursor = connection.execute(
-                    "SELECT path, size, mtime, sidecar, counts FROM bags"
-                    " WHERE config = ? AND shape = ?",
+                    "SELECT path, size, mtime, sidecar, counts FROM bags"  # noqa: S608
+                    f" WHERE config = {OWN_CONFIG} AND shape = ?",
                     (self._config, number),
                 )
                 while rows := cursor.fetchmany(_BATCH):
-                    starts, ends = _time_spans(schema, [row[4] for row in rows])
-                    for row, start, end in zip(rows, starts, ends, strict=True):
-                        path, size, mtime, sidecar, counts = row
-                        summary = BagSummary.decoded(schema, counts)
+                    counts = decode_counts(
+                        [unpacked(row[4], model) for row in rows], len(schema.topics)
+                    )
+                    starts, ends = _time_spans(counts)
+                    for row, numbers, start, end in zip(rows, counts, starts, ends, strict=True):
+                        path, size, mtime, sidecar, _ = row
+                        summary = BagSummary.decoded(schema, numbers.tobytes())
                         file = root + path
                         found[file] = BagFile(
                             file, size, mtime, BagState.CLOSED, summary, start, end, sidecar
@@ -163,7 +170,10 @@ class Catalogue(CatalogueDatabase):
         """Returns the files that have an entry, as paths below the bag directory."""
 
         def ask(connection: sqlite3.Connection) -> list[str]:
-            rows = connection.execute("SELECT path FROM bags WHERE config = ?", (self._config,))
+            rows = connection.execute(
+                f"SELECT path FROM bags WHERE config = {OWN_CONFIG}",  # noqa: S608
+                (self._config,),
+            )
             return [row[0] for row in rows]
 
         return self.read(ask, [])
@@ -215,8 +225,12 @@ class Catalogue(CatalogueDatabase):
 
         def ask(connection: sqlite3.Connection) -> FieldColumn:
             offset = self.offset
-            rows = range_rows(connection, topic, self.row_ids(numbers))
-            return field_column([(offset + row[0], row[1], row[2]) for row in rows], field)
+            of_topic = topic_number(connection, topic)
+            model = model_of(connection, of_topic, RANGES)
+            rows = range_rows(connection, of_topic, self.row_ids(numbers))
+            return field_column(
+                [(offset + row[0], row[1], unpacked(row[2] or b"", model)) for row in rows], field
+            )
 
         return self.read(ask, field_column([], field))
 
@@ -408,13 +422,16 @@ class Catalogue(CatalogueDatabase):
 
         def write(connection: sqlite3.Connection) -> None:
             latest = connection.execute(
-                "SELECT config FROM bags WHERE config <> ? ORDER BY id DESC LIMIT 1",
+                f"SELECT config FROM bags WHERE config IS NOT {OWN_CONFIG}"  # noqa: S608
+                " ORDER BY id DESC LIMIT 1",
                 (self._config,),
             ).fetchone()
             if latest is None:
                 return
             rows = connection.execute(
-                "SELECT id FROM bags WHERE config NOT IN (?, ?)", (self._config, latest[0])
+                f"SELECT id FROM bags WHERE config IS NOT {OWN_CONFIG}"  # noqa: S608
+                " AND config <> ?",
+                (self._config, latest[0]),
             )
             delete_entries(connection, [row[0] for row in rows.fetchall()])
 
@@ -430,21 +447,16 @@ def _kind_of(question: str) -> str:
     return f"answer {question.partition(' ')[0]}"
 
 
-def _time_spans(schema: SummarySchema, counts: Sequence[bytes]) -> tuple[list[Ns], list[Ns]]:
+def _time_spans(
+    counts: np.ndarray[tuple[int, int, int], np.dtype[np.int64]],
+) -> tuple[list[Ns], list[Ns]]:
     """Returns the log times of the first and last message of bags of one summary schema.
 
     0 for bags without a message.
-
-    Raises:
-        ValueError: the packed counts are of another schema.
     """
-    size = schema.numbers.size
-    if any(len(each) != size for each in counts):
-        raise ValueError(f"not the numbers of bags that hold {len(schema.topics)} topics")
-    if not size or not counts:
+    if not counts.size:
         return [0] * len(counts), [0] * len(counts)
-    numbers = np.frombuffer(b"".join(counts), "<i8").reshape(len(counts), -1, 3)
-    return numbers[:, :, 1].min(axis=1).tolist(), numbers[:, :, 2].max(axis=1).tolist()
+    return counts[:, :, 1].min(axis=1).tolist(), counts[:, :, 2].max(axis=1).tolist()
 
 
 def relative(path: str, bag_dir: str) -> str:

@@ -108,7 +108,7 @@ class View:
     def _overlap_census(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
         """Returns, by type, the messages stored in overlapping bags, and those that count."""
         bags = self.stream.overlapping_bags([topic], window)
-        question = json.dumps(["contest", topic, window.start, window.stop])
+        question = f"contest {topic} {window.start} {window.stop - window.start}"
         known = self.bags.cached_answer(question, bags, _decode_overlap)
         if known is not None:
             return known
