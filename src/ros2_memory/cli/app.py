@@ -116,6 +116,7 @@ app = typer.Typer(
     help="A robot's episodic memory: tools for people.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,
 )
 

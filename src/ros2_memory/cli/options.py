@@ -5,9 +5,11 @@ Typer reads annotations at run time, so modules with commands do without `annota
 """
 
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from datetime import datetime, time, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -30,6 +32,14 @@ EXIT_NEGATIVE: Final = 1
 EXIT_CANNOT_RUN: Final = 2
 """Exit code: it could not run, and stderr says why."""
 MB: Final = 1_000_000
+
+TIMES: Final = (
+    "Unix seconds (1795163910.5), ISO 8601 (2026-11-20T08:30), a time of day (14:05), "
+    "yesterday 14:05, or how long ago (90s, 10m, 2h, 3d)"
+)
+_AGO: Final = re.compile(r"(\d+(?:\.\d+)?) ?([smhd])(?: ago)?")
+_SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+_TIME_OF_DAY: Final = re.compile(r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d)?))?")
 
 _PIPE_WIDTH: Final = 160
 """Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
@@ -55,7 +65,7 @@ Verbose = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, for programs.")]
 Start = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help="From here on: Unix seconds, or ISO 8601 (local time)."),
+    typer.Option(metavar="TIME", help=f"From here on: {TIMES}; local time."),
 ]
 End = Annotated[str | None, typer.Option(metavar="TIME", help="Up to here, inclusive; likewise.")]
 Last = Annotated[
@@ -127,34 +137,40 @@ def parse_window(
     Raises:
         InvalidArgumentsError: the options contradict each other, or one is not a time.
     """
+    now = unix_from_ns(present(memory))
     if last is None:
-        first = unix_from_ns(MIN_NS) if start is None else parse_time(start)
-        return TimeWindow.from_unix(first, unix_from_ns(MAX_NS) if end is None else parse_time(end))
+        first = unix_from_ns(MIN_NS) if start is None else parse_time(start, now)
+        until = unix_from_ns(MAX_NS) if end is None else parse_time(end, now)
+        return TimeWindow.from_unix(first, until)
     if start is not None or end is not None:
         raise InvalidArgumentsError("give --last, or --start and --end, not both")
     if not last > 0:
         raise InvalidArgumentsError(f"--last is {last:g}; it must be more than 0 seconds")
-    now = unix_from_ns(present(memory))
     return TimeWindow.from_unix(now - last, now)
 
 
-def parse_time(text: str) -> float:
-    """Returns the Unix seconds of a time that is written so, or as ISO 8601.
+def parse_time(text: str, now: float) -> float:
+    """Returns the Unix seconds of a time as people write it; see `TIMES`.
+
+    Args:
+        text: the time.
+        now: what "ago", "today" and a time of day count from, in Unix seconds.
 
     Raises:
-        InvalidArgumentsError: the text is neither.
+        InvalidArgumentsError: the text is no time.
     """
-    try:
-        return float(text)
-    except ValueError:
-        pass
-    try:
+    words = text.strip().lower()
+    with suppress(ValueError):
+        return float(words)
+    if ago := _AGO.fullmatch(words):
+        return now - float(ago[1]) * _SECONDS_OF[ago[2]]
+    with suppress(ValueError, OverflowError, OSError):
+        if clock := _TIME_OF_DAY.fullmatch(words):
+            midnight = datetime.fromtimestamp(now).astimezone().date()
+            date = midnight - timedelta(days=clock[1] == "yesterday")
+            return datetime.combine(date, time.fromisoformat(clock[2] or "00:00")).timestamp()
         return unix_from_text(text)
-    except ValueError:
-        raise InvalidArgumentsError(
-            f"{text!r} is no time; write Unix seconds (1795163910.5) or ISO 8601 "
-            "(2026-11-20T08:30:00)"
-        ) from None
+    raise InvalidArgumentsError(f"{text!r} is no time; write {TIMES}")
 
 
 @contextmanager

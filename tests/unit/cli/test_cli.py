@@ -296,3 +296,9 @@ class TestTheProgram:
         assert escape("a\x07\u202eb ß") == "a\\x07\\u202eb ß"
         assert format_value([1.5, "x"]) == "1.5, x"
         assert format_value([]) == format_value(None) == "-"
+
+
+@pytest.mark.parametrize("words", [["-h"], ["info", "-h"], ["config", "show", "-h"]])
+def test_help_has_a_short_option(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 0
+    assert "Usage: ros2-memory" in capsys.readouterr().out

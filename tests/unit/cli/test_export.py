@@ -8,6 +8,7 @@ import shutil
 import sys
 import time
 from collections import Counter
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
 
 T0 = 1_700_000_000 * NS_PER_S
+NOW = datetime.fromisoformat("2023-11-14T20:00:00").timestamp()
 Capture = pytest.CaptureFixture[str]
 Row = tuple[str, int, bytes]
 
@@ -447,8 +449,28 @@ class TestWindows:
         assert cli.main(["export", *words]) == 2
         assert capsys.readouterr().err
 
-    def test_times_are_unix_seconds_or_iso(self) -> None:
-        assert parse_time("1700000000.5") == 1_700_000_000.5
-        assert parse_time("2023-11-14T22:13:20+00:00") == 1_700_000_000
-        with pytest.raises(InvalidArgumentsError):
-            parse_time("noon")
+    @pytest.mark.parametrize(
+        ("written", "expected"),
+        [
+            ("1700000000.5", 1_700_000_000.5),
+            ("2023-11-14T22:13:20+00:00", 1_700_000_000),
+            ("90s", NOW - 90),
+            ("10m ago", NOW - 600),
+            ("1.5 h", NOW - 5400),
+            ("2d", NOW - 172_800),
+            ("14:05", "2023-11-14T14:05:00"),
+            ("today 14:05:30", "2023-11-14T14:05:30"),
+            ("Yesterday 14:05", "2023-11-13T14:05:00"),
+            ("yesterday", "2023-11-13T00:00:00"),
+            ("2023-11-14 14:05", "2023-11-14T14:05:00"),
+        ],
+    )
+    def test_times_are_read_as_people_write_them(self, written: str, expected: float | str) -> None:
+        local = datetime.fromisoformat(expected) if isinstance(expected, str) else None
+        at = expected if local is None else local.timestamp()
+        assert parse_time(written, NOW) == at
+
+    @pytest.mark.parametrize("written", ["noon", "", "25:00", "10 weeks", "yesterday noon", "-5m"])
+    def test_what_is_no_time_is_refused_with_what_is(self, written: str) -> None:
+        with pytest.raises(InvalidArgumentsError, match="yesterday 14:05"):
+            parse_time(written, NOW)
