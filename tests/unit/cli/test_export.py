@@ -438,7 +438,7 @@ class TestWindows:
             ["--mcap", "a", "--parquet", "b"],
             ["--mcap", "a", "--last", "5", "--start", "1"],
             ["--mcap", "a", "--last", "0"],
-            ["--mcap", "a", "--start", "yesterday"],
+            ["--mcap", "a", "--start", "noon"],
             ["--mcap", "a", "--start", "2", "--end", "1"],
             ["--mcap", "a", "--topic", "/nothing"],
         ],

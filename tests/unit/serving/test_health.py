@@ -125,6 +125,7 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
         "silent_topics": ["/b"],
         "missing_topics": ["/c"],
         "last_error": None,
+        "waiting_for": None,
         "age_held": None,
     }
 
