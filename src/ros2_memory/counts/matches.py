@@ -21,7 +21,7 @@ from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
 from ros2_memory.counts.bins import BinnedWindow
-from ros2_memory.counts.segment_fold import SegmentFold
+from ros2_memory.counts.segment_fold import Digested, SegmentFold
 from ros2_memory.counts.time_bins import Held
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import condition_of
@@ -35,10 +35,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.topic_events import KnownFlag
+    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
-    from ros2_memory.counts.segment_fold import Digested, Folded
+    from ros2_memory.counts.segment_fold import Folded
+    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
     from ros2_memory.places.scope import WhileCondition
@@ -109,14 +111,18 @@ def _by_events(
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is None and (condition.field is not None or not isinstance(value, str)):
         return None, None
-    folded = _events(view, topic, binned.asked)
+    label = condition if wanted is None else None
+    folded = _events(view, topic, binned.asked, label)
     _note_limits(view, topic, folded)
     if wanted is not None:
         return _flag_held(folded, condition, _gaps_of(binned, topic), wanted=wanted), folded.since
     return _label_held(folded, condition), folded.since
 
 
-def _events(view: View, topic: str, window: TimeWindow) -> Folded[TopicEvents]:
+def _events(
+    view: View, topic: str, window: TimeWindow, label: Condition | None
+) -> Folded[TopicEvents]:
+    """Returns the events of a topic; of bags that cannot have a label perhaps not all others."""
     fold = SegmentFold(
         TOPIC_EVENTS,
         partial(collect_events, view),
@@ -124,8 +130,51 @@ def _events(view: View, topic: str, window: TimeWindow) -> Folded[TopicEvents]:
         name="events",
         leaves_out=lambda events: events is not None and events.left_out > 0,
         collect_all=partial(collect_events, view, at_most=None),
+        unread=None if label is None else _WithoutLabel(view, topic, label).of,
+        question="" if label is None else f"of {label}",
     )
     return fold.over(view, topic, window)
+
+
+class _WithoutLabel:
+    """Finds groups of bags that cannot have a label: other labels in them do not matter."""
+
+    def __init__(self, view: View, topic: str, condition: Condition) -> None:
+        self._view = view
+        self._topic = topic
+        self._condition = condition
+
+    def of(self, group: Group) -> Digested[TopicEvents | None] | None:
+        """Returns events of a group that cannot have the label: whatever is stored of its bags."""
+        if group.may_be_relatched:
+            return None
+        builder = TopicEventsBuilder()
+        for each in group.bags:
+            entry = self._view.bags.entry(each.bag)
+            if entry is None or entry[1] in self._may_have_it(entry[0]):
+                return None
+            digests, number = entry
+            stored = digests.catalogue.topic_events(self._topic, [number])
+            if number not in stored:
+                return None
+            events = stored[number]
+            if events is NO_EVENTS:
+                builder.join(TopicEvents(each.first, each.last))
+            elif events is not None:
+                builder.join(replace(events, left_out=0))
+        first = min(each.first for each in group.bags)
+        last = max(each.last for each in group.bags)
+        return Digested(builder.events() or NO_EVENTS, first, last)
+
+    def _may_have_it(self, digests: SegmentDigests) -> set[int]:
+        """Returns the entries of a segment that may have the label."""
+
+        def may_have() -> set[int]:
+            maps = digests.zone_maps(self._topic)
+            return {number for number, each in maps.items() if self._condition.can_match(each)}
+
+        name = f"bags that may have {self._condition} on {self._topic}"
+        return digests.derived(name, may_have)
 
 
 def _joined_events(found: Sequence[Digested[TopicEvents | None]]) -> TopicEvents:

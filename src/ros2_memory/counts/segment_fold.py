@@ -66,6 +66,9 @@ class SegmentFold(Generic[T, R]):
         failures: where `collect` puts messages that cannot be decoded.
         leaves_out: whether a digest lacks something, since there is too much of it.
         collect_all: makes one that lacks nothing, which is not stored.
+        unread: what serves this one question as well as the digest of a group that would be read,
+            with the times of its first and last message; None where nothing does.
+        question: the name of what is folded with `unread`.
     """
 
     kind: DigestKind[T]
@@ -77,6 +80,8 @@ class SegmentFold(Generic[T, R]):
     failures: Sequence[UndecodableError] = ()
     leaves_out: Callable[[T], bool] | None = None
     collect_all: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]] | None = None
+    unread: Callable[[Group], Digested[T] | None] | None = None
+    question: str = ""
 
     def over(self, view: View, topic: str, window: TimeWindow) -> Folded[R]:
         """Folds a window.
@@ -108,28 +113,32 @@ class SegmentFold(Generic[T, R]):
         """Returns what is folded of a share, and since when, if not all was read in time."""
         digests = view.bags.digests_of(share.segment)
         if digests is None or not (share.alone and window.covers(share.first, share.last)):
-            return self._fold(view, topic, share, window, reading)
+            return self._fold(view, topic, share, window, reading)[:2]
         inner = [edge for edge in self.edges if share.first < edge <= share.last]
         # The type of a name is one: `name` is part of it.
         name = f"{self.name} {topic} {inner} {share.begins_in} {share.ends_in}"
-        known: list[R | None] = digests.derived(name, list)
+        for_all: list[R | None] = digests.derived(name, list)
+        for_this = digests.derived(f"{name} {self.question}", list) if self.question else for_all
+        known = for_all or for_this
         if known:
             return known[0], None
         with _Completeness(view) as completeness:
-            folded, since = self._fold(view, topic, share, window, reading)
+            folded, since, left_unread = self._fold(view, topic, share, window, reading)
             if since is None and completeness.is_complete and not self.failures:
-                known.append(folded)
+                (for_this if left_unread else for_all).append(folded)
         return folded, since
 
     def _fold(
         self, view: View, topic: str, share: _Share, window: TimeWindow, reading: _Reading
-    ) -> tuple[R | None, Ns | None]:
+    ) -> tuple[R | None, Ns | None, bool]:
+        """Returns as `_share`, and whether groups were left unread for this question."""
         # Wide enough to see the bags before that a group may have begun with.
         begin = max(share.first - COPY_HORIZON_NS, MIN_NS)
         inside = window.intersect(TimeWindow(begin, share.last + 1))
         stored = StoredDigests(view, topic, self.kind, inside)
         found: list[Digested[T]] = []
         since: Ns | None = None
+        left_unread = False
         for group in reversed(groups_of(view.stream, topic, inside)):
             if view.snapshot.timeline.segment_of(group.bags[0].bag) is not share.segment:
                 continue
@@ -137,11 +146,16 @@ class SegmentFold(Generic[T, R]):
             if known is not None and not self._lacks(known[0]):
                 found.append(Digested(known[0], *known[1]))
                 continue
+            other = None if self.unread is None or not group.is_whole else self.unread(group)
+            if other is not None:
+                found.append(other)
+                left_unread = True
+                continue
             if reading.is_over:
                 since = max(each.last for each in group.bags) + 1
                 break
             found.extend(reversed([*self._made(view, group, stored)]))
-        return (self.reduce(found[::-1]) if found else None), since
+        return (self.reduce(found[::-1]) if found else None), since, left_unread
 
     def _made(self, view: View, group: Group, stored: StoredDigests[T]) -> Iterator[Digested[T]]:
         """Yields the digest of a group that is read; several where it is cut."""

@@ -283,3 +283,51 @@ def test_by_refuses_what_it_does_not_take_and_ignores_how_much_is_shown(
     assert "fields" in refused["detail"]
     shown = asked(memories[0], Path(), "find_matches", **question, limit=1, oldest_first=True)
     assert shown == asked(memories[0], Path(), "find_matches", **question)
+
+
+def test_bags_that_cannot_have_a_label_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(6):
+        # More labels than a digest holds, but for the bag with the cat.
+        seen = ["cat", "dog"] if number == 3 else [f"thing {each}" for each in range(70)]
+        begin = BEGIN + number * 60 * S
+        messages = [detections(begin + second * S, seen) for second in range(20)]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    plain = memory_of(tmp_path, limits=LATEST)
+    known = recalling(plain, tmp_path)
+    for label, times in (("cat", 1), ("elephant", 0), ("thing 7", 5)):
+        answer = count_matches(plain, Call(), OBJECTS, "contains", label, by="day")
+        assert whole(answer, "count") == times
+        if label.startswith("thing"):
+            assert count_matches(known, Call(), OBJECTS, "contains", label, by="day") == answer
+            continue
+        with monkeypatch.context() as patch:
+            patch.setattr(segment_fold, "READING_S", -1.0)
+            for _ in range(2):
+                assert count_matches(known, Call(), OBJECTS, "contains", label, by="day") == answer
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    labels=st.lists(st.sets(st.sampled_from(["cat", "cattle", "dog"])), min_size=2, max_size=8),
+    busy=st.integers(0, 255),
+    part=st.sampled_from([0.5, 1.0]),
+)
+def test_a_label_counts_the_same_where_bags_without_it_are_left_unread(
+    labels: list[set[str]], busy: int, part: float
+) -> None:
+    with TemporaryDirectory() as folder:
+        bags = Path(folder)
+        for number, some in enumerate(labels):
+            many = [f"thing {each}" for each in range(66)] if busy >> number & 1 else []
+            begin = BEGIN + number * 4 * S
+            messages = [detections(begin + at * S, [*sorted(some), *many]) for at in range(4)]
+            write_mcap(bags / f"rec_{number // 3}" / f"rec_{number}.mcap", messages)
+        plain = memory_of(bags, limits=LATEST)
+        known = recalling(plain, bags, part=part)
+        for label in ("cat", "dog", "thing 1", "rec"):
+            for by in ("day", "hour"):
+                answer = count_matches(plain, Call(), OBJECTS, "contains", label, by=by)
+                again = count_matches(known, Call(), OBJECTS, "contains", label, by=by)
+                assert again == answer
