@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import JsonValue, Vector3
 
-_VERTEX: Final = struct.Struct("<qdddd")
 _EVENTS: Final = struct.Struct("<qqqqqI")
 _ZONES: Final = struct.Struct("<Bdd")
 _BOUNDS: Final = struct.Struct("<6f")
@@ -57,15 +56,13 @@ _OPEN, _TEXTS, _FALSE, _TRUE, _WORDS, _BOX = 1, 2, 4, 8, 16, 32
 def encode_poses(poses: PoseDigest) -> bytes:
     """Encodes a digest of poses."""
     totals = [getattr(poses.totals, each.name) for each in fields(poses.totals)]
-    head = json.dumps(
-        [poses.poses, poses.invalid, totals, poses.twist, poses.frames, poses.error_m],
-        separators=(",", ":"),
-    )
-    vertices = b"".join(
-        _VERTEX.pack(time, *position, turn if isinstance(turn, float) else math.nan)
+    # Vertices in the same text: the first and the last pose of all are among them.
+    vertices = [
+        (time, *position, turn if isinstance(turn, float) else None)
         for time, position, turn in poses.vertices
-    )
-    return b"".join((head.encode(), b"\n", vertices))
+    ]
+    parts = [poses.poses, poses.invalid, totals, poses.twist, poses.frames, poses.error_m, vertices]
+    return json.dumps(parts, separators=(",", ":")).encode()
 
 
 def decode_poses(packed: bytes) -> PoseDigest:
@@ -74,16 +71,12 @@ def decode_poses(packed: bytes) -> PoseDigest:
     Raises:
         ValueError: the bytes are not one.
     """
-    head, _, body = packed.partition(b"\n")
     try:
-        poses, invalid, driven, twist, frames, error_m = json.loads(head)
+        poses, invalid, driven, twist, frames, error_m, stored = json.loads(packed)
         totals = MotionTotals(*driven)
         totals.head, totals.tail = _decode_leg(totals.head), _decode_leg(totals.tail)
         totals.resets = tuple(totals.resets)
-        vertices: list[Vertex] = [
-            (time, (x, y, z), None if math.isnan(heading) else heading)
-            for time, x, y, z, heading in _VERTEX.iter_unpack(body)
-        ]
+        vertices: list[Vertex] = [(time, (x, y, z), turn) for time, x, y, z, turn in stored]
     except (TypeError, struct.error) as error:
         raise ValueError(f"not a digest of poses: {error}") from error
     return PoseDigest(poses, invalid, totals, twist, tuple(frames), tuple(vertices), error_m)

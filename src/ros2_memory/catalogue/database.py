@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-VERSION: Final = 8
+VERSION: Final = 9
 """Version of the tables below and of their content; a file of any other version is set aside."""
 
 BUSY_S: Final = 1.0

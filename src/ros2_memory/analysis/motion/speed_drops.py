@@ -33,8 +33,11 @@ FRACTION: Final = 0.4
 TURNS_RAD: Final = 0.35
 _ROWS: Final = 7
 """Slots that decide whether there is a drop at the fourth of them, and none at the third."""
-_STEP: Final = 1e-4
-"""What positions (m) and headings (rad) are rounded to."""
+_STEP: Final = 1e-3
+"""What positions (m) and times (s) are rounded to."""
+_TURN: Final = 0.01
+"""What headings (rad) are rounded to."""
+_STEP_NS: Final[Ns] = NS_PER_S // 1000
 _NO_HEADING: Final = -(2**31)
 
 
@@ -47,7 +50,7 @@ class SpeedDrop(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """The first pose of a slot, in steps of `_STEP`."""
+    """The first pose of a slot, rounded."""
 
     time: Ns
     x: int
@@ -96,7 +99,7 @@ class _Finder:
             return None
         turned = rows[6].heading - rows[2].heading
         if _NO_HEADING not in {rows[6].heading, rows[2].heading} and (
-            abs(math.remainder(turned * _STEP, math.tau)) > TURNS_RAD
+            abs(math.remainder(turned * _TURN, math.tau)) > TURNS_RAD
         ):
             return None
         return SpeedDrop(rows[3].time, min(speeds[1:3]), max(speeds[4:]))
@@ -137,7 +140,8 @@ class SpeedDropCollector:
 
     def digest(self) -> SpeedDropDigest:
         """Returns the digest."""
-        tail = _encode(self._finder.rows) if self._count > _ROWS else b""
+        # The next slot completes them.
+        tail = _encode([*self._finder.rows][1:]) if self._count > _ROWS else b""
         return SpeedDropDigest(_encode(self._head), tail, tuple(self._drops))
 
 
@@ -174,16 +178,20 @@ class SpeedDropBuilder:
 
 def _row(time: Ns, position: Vector3, turn: Quaternion | None) -> _Row:
     unit = None if turn is None else normalised(turn)
-    heading = _NO_HEADING if unit is None else round(yaw(unit) / _STEP)
-    return _Row(time, round(position[0] / _STEP), round(position[1] / _STEP), heading)
+    heading = _NO_HEADING if unit is None else round(yaw(unit) / _TURN)
+    # Down, so that a time stays in its slot.
+    at = time // _STEP_NS * _STEP_NS
+    return _Row(at, round(position[0] / _STEP), round(position[1] / _STEP), heading)
 
 
 def _encode(rows: Iterable[_Row]) -> bytes:
     """Encodes rows column by column as differences, which compress well."""
     columns = np.array([*rows], "<i8").reshape(-1, len(_Row._fields)).T
+    columns[0] //= _STEP_NS
     return np.diff(columns, prepend=0).tobytes()
 
 
 def _decode(packed: bytes) -> list[_Row]:
     columns = np.frombuffer(packed, "<i8").reshape(len(_Row._fields), -1).cumsum(axis=1)
+    columns[0] *= _STEP_NS
     return [_Row(*row) for row in columns.T.tolist()]
