@@ -1,13 +1,13 @@
 """The static transforms in force for each bag: those of its session, at the bag's end.
 
-A robot may publish them in every split, so they are gathered once for each segment of bags, and of
-a recording only those that differ from the one before are stored.
+A robot may publish them in every split, so they are gathered once for each folder in each segment
+of bags, and only those that differ from the one before are stored. Bags without an entry in the
+catalogue are read for the sessions that are asked about alone.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
@@ -18,7 +18,7 @@ from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
 from ros2_memory.history.transforms import sessions_of, static_at, static_changes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from pathlib import Path
 
     from ros2_memory.catalogue.lookup import SegmentDigests
@@ -34,9 +34,9 @@ Topics: TypeAlias = "tuple[str, ...]"
 
 @dataclass(slots=True)
 class _Gathered:
-    """Static transforms of some bags, in log-time order: by folder, and carried ones."""
+    """Static transforms of one folder's bags, in log-time order: its own, and carried ones."""
 
-    by_folder: dict[str, list[StampedTransform]] = field(default_factory=dict)
+    own: list[StampedTransform] = field(default_factory=list)
     carried: list[tuple[StoredMessage, tuple[StampedTransform, ...]]] = field(default_factory=list)
 
 
@@ -57,14 +57,24 @@ class _SessionStatics:
         return self.periods[number]
 
 
-_OF_SEGMENTS: Final[WeakKeyDictionary[Segment, dict[Topics, _Gathered]]] = WeakKeyDictionary()
+_OF_SEGMENTS: Final[WeakKeyDictionary[Segment, dict[Topics, dict[str, _Gathered]]]] = (
+    WeakKeyDictionary()
+)
 
 
 @dataclass(slots=True)
 class _OfTimeline:
-    """What is known of a timeline: a new bag makes a new one."""
+    """What is known of a timeline: a new bag makes a new one.
 
-    gathered: _Gathered | None = None
+    Attributes:
+        folders: the segments with static transforms of each folder.
+        carried: the folders of carried messages.
+        valid: what follows from digests.
+        sessions: the static transforms of each session.
+    """
+
+    folders: dict[str, list[Segment]] | None = None
+    carried: set[str] = field(default_factory=set)
     valid: WeakKeyDictionary[SegmentDigests, dict[str, int]] = field(
         default_factory=WeakKeyDictionary
     )
@@ -109,78 +119,102 @@ class BagStatics:
     def _statics(self, session: Session) -> _SessionStatics:
         known = self._known.sessions.get(session)
         if known is None:
-            gathered = self._gathered()
-            sessions = sessions_of(self._view)
-            static = [each for name in session for each in gathered.by_folder.get(name, ())]
-            for found, transforms in gathered.carried:
-                if sessions.has(session, found):
-                    static += transforms
+            folders, sessions = self._folders(), sessions_of(self._view)
+            static = [
+                each
+                for name in session
+                for segment in folders.get(name, ())
+                for each in self._gathered_in(segment, name).own
+            ]
+            for name in self._known.carried:
+                for segment in folders[name]:
+                    for found, transforms in self._gathered_in(segment, name).carried:
+                        if sessions.has(session, found):
+                            static += transforms
             static.sort(key=lambda each: each.log_time)
             known = _SessionStatics(static, static_changes(static))
             self._known.sessions[session] = known
         return known
 
-    def _gathered(self) -> _Gathered:
-        """Returns the static transforms of all bags."""
-        known = self._known.gathered
-        if known is None:
-            known = _Gathered()
+    def _folders(self) -> dict[str, list[Segment]]:
+        """Returns the segments that hold static transforms of each folder."""
+        if self._known.folders is None:
+            sessions = sessions_of(self._view)
+            found: dict[str, dict[Segment, None]] = {}
             for segment in self._view.snapshot.timeline.segments:
-                part = self._gathered_in(segment)
-                for name, transforms in part.by_folder.items():
-                    known.by_folder.setdefault(name, []).extend(transforms)
-                known.carried += part.carried
-            self._known.gathered = known
-        return known
+                held = [topic for topic in self._topics if topic in segment.spans]
+                bags = [bag for topic in held for bag in segment.bags_with(topic)]
+                for recording, bag in {bag.recording: bag for bag in bags}.items():
+                    name = sessions.folder(recording)
+                    found.setdefault(name, {})[segment] = None
+                    if sessions.is_carried(bag):
+                        self._known.carried.add(name)
+            self._known.folders = {name: [*segments] for name, segments in found.items()}
+        return self._known.folders
 
-    def _gathered_in(self, segment: Segment) -> _Gathered:
-        cache = _OF_SEGMENTS.setdefault(segment, {})
-        known = cache.get(self._topics)
+    def _gathered_in(self, segment: Segment, folder: str) -> _Gathered:
+        cache = _OF_SEGMENTS.setdefault(segment, {}).setdefault(self._topics, {})
+        known = cache.get(folder)
         if known is None:
             before = self._view.notes.keys()
-            known = _gather(self._view, segment, self._topics)
+            found = _gather(self._view, segment, self._topics, folder, cache.keys())
+            known = found.get(folder, _Gathered())
             if self._view.notes.keys() == before:
-                cache[self._topics] = known
+                cache.update(found)
         return known
 
 
-def _gather(view: View, segment: Segment, topics: Topics) -> _Gathered:
+def _gather(
+    view: View, segment: Segment, topics: Topics, wanted: str, known: Collection[str]
+) -> dict[str, _Gathered]:
+    """Returns the static transforms of a folder, and of all others that need no reading."""
     sessions = sessions_of(view)
-    gathered = _Gathered()
+    gathered: dict[str, _Gathered] = {}
+    unread = {*known}
     latest: dict[tuple[str, str], StampedTransform] = {}
     decoded: dict[tuple[str, str, bytes], tuple[StampedTransform, ...]] = {}
     for topic in topics:
-        if topic not in segment.spans:
-            continue
-        by_folder: dict[str, list[StampedTransform]] = defaultdict(list)
-        for bag, messages in view.bags.all_of(segment, topic):
-            folder, is_carried = sessions.folder(bag.recording), sessions.is_carried(bag)
-            if is_carried:
-                gathered.carried += [(found, _transforms(view, found)) for found in messages]
+        held = view.bags.all_of(segment, topic) if topic in segment.spans else ()
+        for bag, messages in held:
+            folder = sessions.folder(bag.recording)
+            if folder != wanted and not isinstance(messages, list):
+                unread.add(folder)
+            if folder in unread:
                 continue
-            for found in messages:
-                channel = found.record.channel
-                key = (channel.type, channel.encoding, found.record.payload)
-                known = decoded.get(key)
-                # The same bytes again, and nothing else in between, as in nearly every split.
-                if known is not None and all(
-                    latest.get((folder, each.child)) is each for each in known
-                ):
-                    continue
-                # Another recording has the same ones at another time.
-                decoded[key] = made = (
-                    _transforms(view, found)
-                    if known is None
-                    else tuple([replace(each, log_time=found.time) for each in known])
-                )
-                for each in made:
-                    before = latest.get((folder, each.child))
-                    latest[folder, each.child] = each
-                    if before is None or _place(before) != _place(each):
-                        by_folder[folder].append(each)
-        for name, transforms in by_folder.items():
-            gathered.by_folder.setdefault(name, []).extend(transforms)
-    return gathered
+            of_folder = gathered.setdefault(folder, _Gathered())
+            if sessions.is_carried(bag):
+                of_folder.carried += [(found, _transforms(view, found)) for found in messages]
+                continue
+            of_folder.own += _changed(view, folder, messages, latest, decoded)
+    return {name: each for name, each in gathered.items() if name not in unread}
+
+
+def _changed(
+    view: View,
+    folder: str,
+    messages: Iterable[StoredMessage],
+    latest: dict[tuple[str, str], StampedTransform],
+    decoded: dict[tuple[str, str, bytes], tuple[StampedTransform, ...]],
+) -> Iterator[StampedTransform]:
+    """Yields the transforms of messages that differ from the latest ones of their folder."""
+    for found in messages:
+        channel = found.record.channel
+        key = (channel.type, channel.encoding, found.record.payload)
+        known = decoded.get(key)
+        # The same bytes again, and nothing else in between, as in nearly every split.
+        if known is not None and all(latest.get((folder, each.child)) is each for each in known):
+            continue
+        # Another recording has the same ones at another time.
+        decoded[key] = made = (
+            _transforms(view, found)
+            if known is None
+            else tuple([replace(each, log_time=found.time) for each in known])
+        )
+        for each in made:
+            before = latest.get((folder, each.child))
+            latest[folder, each.child] = each
+            if before is None or _place(before) != _place(each):
+                yield each
 
 
 def _place(each: StampedTransform) -> tuple[str, Transform]:
