@@ -316,35 +316,38 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
-def recounted(text: str, gone: Mapping[str, Counts]) -> str:
+def recounted(text: str, left: Mapping[str, Counts]) -> str:
     """Returns the text of a metadata.yaml, as rosbag2 embeds it in a file, with other counts.
 
-    Times stay as they are.
+    Times stay as they are. Files that retention deleted are listed, and their messages are counted
+    by topic with all others: then no topic has more than it is known to have had.
 
     Args:
         text: the old one; returned as it is where it is of no known form.
-        gone: by name, the messages of each topic that a file does not hold any more.
+        left: by name, the messages of each topic that each file of the recording holds now.
     """
     try:
         content = _parse(text)
         info = _mapping(content, "it")
         info = _mapping(info.get(_ROOT, info), _ROOT)
-        lost, total = Counter[str](), integer(info, "message_count")
-        for each in [_mapping(each, "files") for each in _list(info, "files")]:
-            counts = gone.get(bare_name(each.get("path")), {})
+        files = [_mapping(each, "files") for each in _list(info, "files")]
+        topics = [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]
+        counts, others = Counter[str](), 0
+        for each in files:
             count = integer(each, "message_count")
             # None, where rosbag2 wrote it before the first message.
-            if counts and count:
-                each["message_count"] = max(count - sum(counts.values()), 0)
-                lost.update(counts)
-        for each in [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]:
+            known = left.get(bare_name(each.get("path"))) if count else {}
+            if known is None:
+                others += count
+            else:
+                counts.update(known)
+                each["message_count"] = min(count, sum(known.values()))
+        for each in topics:
             name = str(_mapping(each.get("topic_metadata"), "topic_metadata").get("name"))
-            each["message_count"] = max(integer(each, "message_count") - lost[name], 0)
+            each["message_count"] = min(integer(each, "message_count"), counts[name] + others)
+        info["message_count"] = sum(integer(each, "message_count") for each in files)
     except ValueError:
         return text
-    if not lost:
-        return text
-    info["message_count"] = max(total - lost.total(), 0)
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 

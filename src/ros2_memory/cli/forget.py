@@ -124,7 +124,7 @@ def forget(
         if taking.take(wanted, lines, ask=not yes) or interrupted:
             raise typer.Exit(EXIT_NEGATIVE)
         return
-    plan = plan_deletion(settings, snapshot, window)
+    plan = plan_deletion(settings, memory.index.snapshot(), window)
     carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
     kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
     _print_kept(kept)
@@ -276,8 +276,6 @@ class _Taking:
 
     def _forget_derived(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
-        if self._memory.recall is not None:
-            self._memory.recall.catalogue.close()
         for path in catalogue_paths(self._settings):
             purge(path, erasure.files)
 

@@ -19,7 +19,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.erasure_file import Erased, Erasure, remove_erasure, write_erasure
-from ros2_memory.bag_dir.handover_file import handover_to_change, message_id, write_handover
+from ros2_memory.bag_dir.handover_file import (
+    handover_to_change,
+    message_id,
+    read_handover,
+    write_handover,
+)
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     CARRY_FILE,
@@ -32,7 +37,7 @@ from ros2_memory.bag_dir.layout import (
     is_kept_apart,
 )
 from ros2_memory.bag_dir.lost_file import Loss, append_losses, read_losses
-from ros2_memory.bag_dir.metadata_yaml import correct, recounted
+from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
@@ -65,7 +70,7 @@ class Holder:
         inode: device and inode.
         counts: the messages that go, by topic.
         windows: likewise, by topic and window.
-        ids: what identifies them in sidecars, by topic.
+        ids: what identifies those of them in sidecars that one may list, by topic.
     """
 
     paths: tuple[Path, ...]
@@ -129,7 +134,7 @@ class Eraser:
         found: set[str] = set()
         for paths in self._files().values():
             with suppress(BagError):
-                found.update(topic.topic for topic in self._reader.summarize(paths[0]).topics)
+                found.update(each.topic for each in self._reader.channels(paths[0]))
         return frozenset(found)
 
     def survey(self, erasure: Erasure) -> Survey:
@@ -192,12 +197,10 @@ class Eraser:
             erasure = self._with_files(erasure, survey)
         write_erasure(self._bag_dir, erasure)
         kept: list[str] = []
-        gone: defaultdict[Path, dict[str, Counter[str]]] = defaultdict(dict)
+        left = self._left_by_recording(survey)
         for holder in survey.holders:
-            recording = holder.paths[0].parent
-            gone[recording][holder.paths[0].name] = holder.counts
             try:
-                self._erase_in(holder, erasure, gone[recording], kept)
+                self._erase_in(holder, erasure, left[holder.paths[0].parent], kept)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._name(holder.paths[0])}: {_reason_of(error)}")
         files = [self._bag_dir / each for each in erasure.files]
@@ -271,6 +274,7 @@ class Eraser:
     ) -> Holder:
         """Reads which messages of a file go."""
         holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
+        listed = {topic for path in holder.paths for topic in self._listed(path)}
         for topic in topics:
             first, last = erasure.windows[0][0], erasure.windows[-1][1]
             span = (
@@ -281,9 +285,30 @@ class Eraser:
                 if window is not None:
                     holder.counts[topic] += 1
                     holder.windows[topic, *window] += 1
-                    known = holder.ids.setdefault(topic, set())
-                    known.add(message_id(record.publish_time, record.payload))
+                    if topic in listed:
+                        known = holder.ids.setdefault(topic, set())
+                        known.add(message_id(record.publish_time, record.payload))
         return holder
+
+    def _listed(self, path: Path) -> Collection[str]:
+        """Returns the topics of which a sidecar lists messages of a file."""
+        handover = read_handover(path.parent).handover
+        lists = (handover.also_counts, handover.counts_elsewhere)
+        return {topic for each in lists for topic in each.get(path.name, ())}
+
+    def _left_by_recording(self, survey: Survey) -> dict[Path, dict[str, Counter[str]]]:
+        """Returns what is left of each file of the recordings that change, by topic."""
+        gone = {path: each.counts for each in survey.holders for path in each.paths}
+        left: dict[Path, dict[str, Counter[str]]] = {}
+        for recording in {each.paths[0].parent for each in survey.holders}:
+            files = left[recording] = {}
+            for path in filter(lambda each: bag_kind(each.name), recording.iterdir()):
+                with suppress(BagError):
+                    counts = Counter[str]()
+                    for topic in self._reader.summarize(path).topics:
+                        counts[topic.topic] += topic.count
+                    files[bare_name(path.name)] = counts - gone.get(path, Counter())
+        return left
 
     def _with_files(self, erasure: Erasure, survey: Survey) -> Erasure:
         counts = Counter[tuple[str, int, int]]()
@@ -300,7 +325,7 @@ class Eraser:
         self,
         holder: Holder,
         erasure: Erasure,
-        gone: Mapping[str, Counter[str]],
+        left_of: Mapping[str, Counter[str]],
         kept: list[str],
     ) -> None:
         """Writes one file anew, in place of all its names.
@@ -322,7 +347,7 @@ class Eraser:
                 beside.unlink(missing_ok=True)
                 try:
                     taken = self._writer.cut(
-                        here, beside, erasure.takes, lambda text: recounted(text, gone)
+                        here, beside, erasure.takes, lambda text: recounted(text, left_of)
                     )
                     if taken != holder.counts:
                         raise BagError(str(path), "it does not hold what it held just now")

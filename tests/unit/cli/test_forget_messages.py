@@ -15,7 +15,7 @@ import subprocess
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
@@ -31,11 +31,14 @@ from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.lost_file import read_losses
 from ros2_memory.bag_dir.metadata_yaml import Contents, describing
+from ros2_memory.bootstrap import build_memory
 from ros2_memory.catalogue.packing import unpacked
-from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.catalogue.store import FILE, FOLDER, BagKey
 from ros2_memory.cli import forget as cli_forget
+from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.retention import eraser
+from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
@@ -51,6 +54,7 @@ from tests.support.bags import (
 from tests.support.housekeepers import own_all
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Callable, Iterator
 
 S = NS_PER_S
@@ -227,6 +231,45 @@ def test_hard_links_in_moments_follow(tmp_path: Path, bag_dir: Path) -> None:
     assert link.samefile(source)
 
 
+def test_a_moment_that_is_kept_meanwhile_follows(
+    tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = bag_dir / "rec_a" / "rec_a_1.mcap"
+    link = bag_dir / "moments" / "20260101T000000Z-dance" / "rec_a" / source.name
+    cut = McapWriter.cut
+
+    def slow_cut(self: McapWriter, *arguments: Any) -> Counter[str]:
+        taken = cut(self, *arguments)
+        if not link.exists():
+            link.parent.mkdir(parents=True)
+            os.link(source, link)
+        return taken
+
+    monkeypatch.setattr(McapWriter, "cut", slow_cut)
+    assert forget(0, 100, "--topic", CAMERA) == 0
+    assert link.samefile(source)
+    assert traces(tmp_path, SAID) == []
+
+
+def test_what_the_catalogue_says_of_the_others_stays(bag_dir: Path) -> None:
+    indexed()
+
+    def said() -> list[object]:
+        memory = build_memory(load_settings([]))
+        memory.index.refresh()
+        assert memory.recall is not None
+        catalogue = memory.recall.catalogue
+        bags = [each for each in memory.index.snapshot().bags if each.path.stem == "rec_a_2"]
+        numbers = [each for each in catalogue.find([BagKey.of(b, bag_dir) for b in bags]) if each]
+        assert numbers
+        found = [catalogue.zone_maps(topic, numbers) for topic in (CAMERA, MIC, "/odom")]
+        return [*found, catalogue.poses("/odom", numbers), catalogue.maps(numbers).keys()]
+
+    before = said()
+    assert forget(0, 15, "--topic", CAMERA, "--topic", "/odom") == 0
+    assert said() == before
+
+
 def test_a_hard_link_elsewhere_is_named(tmp_path: Path, bag_dir: Path, capsys: Capture) -> None:
     os.link(bag_dir / "rec_a" / "rec_a_1.mcap", tmp_path / "copy.mcap")
     assert forget(0, 100, "--topic", CAMERA) == 1
@@ -324,6 +367,12 @@ def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> N
     assert traces(bag_dir, "laser") == []
 
 
+def test_what_has_gone_can_be_forgotten_again(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(0, 100, "--topic", CAMERA) == 0
+    assert forget(0, 100, "--topic", CAMERA) == 0
+    assert "no message of that lies in the window" in capsys.readouterr().out
+
+
 def test_a_dry_run_changes_nothing(bag_dir: Path, capsys: Capture) -> None:
     before = {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")}
     assert forget(0, 100, "--topic", CAMERA, "--dry-run") == 0
@@ -382,15 +431,18 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
         assert base.execute(every).fetchall() == rest
         told = yaml.safe_load(base.execute("SELECT metadata FROM metadata").fetchone()[0])
     assert told["message_count"] == told["files"][0]["message_count"] == 41 - 6
+    counts = {each["topic_metadata"]["name"]: each["message_count"] for each in told[TOPICS]}
+    assert counts == {CAMERA: 4, "/odom": 10}
     assert f"{SAID} 0 4".encode() not in path.read_bytes()
     assert f"{SAID} 0 3".encode() in path.read_bytes()
 
 
+TOPICS = "topics_with_message_count"
 EMBEDDED = yaml.safe_dump(
     {
         "version": 9,
         "message_count": 41,
-        "topics_with_message_count": [
+        TOPICS: [
             {"topic_metadata": {"name": CAMERA}, "message_count": 10},
             {"topic_metadata": {"name": "/odom"}, "message_count": 10},
         ],
