@@ -184,7 +184,8 @@ class CatalogueDatabase:
                 try:
                     return ask(opened.connection)
                 finally:
-                    opened.connection.execute("COMMIT")
+                    if opened.connection.in_transaction:  # not after an error that ended it
+                        opened.connection.execute("COMMIT")
             # Rows of a damaged file can hold anything, so decoding them can raise any of these.
             except (sqlite3.Error, ValueError, TypeError, LookupError, MemoryError) as error:
                 self._failed(error)

@@ -16,16 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.catalogue.database import ROW_ID_BITS, VERSION
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed, unpacked
-from ros2_memory.catalogue.sql import (
-    NO_TOPIC,
-    POSES,
-    SIGHTS,
-    STANDSTILLS,
-    STORY,
-    TRACK,
-    ZONE_MAP,
-    delete_entries,
-)
+from ros2_memory.catalogue.sql import NO_TOPIC, PACKED_IN, delete_entries
 from ros2_memory.core.errors import BagError
 
 if TYPE_CHECKING:
@@ -36,8 +27,13 @@ PATIENCE_S: Final = 10.0
 """How long other programs may use the file before it is given up to empty its log."""
 _PAUSE_S: Final = 0.05
 _ASIDE: Final = ".aside"
-_OF_TOPIC: Final = {ZONE_MAP: "held", POSES: "held", STANDSTILLS: "tales", STORY: "tales"}
-_OF_MAP: Final = (TRACK, SIGHTS)
+_KEYS: Final = {
+    "held": f"id >> {ROW_ID_BITS:d} = ?",
+    "tales": f"id >> {ROW_ID_BITS:d} = ?",
+    "maps": "? = 0",
+    "bags": "shape = ?",
+}
+"""Which rows of a table a model is for, by its topic; of counts that is their schema."""
 
 
 def purge(file: Path, bags: Sequence[str]) -> None:
@@ -55,7 +51,7 @@ def purge(file: Path, bags: Sequence[str]) -> None:
             each.unlink(missing_ok=True)
         if file.is_file() and not file.is_symlink():
             _purge(file, bags)
-    except (OSError, sqlite3.Error, ValueError) as error:
+    except (OSError, sqlite3.Error, ValueError, LookupError) as error:
         reason = f"the catalogue may still tell of what was deleted ({error}); delete the file"
         raise BagError(str(file), f"{file.name}: {reason}") from error
 
@@ -109,18 +105,15 @@ def _done(base: sqlite3.Connection, statement: str) -> bool:
 
 def _renew_model(base: sqlite3.Connection, topic: int, kind: str, model: bytes) -> None:
     """Replaces a model that nothing which is left says, and packs that with another."""
-    if topic == NO_TOPIC and kind not in _OF_MAP:
+    if topic == NO_TOPIC and kind not in PACKED_IN:  # of answers, which were deleted
         base.execute("DELETE FROM models WHERE topic = ? AND kind = ?", (topic, kind))
         return
-    if topic == NO_TOPIC:
-        table, key, bounds = "maps", "bag", (0, 1 << ROW_ID_BITS)
-    else:
-        table, key = _OF_TOPIC[kind], "id"
-        bounds = (topic << ROW_ID_BITS, (topic + 1) << ROW_ID_BITS)
+    table = PACKED_IN[kind]
+    key = "bag" if table == "maps" else "id"
     rows = base.execute(
-        f"SELECT {key}, {kind} FROM {table} WHERE {key} >= ? AND {key} < ?"
+        f"SELECT {key}, {kind} FROM {table} WHERE {_KEYS[table]}"
         f" AND length({kind}) > 0 ORDER BY {key}",
-        bounds,
+        (topic,),
     )
     plain: list[tuple[int, bytes]] = []
     for number, stored in rows:

@@ -49,10 +49,20 @@ EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, la
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 TRACK: Final = "track"
 SIGHTS: Final = "sights"
-
 RANGES: Final = "ranges"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
+PACKED_IN: Final = {
+    ZONE_MAP: "held",
+    POSES: "held",
+    RANGES: "held",
+    STANDSTILLS: "tales",
+    STORY: "tales",
+    TRACK: "maps",
+    SIGHTS: "maps",
+    COUNTS: "bags",
+}
+"""The table in whose column of that name what is packed of a kind lies; answers lie elsewhere."""
 
 
 def entry_rows(

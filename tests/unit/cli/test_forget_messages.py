@@ -169,8 +169,8 @@ def packed_in(catalogue: Path) -> Iterator[bytes]:
     with closing(sqlite3.connect(catalogue)) as base:
         for topic, kind, model in base.execute("SELECT * FROM models").fetchall():
             yield bytes(model)
-            if kind in {"zones", "poses", "rests", "story"}:
-                table = "held" if kind in {"zones", "poses"} else "tales"
+            if kind in {"zones", "poses", "ranges", "rests", "story"}:
+                table = "tales" if kind in {"rests", "story"} else "held"
                 rows = base.execute(
                     f"SELECT {kind} FROM {table} WHERE id >> 40 = ?",  # noqa: S608 - constants
                     (topic,),
@@ -263,7 +263,8 @@ def test_what_the_catalogue_says_of_the_others_stays(bag_dir: Path) -> None:
         numbers = [each for each in catalogue.find([BagKey.of(b, bag_dir) for b in bags]) if each]
         assert numbers
         found = [catalogue.zone_maps(topic, numbers) for topic in (CAMERA, MIC, "/odom")]
-        return [*found, catalogue.poses("/odom", numbers), catalogue.maps(numbers).keys()]
+        known = catalogue.known_files(bag_dir)[bags[0].file].summary
+        return [*found, known, catalogue.poses("/odom", numbers), {*catalogue.maps(numbers)}]
 
     before = said()
     assert forget(0, 15, "--topic", CAMERA, "--topic", "/odom") == 0
