@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -260,7 +260,8 @@ class BagAccess:
             numbers, stored = digests.numbers, digests.messages(topic)
         for bag in segment.bags_with(topic):
             records = stored.get(numbers.get(bag.file, -1))
-            if records is None or is_carried(bag.path):
+            # A path for each bag of a week would take longer than the look-up.
+            if records is None or (bag.file.endswith(CARRY_FILE) and is_carried(bag.path)):
                 yield bag, self.read(bag, (topic,), TimeWindow.everything())
             else:
                 yield bag, [StoredMessage(bag, each) for each in records]
