@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from benchmarks.home.truth import Standstill
 
 _REASONS: Final = {
-    "blocked": ("abort", "no way", "failed to create plan"),
-    "bump": ("bumper",),
+    "blocked": ("block", "abort", "no way", "failed to create plan"),
+    "bump": ("bump",),
     "hot": ("overheat", "motor"),
     "low battery": ("battery", "cancel"),
     "pause": (),
@@ -37,13 +37,13 @@ def questions(asked: Asked) -> list[Question]:
 
 def _why(asked: Asked) -> list[Question]:
     found = []
-    for reason, words in _REASONS.items():
+    for number, (reason, words) in enumerate(_REASONS.items(), 1):
         stood = [each for each in asked.truth.standstills if each.reason == reason][-1]
-        found.append(_stopped(reason, stood, words))
+        found.append(_stopped(number, stood, words))
     return found
 
 
-def _stopped(reason: str, stood: Standstill, words: tuple[str, ...]) -> Question:
+def _stopped(number: int, stood: Standstill, words: tuple[str, ...]) -> Question:
     at = round(stood.start + 1.0)
     truth = Words(words, () if words else _OTHERS, or_none=True)
 
@@ -56,7 +56,7 @@ def _stopped(reason: str, stood: Standstill, words: tuple[str, ...]) -> Question
         return {"reason": json.dumps(before)}
 
     return Question(
-        f"why-{reason.replace(' ', '-')}",
+        f"why-{number}",
         "why",
         f"Why did you stop at {in_words(at)} in the {stood.room}?",
         {"reason": truth},

@@ -564,7 +564,7 @@ class StillThere:
     """What is known of a thing since it was last seen, in the words of the reply.
 
     Attributes:
-        state: `seen_since`, `not_looked_at_since` or `not_seen_where_expected`.
+        state: `in_view`, `seen_since`, `not_looked_at_since` or `not_seen_where_expected`.
         at: when it was seen again, last seen, or known to be missed.
         looks: detector messages that should have had it.
     """
@@ -579,7 +579,8 @@ class Thing:
     """One thing that detectors saw, or one label of things that move by themselves.
 
     Attributes:
-        also_seen_as: other labels that it was seen under, the commonest first.
+        also_seen_as: other spellings that it was seen under, the commonest first; `misread_as`:
+            labels of other things.
         place: its last one (m), in `frame_id`; `spread_m` is the root mean square distance of its
             detections there.
         inside: the named place that it is in.
@@ -605,6 +606,7 @@ class Thing:
     robot: tuple[float, float, float] | None
     still_there: StillThere | None
     moved: tuple[ThingStay, ...] = ()
+    misread_as: tuple[str, ...] = ()
     at_once: int | None = None
     moves: bool = False
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -12,6 +13,7 @@ from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.text import abbreviate, counted, listed
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
@@ -19,7 +21,7 @@ from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3
 _MOST_NAMES: Final = 5
+_JUST_NOW_NS: Final = 2 * NS_PER_S
+"""Detectors speak at their own times."""
 _MM: Final = 1000.0
 
 
@@ -128,7 +132,8 @@ class _Finder:
         spots = self.known.estimate.sights.spots[every]
         return Thing(
             label=self.known.estimate.names[instance.key],
-            also_seen_as=self._other_names(instance),
+            also_seen_as=self._names(instance, [stay.spellings for stay in instance.stays]),
+            misread_as=self._names(instance, [stay.also for stay in instance.stays]),
             place=_place(last.x, last.y, last.z),
             spread_m=last.dev_mm / _MM,
             frame_id=frame,
@@ -240,11 +245,11 @@ class _Finder:
         x, y, yaw = self.known.estimate.sights.looks[look, [Look.X, Look.Y, Look.YAW]].tolist()
         return x / _MM, y / _MM, float(np.radians((yaw / 10 + 180) % 360 - 180))
 
-    def _other_names(self, instance: Instance) -> tuple[str, ...]:
-        counts: dict[str, int] = {}
-        for stay in instance.stays:
-            for name, count in (*stay.spellings.items(), *stay.also.items()):
-                counts[name] = counts.get(name, 0) + count
+    def _names(self, instance: Instance, seen: Iterable[Mapping[str, int]]) -> tuple[str, ...]:
+        """Returns the commonest of these names, other than the thing's own."""
+        counts: Counter[str] = Counter()
+        for each in seen:
+            counts.update(each)
         counts.pop(self.known.estimate.names[instance.key], None)
         return tuple(sorted(counts, key=lambda each: (-counts[each], each))[:_MOST_NAMES])
 
@@ -260,6 +265,9 @@ class _Finder:
             _, looks, missed = self.known.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
+        looked = self.known.estimate.sights.looks[:, Look.LAST]
+        if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
+            return StillThere("in_view", last)
         return StillThere("not_looked_at_since", last)
 
 

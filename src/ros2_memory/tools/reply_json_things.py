@@ -70,6 +70,8 @@ def _thing(thing: results.Thing, answer: results.Things, most_stays: int) -> Jso
     reply: JsonObject = {"label": thing.label}
     if thing.also_seen_as:
         reply["also_seen_as"] = [*thing.also_seen_as]
+    if thing.misread_as:
+        reply["misread_as"] = [*thing.misread_as]
     kind: JsonObject = {"moves": thing.moves or None, "at_once": thing.at_once}
     reply |= {key: each for key, each in kind.items() if each is not None}
     reply["place"] = _place(thing.place)

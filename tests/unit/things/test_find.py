@@ -108,7 +108,7 @@ def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path
     assert mug["count"] == 20
     assert mug["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
     assert mug["score"]["best"] == 0.9
-    assert mug["still_there"] == {"not_looked_at_since": BEGIN + 19}
+    assert mug["still_there"] == {"in_view": BEGIN + 19}
 
 
 def test_chairs_are_counted(tmp_path: Path) -> None:
