@@ -135,7 +135,8 @@ def test_what_was_lost_is_counted_to_the_message(site: Machine) -> None:
         recorder.stop()
     found = numbers(recorder.bag_dir)["/odom"]
     lost = sum(later - earlier - 1 for earlier, later in pairwise(found))
-    assert missing["lost"] == lost > 10
+    # A busy machine may lose more in a later split, which is told with that.
+    assert lost >= missing["lost"] > 10
     window = (0, time.time_ns())
     assert sum(loss.lost for loss in read_losses(recorder.bag_dir, *window)) == lost
     beat = recorder.heartbeat.heartbeat

@@ -236,7 +236,7 @@ def test_a_topic_is_recorded_whose_name_contains_a_match(
 def test_of_what_comes_while_it_is_stopped_only_the_newest_messages_are_kept(
     started: dict[str, Recording],
 ) -> None:
-    """Ten, fewer where others come before it takes them, more where it takes some meanwhile."""
+    """Ten, and those that publishers send again; fewer where others come before it takes them."""
     recording = started["stalled"]
     recording.await_splits(2)
     stopped = time.time_ns()
@@ -248,7 +248,7 @@ def test_of_what_comes_while_it_is_stopped_only_the_newest_messages_are_kept(
     assert recording.stop() == 0
     published = sorted(published for _, _, published, _ in messages(recording))
     kept = [time_ns for time_ns in published if stopped < time_ns < going_on]
-    assert len(kept) <= 20
+    assert len(kept) <= 30
     assert max(after - before for before, after in pairwise(published)) > SECOND // 2
 
 

@@ -51,6 +51,7 @@ HEARTBEAT = Heartbeat(
     silent=(),
     last_error=None,
     interval_s=2.0,
+    lost={"/odom": 3},
 )
 CALL = Answered("ask", "no_data: gap", 0.03, 12, "abc", {"read": 2.0})
 

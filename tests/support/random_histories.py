@@ -139,7 +139,7 @@ def write_history(bag_dir: Path, draw: Random) -> Written:
                 # The recorder before stalled: it missed these.
                 missed = [
                     each
-                    for each in robot.between(before[1][0].log_time, now)
+                    for each in robot.between(min(before[1][0].log_time, now - S), now)
                     if each.topic not in LATCHED
                 ]
                 arrived += [_shifted(each, draw.randint(10_000, 900_000)) for each in missed]

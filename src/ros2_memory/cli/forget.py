@@ -21,6 +21,7 @@ from ros2_memory.bag_dir.erasure_file import Erasure, read_erasure
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
+    LOCK_FILE,
     METADATA_FILE,
     MOMENTS_FOLDER,
     is_kept_apart,
@@ -116,8 +117,7 @@ def forget(
     if snapshot.problem:
         raise RecorderError(snapshot.problem)
     window = parse_window(memory, start, end, last)
-    with _recorder_locked_out(settings.recording.bag_dir) as recorder:
-        taking = _Taking(settings, memory, recorder, dry_run=dry_run)
+    taking = _Taking(settings, memory, _recorder_of(settings.recording.bag_dir), dry_run=dry_run)
     interrupted = taking.finish()
     if topic or where is not None:
         wanted, lines = taking.wanted(window, topic or (), where)
@@ -463,6 +463,14 @@ def _delete(
     for note in notes:
         print_line(note)
     return kept
+
+
+def _recorder_of(bag_dir: Path) -> str | None:
+    """Returns why a recorder holds the bag directory; None where none does. Writes nothing."""
+    if not (bag_dir / LOCK_FILE).exists():
+        return None
+    with _recorder_locked_out(bag_dir) as recorder:
+        return recorder
 
 
 @contextmanager
