@@ -20,11 +20,11 @@ from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from tests.support.processes import PATIENCE_S, until
-from tests.support.robot_run import ANSWERED, REFUSED, T0_S, ask, ask_everything, write_run
+from tests.support.robot_run import ANSWERED, CALLS, REFUSED, T0_S, ask, ask_everything, write_run
 from tests.timing import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 BETWEEN_ATTEMPTS_S = 0.05
@@ -38,8 +38,11 @@ def bag_dir(tmp_path: Path) -> Path:
     return tmp_path / "bags"
 
 
+PROGRAM = (sys.executable, "-m", "ros2_memory.server", "data.now=latest")
+
+
 def command(*overrides: str) -> list[str]:
-    return [sys.executable, "-m", "ros2_memory.server", "data.now=latest", *overrides]
+    return [*PROGRAM, *overrides]
 
 
 def environment(bag_dir: Path, **more: str) -> dict[str, str]:
@@ -74,7 +77,9 @@ class Served:
 
 
 @contextmanager
-def serving(bag_dir: Path, log: Path, *overrides: str, **more: str) -> Iterator[Served]:
+def serving(
+    bag_dir: Path, log: Path, *overrides: str, program: Sequence[str] = PROGRAM, **more: str
+) -> Iterator[Served]:
     """The server over HTTP on a free port, from when it answers `/health`.
 
     `more` joins its environment.
@@ -82,7 +87,7 @@ def serving(bag_dir: Path, log: Path, *overrides: str, **more: str) -> Iterator[
     env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT="0", **more)
     with log.open("wb") as stderr:
         process = subprocess.Popen(
-            command(*overrides), env=env, stdout=subprocess.PIPE, stderr=stderr
+            [*program, *overrides], env=env, stdout=subprocess.PIPE, stderr=stderr
         )
     try:
         served = Served(process, 0, log)
@@ -119,6 +124,27 @@ async def test_everything_is_answered_over_sse_and_streamable_http(
         called = [each for each in served.events() if each["event"] == "tool_call"]
         assert len(called) == 2 * (len(ANSWERED) + len(REFUSED))
         assert all(each["correlation_id"] and each["duration_ms"] > 0 for each in called)
+
+
+async def replies(client: Client) -> list[tuple[str, str, bool]]:
+    """Every tool's reply, and every kind of refusal, to the letter."""
+    results = [(name, await client.call_tool(name, given)) for name, given in CALLS]
+    return [(name, str(result.content), bool(result.is_error)) for name, result in results]
+
+
+async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: Path) -> None:
+    program, *arguments = command()
+    alone = StdioServerParameters(command=program, args=arguments, env=environment(bag_dir))
+    with serving(bag_dir, tmp_path / "log") as served:
+        async with Client(served.url("/mcp")) as client:
+            expected = await replies(client)
+        async with Client(served.url("/mcp"), mode="legacy") as client:
+            assert await replies(client) == expected
+        async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
+            assert await replies(client) == expected
+    with (tmp_path / "stdio").open("w", encoding="utf-8") as log:
+        async with Client(stdio_client(alone, errlog=log)) as client:
+            assert await replies(client) == expected
 
 
 async def test_several_clients_are_served_at_once(bag_dir: Path, tmp_path: Path) -> None:

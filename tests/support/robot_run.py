@@ -92,6 +92,11 @@ REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [
     ),
     ("no_such_tool", {}, "invalid_arguments", True),
 ]
+CALLS: list[tuple[str, dict[str, Any]]] = [
+    *((name, given) for name, given, _ in ANSWERED),
+    *((name, given) for name, given, _, _ in REFUSED),
+]
+"""Every tool, and every kind of refusal."""
 
 
 def write_run(bag_dir: Path) -> None:

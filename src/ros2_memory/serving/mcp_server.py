@@ -35,7 +35,7 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
-from ros2_memory.tools.instructions import PROMPT
+from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping
@@ -155,7 +155,7 @@ class EpisodicServer(MCPServer[object]):
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
         self._resources = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
         self._templates = [each[0] for each in _TEMPLATES.values()] if has_status else []
-        self._prompt = f"{instructions}\n{PROMPT}"
+        self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
 
     async def list_tools(self) -> list[ListedTool]:
         """Returns the tools, in the order of their declaration."""
@@ -312,16 +312,16 @@ def _client(context: object) -> Hashable:
 
 
 def _listed(tool: Tool) -> ListedTool:
-    # A hint about destruction is left out of tools that only read, where it would mean nothing.
+    # Hints about what a call changes are left out of tools that only read, where they mean nothing.
     annotations = ToolAnnotations(
-        # Clients show it where a tool has no title of its own, so a title is given only once.
-        title=f"{tool.title} (blocking)" if tool.blocking else None,
         read_only_hint=not tool.writes,
         destructive_hint=False if tool.writes else None,
+        idempotent_hint=False if tool.writes else None,
+        open_world_hint=False,
     )
     return ListedTool(
         name=tool.name,
-        title=None if tool.blocking else tool.title,
+        title=f"{tool.title} (blocking)" if tool.blocking else tool.title,
         description=tool.description,
         input_schema=dict(tool.schema),
         annotations=annotations,

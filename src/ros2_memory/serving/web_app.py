@@ -13,7 +13,7 @@ import anyio
 import anyio.to_thread
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 
     from mcp.server.mcpserver import MCPServer
+    from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
     from starlette.requests import Request
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -51,6 +52,8 @@ THREADS: Final = 4
 _MCP_PATH: Final = "/mcp"
 _SESSION_HEADER: Final = "mcp-session-id"
 _INITIALIZE: Final = b'"initialize"'
+_PROGRESS: Final = b'"progressToken"'
+_EVENTS: Final = "text/event-stream"
 _OK: Final = 200
 _UNAVAILABLE: Final = 503
 
@@ -91,8 +94,9 @@ def web_app(
     # `ForgeryGuard` checks all routes instead, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     streams = server.sse_app(sse_path=STREAM_PATH, transport_security=guarded)
-    requests = server.streamable_http_app(
-        stateless_http=True, json_response=True, transport_security=guarded
+    plain, streaming = (
+        _session_manager(server, guarded, json_response=json_response)
+        for json_response in (True, False)
     )
 
     async def show_health(request: Request) -> JSONResponse:
@@ -109,13 +113,17 @@ def web_app(
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
-        async with server.session_manager.run(), anyio.create_task_group() as tasks:
+        async with plain.run(), streaming.run(), anyio.create_task_group() as tasks:
             tasks.start_soon(background)
             yield
             tasks.cancel_scope.cancel()
 
-    routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
-    routes.append(Route(RECORDING_PATH, show_recording, methods=["GET"]))
+    routes = [
+        *streams.routes,
+        Route(_MCP_PATH, McpEndpoint(plain.handle_request, streaming.handle_request)),
+        Route(HEALTH_PATH, show_health, methods=["GET"]),
+        Route(RECORDING_PATH, show_recording, methods=["GET"]),
+    ]
     if metrics is not None:
 
         async def show_metrics(_request: Request) -> Response:
@@ -133,6 +141,43 @@ def web_app(
         # machines can reach the server, the token comes first.
         app = Page(app)
     return WebApp(ForgeryGuard(app, host, admits=api_token is None))
+
+
+def _session_manager(
+    server: MCPServer[object], security: TransportSecuritySettings, *, json_response: bool
+) -> StreamableHTTPSessionManager:
+    """Returns what answers streamable HTTP without keeping sessions."""
+    server.streamable_http_app(
+        stateless_http=True, json_response=json_response, transport_security=security
+    )
+    # The library keeps the newest one alone.
+    return server.session_manager
+
+
+class McpEndpoint:
+    """Answers streamable HTTP: by JSON, or by an event stream where a client wants progress.
+
+    A reply by JSON is one message, so notifications have no place in it. `RequestLimits` has read
+    the body, so the first message holds all of it.
+    """
+
+    def __init__(self, plain: ASGIApp, streaming: ASGIApp) -> None:
+        self._plain = plain
+        self._streaming = streaming
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles an ASGI connection."""
+        if scope["method"] != "POST" or _EVENTS not in Headers(scope=scope).get("accept", ""):
+            await self._plain(scope, receive, send)
+            return
+        first = await receive()
+        unread = [first]
+
+        async def receive_again() -> Message:
+            return unread.pop() if unread else await receive()
+
+        app = self._streaming if _PROGRESS in first.get("body", b"") else self._plain
+        await app(scope, receive_again, send)
 
 
 class WebApp:

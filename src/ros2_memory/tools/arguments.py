@@ -193,7 +193,7 @@ _Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Not the default.")]
 _SearchTopic: TypeAlias = Annotated[
     _Name,
-    Field(description="Topic, or glob over topics.", examples=["/vision/*/scene_objects"]),
+    Field(description="Topic or glob.", examples=["/vision/*/scene_objects"]),
 ]
 _Fields: TypeAlias = Annotated[
     tuple[_Name, ...],
@@ -231,9 +231,7 @@ _ConditionValue: TypeAlias = Annotated[
         }
     ),
 ]
-_SearchField: TypeAlias = Annotated[
-    _Name, Field(description="Dot-path in value that alone is tested.")
-]
+_SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path of what is tested.")]
 
 
 _By: TypeAlias = Annotated[

@@ -62,7 +62,7 @@ def instructions(settings: QuerySettings, *, additions: bool = True) -> str:
     )
 
 
-PROMPT: Final = """\
+_ANSWERS: Final = """\
 Which question answers what, in one call each:
 - Where was I 10 s ago, at a time: get_position_seconds_ago, get_position_at. How fast: \
 get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
@@ -83,6 +83,24 @@ else held: get_value_when.
 - When do you usually, how often, how far, how low on each day, weekday or hour, or in each named \
 place: by, of find_matches, visits, trajectory_summary and get_topic_in_range.
 - What do you remember at all, and how well: data_time_range, memory_status, list_recorded_topics.
+"""
+_SPEC_ANSWERS: Final = """\
+Which question answers what:
+- Where was I 10 s ago, at a time: get_position_seconds_ago, get_position_at. How fast: \
+get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
+- When did you last see X, where were you: find_last_match with contains on the vision topics, \
+then get_position_at with the timestamp it gives. What did a topic say when something else held: \
+get_value_when.
+- How far and where did I drive: recent_trajectory_summary, trajectory_summary.
+- What did a topic say: get_topic_seconds_ago, get_topic_in_last. How low or high was a number: \
+the extremes there, with fields and max_samples 1.
+- What do you remember at all: data_time_range, list_recorded_topics.
+"""
+_AS_THEY_STAND: Final = """\
 Answer with the figures of the reply as they stand: ages, durations and distances are in it.
 """
-"""The text that the prompt appends to the instructions."""
+
+
+def prompt(*, additions: bool = True) -> str:
+    """Returns the text that the prompt appends to the instructions; `additions`: as there."""
+    return (_ANSWERS if additions else _SPEC_ANSWERS) + _AS_THEY_STAND

@@ -122,7 +122,7 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Span of the memory"),),
-        "What time span the memory covers, with its holes, and what time it is now. "
+        "The time span of the memory, its holes, and what time it is now. "
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, times "
         "in Unix s and local ISO, null while the memory is empty.",
         NoArguments,
@@ -131,7 +131,7 @@ _DECLARATIONS = (
     ToolDeclaration(
         _at_and_ago("topic", "A topic's value", at="at_time"),
         "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
-        "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
+        "(default {tolerance}, too little for slow topics; latched topics: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
         at_each(queries.topic_value),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -26,15 +27,19 @@ from ros2_memory.bag_dir.moment_file import (
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.backfill import Progress
 from ros2_memory.serving.mcp_server import Filling
-from tests.support.robot_run import write_run
+from ros2_memory.tools.spec_tools import build_tools, readable_tools
+from tests.support.robot_run import CALLS, write_run
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from ros2_memory.config import Settings
     from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.tools.declaration import Tool
 
 T0 = 1_795_161_600 * NS_PER_S
 
@@ -56,14 +61,26 @@ async def read(client: Client, uri: str) -> Any:
     return json.loads(content.text)
 
 
-async def test_tools_that_may_take_long_are_marked_in_their_annotations(tmp_path: Path) -> None:
+async def test_every_tool_has_a_title_which_marks_those_that_may_take_long(tmp_path: Path) -> None:
     async with Client(server(tmp_path)) as client:
-        for tool in (await client.list_tools()).tools:
-            assert tool.annotations is not None
-            assert tool.annotations.read_only_hint
-            marked = (tool.annotations.title or "").endswith(" (blocking)")
-            assert marked == (tool.description or "").startswith("Blocking")
-            assert (tool.title is None) == marked
+        listed = (await client.list_tools()).tools
+    titles = [tool.title or "" for tool in listed]
+    assert len({*titles}) == len(titles)
+    for tool, title in zip(listed, titles, strict=True):
+        assert title
+        assert title.endswith(" (blocking)") == (tool.description or "").startswith("Blocking")
+
+
+async def test_hints_say_what_a_call_changes(tmp_path: Path) -> None:
+    async with Client(server(tmp_path, "server.write_tools=true")) as client:
+        hints = {tool.name: tool.annotations for tool in (await client.list_tools()).tools}
+    assert all(hint and hint.open_world_hint is False for hint in hints.values())
+    writing = {name for name, hint in hints.items() if hint and not hint.read_only_hint}
+    assert writing == {"remember_moment"}
+    keeping = hints["remember_moment"]
+    # It adds a moment at each call, and removes nothing.
+    assert keeping
+    assert (keeping.destructive_hint, keeping.idempotent_hint) == (False, False)
 
 
 async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
@@ -168,7 +185,32 @@ async def test_with_the_specifications_tools_alone_nothing_speaks_of_the_others(
             "episodic://topics"
         ]
         assert (await client.list_resource_templates()).resource_templates == []
-        assert "find_matches" not in (client.instructions or "")
+
+
+def words_of(tools: Iterable[Tool]) -> set[str]:
+    """Their names, but for words of English that replies use for keys."""
+    return {tool.name for tool in tools} - {"visits", "compare", "recap"}
+
+
+async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    known = words_of(
+        [*build_tools(QuerySettings(), writing=True), *readable_tools(QuerySettings())]
+    )
+    async with Client(server(tmp_path, "server.tools=spec")) as client:
+        listed = (await client.list_tools()).tools
+        [prompt] = (await client.list_prompts()).prompts
+        [message] = (await client.get_prompt(prompt.name)).messages
+        read = [tool.model_dump_json() for tool in listed]
+        read += [client.instructions or "", message.model_dump_json()]
+        for name, given in CALLS:
+            if name not in known - {tool.name for tool in listed}:
+                read.append(str((await client.call_tool(name, given)).content))
+    lacking = known - {tool.name for tool in listed}
+    assert len(lacking) == len(known) - 17
+    assert [(name, text) for name in lacking for text in read if name in text] == []
+    # The words that are left out above: as names of tools they follow a colon.
+    assert [text for text in read if re.search(r": (visits|compare|recap)\b", text)] == []
 
 
 async def test_nothing_is_declared_that_never_comes(tmp_path: Path) -> None:
