@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, TypeVar, cast
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -34,6 +34,8 @@ T = TypeVar("T")
 
 _MAX_WITH_MESSAGES: Final = 64
 """Segments whose stored messages stay in memory: two days of 10 s splits."""
+_MAX_DERIVED: Final = 8192
+"""What is computed of segments and stays in memory: a recap of a week of 10 s splits has 4,000."""
 _MAX_BOUNDS: Final = 8
 """Fields whose bounds stay in memory."""
 _UNKNOWN_STATE: Final = -1
@@ -165,8 +167,10 @@ class SegmentDigests:
     def derived(self, name: str, compute: Callable[[], T]) -> T:
         """Returns what is computed from the entries of this segment once, by name.
 
-        It lives as long as the segment is in use. A name always stands for one type of value.
+        It lives as long as the segment is in use, but for what was asked for longest ago of very
+        much. A name always stands for one type of value.
         """
+        self._cache.mark_derived(self, name)
         # The type is the caller's: each name is used in one place.
         return self._cached(cast("dict[str, T]", self._derived), name, compute)
 
@@ -192,6 +196,10 @@ class SegmentDigests:
         """Drops the cached messages."""
         self._messages = {}
 
+    def release_derived(self, name: str) -> None:
+        """Drops what was computed under a name."""
+        self._derived.pop(name, None)
+
     def _numbers_of(self, bags: Sequence[BagFile]) -> list[int]:
         return [self.numbers[bag.file] for bag in bags if bag.file in self.numbers]
 
@@ -207,6 +215,7 @@ class DigestCache:
         self.bag_dir = bag_dir
         self._lock = threading.Lock()
         self._with_messages: OrderedDict[SegmentDigests, None] = OrderedDict()
+        self._derived: OrderedDict[tuple[ref[SegmentDigests], str], None] = OrderedDict()
         self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
     def digests_for(self, segment: Segment, as_of: int) -> SegmentDigests:
@@ -240,6 +249,18 @@ class DigestCache:
             self._with_messages.move_to_end(digests)
             if len(self._with_messages) > _MAX_WITH_MESSAGES:
                 self._with_messages.popitem(last=False)[0].release_messages()
+
+    def mark_derived(self, digests: SegmentDigests, name: str) -> None:
+        """Marks what is computed from a segment as used; the least recently used is dropped."""
+        with self._lock:
+            self._derived[ref(digests), name] = None
+            self._derived.move_to_end((ref(digests), name))
+            if len(self._derived) <= _MAX_DERIVED:
+                return
+            (oldest, old_name), _ = self._derived.popitem(last=False)
+        segment = oldest()
+        if segment is not None:
+            segment.release_derived(old_name)
 
     def cached_answer(
         self, question: str, numbers: Sequence[int], parse: Callable[[str], T]

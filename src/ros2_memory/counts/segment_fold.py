@@ -8,24 +8,24 @@ and reported.
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
 
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Deadline, Ns
-from ros2_memory.history.bag_groups import DigestKind, Group, StoredDigests, groups_of
-from ros2_memory.history.duplicates import COPY_HORIZON_NS
+from ros2_memory.core.timebase import NS_PER_S, Deadline, Ns
+from ros2_memory.history.bag_fold import shares_of
+from ros2_memory.history.bag_groups import DigestKind, Group, StoredDigests
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.core.errors import UndecodableError
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.history.bag_fold import Share
     from ros2_memory.history.bag_groups import Span
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Segment
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -92,7 +92,7 @@ class SegmentFold(Generic[T, R]):
         reading = _Reading(view)
         parts: list[R] = []
         since: Ns | None = None
-        for share in reversed(_shares_of(view, topic, window)):
+        for share in reversed(shares_of(view, topic, window)):
             view.bags.check_deadline()
             part, since = self._share(view, topic, share, window, reading)
             if part is not None:
@@ -108,11 +108,11 @@ class SegmentFold(Generic[T, R]):
         return Folded(tuple(reversed(parts)), since)
 
     def _share(
-        self, view: View, topic: str, share: _Share, window: TimeWindow, reading: _Reading
+        self, view: View, topic: str, share: Share, window: TimeWindow, reading: _Reading
     ) -> tuple[R | None, Ns | None]:
         """Returns what is folded of a share, and since when, if not all was read in time."""
         digests = view.bags.digests_of(share.segment)
-        if digests is None or not (share.alone and window.covers(share.first, share.last)):
+        if digests is None or not share.is_covered_by(window):
             return self._fold(view, topic, share, window, reading)[:2]
         inner = [edge for edge in self.edges if share.first < edge <= share.last]
         # The type of a name is one: `name` is part of it.
@@ -129,19 +129,14 @@ class SegmentFold(Generic[T, R]):
         return folded, since
 
     def _fold(
-        self, view: View, topic: str, share: _Share, window: TimeWindow, reading: _Reading
+        self, view: View, topic: str, share: Share, window: TimeWindow, reading: _Reading
     ) -> tuple[R | None, Ns | None, bool]:
         """Returns as `_share`, and whether groups were left unread for this question."""
-        # Wide enough to see the bags before that a group may have begun with.
-        begin = max(share.first - COPY_HORIZON_NS, MIN_NS)
-        inside = window.intersect(TimeWindow(begin, share.last + 1))
-        stored = StoredDigests(view, topic, self.kind, inside)
+        stored = StoredDigests(view, topic, self.kind, share.inside(window))
         found: list[Digested[T]] = []
         since: Ns | None = None
         left_unread = False
-        for group in reversed(groups_of(view.stream, topic, inside)):
-            if view.snapshot.timeline.segment_of(group.bags[0].bag) is not share.segment:
-                continue
+        for group in reversed(share.groups(view, topic, window)):
             known = stored.of(group) if group.is_whole and not self._is_cut(group) else None
             if known is not None and not self._lacks(known[0]):
                 found.append(Digested(known[0], *known[1]))
@@ -223,73 +218,3 @@ class _Completeness:
     def is_complete(self) -> bool:
         """Whether all could be read so far."""
         return self._view.notes.complete
-
-
-@dataclass(frozen=True, slots=True)
-class _Share:
-    """The groups of bags whose first bag is of one segment.
-
-    Attributes:
-        segment: the segment.
-        first: log time of the first message of its bags.
-        last: of the last one of all groups.
-        begins_in: its bags that belong to a group of the segment before.
-        ends_in: bags of the next segment that belong to its last group.
-        alone: whether these bags alone decide what is in them.
-    """
-
-    segment: Segment
-    first: Ns
-    last: Ns
-    begins_in: tuple[str, ...] = ()
-    ends_in: tuple[str, ...] = ()
-    alone: bool = True
-
-
-def _shares_of(view: View, topic: str, window: TimeWindow) -> list[_Share]:
-    """Returns the shares of all segments with a topic in a window, in order."""
-    if view.stream.may_be_relatched([topic]):
-        # Any bag may hold the original of a duplicate in any other.
-        bags = view.stream.overlapping_bags([topic], window)
-        if not bags:
-            return []
-        segment = view.snapshot.timeline.segment_of(bags[0].bag)
-        return [_Share(segment, bags[0].first, max(each.last for each in bags), alone=False)]
-    shares: list[_Share] = []
-    for segment in view.snapshot.timeline.segments:
-        span = segment.spans.get(topic)
-        if span is None or not window.overlaps(*span):
-            continue
-        crossing = _crossing(view, topic, segment) if shares else ()
-        if crossing:
-            before = shares[-1]
-            last = max(before.last, *(each.last for each in crossing))
-            names = tuple(f"{each.bag.file} {each.bag.size}" for each in crossing)
-            shares[-1] = replace(before, last=last, ends_in=names)
-            shares.append(_Share(segment, *span, begins_in=names))
-        else:
-            shares.append(_Share(segment, *span))
-    return shares
-
-
-def _crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:
-    """Returns the bags from a segment on that belong to a group which begins before it."""
-    timeline = view.snapshot.timeline
-    begin = segment.spans[topic][0]
-    end = begin
-
-    def crosses(group: Group) -> bool:
-        inside = [timeline.segment_of(each.bag) is segment for each in group.bags]
-        return any(inside) and not all(inside)
-
-    while True:
-        near = TimeWindow(
-            max(begin - COPY_HORIZON_NS, MIN_NS), min(end + COPY_HORIZON_NS + 1, MAX_NS)
-        )
-        group = next(filter(crosses, groups_of(view.stream, topic, near)), None)
-        if group is None:
-            return ()
-        last = max(each.last for each in group.bags)
-        if last <= end:
-            return tuple(each for each in group.bags if each.first >= begin)
-        end = last

@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, PoseCollector, TrajectoryBuilder
+from ros2_memory.analysis.motion.trajectory import (
+    MAX_WAYPOINTS,
+    PoseCollector,
+    TrajectoryBuilder,
+    joined_poses,
+)
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
+from ros2_memory.history.bag_fold import Fold
+from ros2_memory.history.bag_groups import DigestKind, store_shared
 from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
 
 if TYPE_CHECKING:
@@ -84,7 +90,9 @@ def driven_path(
         add=lambda messages: add_poses(view, builder.add, decoder, messages, failures),
         collect=collect,
         join=lambda digest, _span: builder.join(digest),
+        reduce=lambda found: joined_poses(found, fastest),
         failures=failures,
+        name=f"{fastest:g}",
     ).over(view, topic, window)
     if failures:
         error = failures[0]

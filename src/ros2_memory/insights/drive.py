@@ -17,6 +17,7 @@ from ros2_memory.analysis.motion.standstills import (
     StandstillBuilder,
     StandstillCollector,
     StandstillDigest,
+    StandstillRun,
 )
 from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
@@ -27,14 +28,15 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
+from ros2_memory.history.bag_fold import Fold
+from ros2_memory.history.bag_groups import DigestKind, store_shared
 from ros2_memory.history.driven_path import add_poses, driven_path
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
@@ -155,6 +157,13 @@ def _add_places(
     return add_poses(view, add_place, decoder, messages, failures)
 
 
+def _in_one(
+    found: Sequence[tuple[StandstillDigest, Span]],
+) -> Sequence[tuple[StandstillRun, Span]]:
+    run = StandstillRun.of([digest for digest, _ in found])
+    return [(run, (found[0][1][0], found[-1][1][1]))]
+
+
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
@@ -187,6 +196,7 @@ def _standstills_in(
         add=lambda messages: _add_places(view, builder, decoder, messages, failures),
         collect=collect,
         join=lambda digest, _span: builder.join(digest),
+        reduce=_in_one,
         failures=failures,
     ).over(view, topic, window.widened(CONTEXT_NS))
     found = builder.standstills()

@@ -14,7 +14,8 @@ from ros2_memory.analysis.topic_events import (
 )
 from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.history.bag_groups import DigestKind, Fold, store_shared
+from ros2_memory.history.bag_fold import Fold
+from ros2_memory.history.bag_groups import DigestKind, store_shared
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -61,16 +62,16 @@ def _join(builder: TopicEventsBuilder, events: TopicEvents | None, span: Span) -
 
 def _reduced(
     found: Sequence[tuple[TopicEvents | None, Span]],
-) -> tuple[TopicEvents | None, Span] | None:
-    """Returns the events of several bags as of one; None where something would be left out."""
+) -> Sequence[tuple[TopicEvents | None, Span]]:
+    """Returns the events of several bags as of one, unless something would be left out."""
     builder = TopicEventsBuilder()
     for events, span in found:
         _join(builder, events, span)
     whole = builder.events()
     parts = [each for each, _ in found if each is not None]
     if whole is None or whole.all_left_out > sum(each.all_left_out for each in parts):
-        return None
-    return whole, (found[0][1][0], found[-1][1][1])
+        return found
+    return [(whole, (found[0][1][0], found[-1][1][1]))]
 
 
 def store_shared_events(view: View, topic: str, window: TimeWindow) -> int:

@@ -168,7 +168,11 @@ class SpeedDropBuilder:
                 self._add(row)
         self.drops += bag.drops
         if bag.tail:
-            self._finder.rows = deque(_decode(bag.tail), _ROWS)
+            self.go_on_after(bag)
+
+    def go_on_after(self, bag: SpeedDropDigest) -> None:
+        """Goes on as after a bag, which must have a tail, whatever came before it."""
+        self._finder.rows = deque(_decode(bag.tail), _ROWS)
 
     def _add(self, row: _Row) -> None:
         drop = self._finder.add(row)

@@ -172,6 +172,46 @@ class StandstillDigest:
     drops: SpeedDropDigest = NO_DROPS
 
 
+@dataclass(frozen=True, slots=True)
+class StandstillRun:
+    """Consecutive bags, joined as far as no bag before or after them has a say.
+
+    Attributes:
+        lead: the first bags, up to one at whose end no standstill is open; all where there is none.
+        found: the standstills of the bags after these, up to the last one of that kind.
+        drops: of speed, in the same bags.
+        last: the last bag of that kind.
+        trail: the bags after it.
+    """
+
+    lead: tuple[StandstillDigest, ...]
+    found: tuple[Standstill, ...] = ()
+    drops: tuple[SpeedDrop, ...] = ()
+    last: StandstillDigest | None = None
+    trail: tuple[StandstillDigest, ...] = ()
+
+    @classmethod
+    def of(cls, bags: Sequence[StandstillDigest]) -> StandstillRun:
+        """Returns the run of some bags, in order."""
+        over = [nth for nth, bag in enumerate(bags) if _ends_over(bag)]
+        if len(over) < 2:
+            return cls(tuple(bags))
+        first, last = over[0], over[-1]
+        found, drops = StandstillBuilder().run_after(bags[first], bags[first + 1 : last + 1])
+        return cls(tuple(bags[: first + 1]), found, drops, bags[last], tuple(bags[last + 1 :]))
+
+
+def _ends_over(bag: StandstillDigest) -> bool:
+    """Returns whether no standstill is open at the end of a bag, whatever came before it.
+
+    All that ended in it did so before its last slots, in which the next one may begin.
+    """
+    if not (bag.tail and bag.drops.tail) or bag.head_until > bag.tail_since:
+        return False
+    end = bag.chains[-1].end if bag.chains else 0
+    return end is not None and end <= bag.tail_since
+
+
 class _Slot:
     """The poses of one slot of time; none is added once `mean` or `bends` were asked for."""
 
@@ -476,8 +516,11 @@ class StandstillBuilder:
         self._decode_tail()
         self._add(TimedPosition(time, _rounded(position)))
 
-    def join(self, bag: StandstillDigest) -> None:
-        """Takes all poses of a bag that come next, as if they were added one by one."""
+    def join(self, bag: StandstillDigest | StandstillRun) -> None:
+        """Takes all poses of a bag, or of a run of them, that come next, as if one by one."""
+        if isinstance(bag, StandstillRun):
+            self._join_run(bag)
+            return
         self._drops.join(bag.drops)
         if not bag.tail:
             self._decode_tail()
@@ -495,6 +538,34 @@ class StandstillBuilder:
         for each in chains:
             self._add_chain(_Chain(each.start), each)
         self._tail = (bag.tail, bag.tail_since)
+
+    def _join_run(self, run: StandstillRun) -> None:
+        for each in run.lead:
+            self.join(each)
+        if run.last is None:
+            return
+        self._done += run.found
+        self._drops.drops += run.drops
+        self._go_on_after(run.last)
+        for each in run.trail:
+            self.join(each)
+
+    def _go_on_after(self, bag: StandstillDigest) -> None:
+        """Goes on as after a bag at whose end no standstill is open."""
+        self._tail = (bag.tail, bag.tail_since)
+        self._drops.go_on_after(bag.drops)
+
+    def run_after(
+        self, bag: StandstillDigest, later: Sequence[StandstillDigest]
+    ) -> tuple[tuple[Standstill, ...], tuple[SpeedDrop, ...]]:
+        """Returns the standstills and drops of bags after one at whose end none is open.
+
+        At the end of the last one none may be open either. Called once, before all else.
+        """
+        self._go_on_after(bag)
+        for each in later:
+            self.join(each)
+        return tuple(self._done), tuple(self._drops.drops)
 
     def standstills(self) -> tuple[Standstill, ...]:
         """Returns the standstills of all poses, in order; no pose may be added after."""

@@ -8,6 +8,7 @@ limit on the count of vertices widens it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import TYPE_CHECKING, Final, Literal
 
 from ros2_memory.analysis.motion.odometry import (
@@ -20,10 +21,12 @@ from ros2_memory.analysis.motion.odometry import (
     is_place,
 )
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
-from ros2_memory.analysis.motion.polyline import DrawnPath
+from ros2_memory.analysis.motion.polyline import PARTED, DrawnPath
 from ros2_memory.core.geometry import normalised, yaw
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.core.model import Pose, Quaternion, Vector3
     from ros2_memory.core.timebase import Ns
 
@@ -205,6 +208,42 @@ class TrajectoryBuilder(_Poses):
             poses=self._poses,
             invalid=self._invalid,
         )
+
+
+def joined_poses(
+    found: Sequence[tuple[PoseDigest, tuple[Ns, Ns]]], max_plausible_speed_mps: float
+) -> list[tuple[PoseDigest, tuple[Ns, Ns]]]:
+    """Returns the digests of consecutive bags, with their times, as of few bags.
+
+    Those of few poses stay as they are: what comes before and after them decides how they are
+    measured.
+    """
+    joined: list[tuple[PoseDigest, tuple[Ns, Ns]]] = []
+    for has_legs, some in groupby(found, key=lambda each: each[0].totals.head is not None):
+        bags = [*some]
+        if not has_legs or len(bags) == 1:
+            joined += bags
+            continue
+        motion = Motion(max_plausible_speed_mps)
+        vertices: list[Vertex] = []
+        for each, _ in bags:
+            if motion.join(each.totals):
+                vertices.append(PARTED)
+            vertices += each.vertices
+        twist: float | None = None
+        for each, _ in bags:
+            twist = faster(twist, each.twist)
+        whole = PoseDigest(
+            poses=sum(each.poses for each, _ in bags),
+            invalid=sum(each.invalid for each, _ in bags),
+            totals=motion.totals,
+            twist=twist,
+            frames=tuple(dict.fromkeys(frame for each, _ in bags for frame in each.frames)),
+            vertices=tuple(vertices),
+            error_m=max(each.error_m for each, _ in bags),
+        )
+        joined.append((whole, (bags[0][1][0], bags[-1][1][1])))
+    return joined
 
 
 class PoseCollector(_Poses):

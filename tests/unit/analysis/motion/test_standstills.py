@@ -15,6 +15,8 @@ from ros2_memory.analysis.motion.standstills import (
     Standstill,
     StandstillBuilder,
     StandstillCollector,
+    StandstillDigest,
+    StandstillRun,
 )
 from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
 from ros2_memory.core.timebase import NS_PER_S
@@ -74,9 +76,9 @@ def cuts_of(poses: Poses, parts: list[float]) -> list[int]:
     return sorted({max(1, int(part * (len(poses) - 1))) for part in parts})
 
 
-def from_bags(poses: Poses, cuts: list[int]) -> tuple[Standstill, ...]:
-    """From bags that end before the poses at these places, as the catalogue gives them back."""
-    builder = StandstillBuilder()
+def bags_of(poses: Poses, cuts: list[int]) -> list[StandstillDigest]:
+    """Bags that end before the poses at these places, as the catalogue gives them back."""
+    bags: list[StandstillDigest] = []
     for begin, end in pairwise([0, *cuts, len(poses)]):
         collector = StandstillCollector()
         for time, position in poses[begin:end]:
@@ -85,7 +87,14 @@ def from_bags(poses: Poses, cuts: list[int]) -> tuple[Standstill, ...]:
         if digest is not None:
             again = decode_standstills(encode_standstills(digest))
             assert again == digest
-            builder.join(again)
+            bags.append(again)
+    return bags
+
+
+def from_bags(poses: Poses, cuts: list[int]) -> tuple[Standstill, ...]:
+    builder = StandstillBuilder()
+    for each in bags_of(poses, cuts):
+        builder.join(each)
     return builder.standstills()
 
 
@@ -163,6 +172,38 @@ def test_noise_is_cut_into_bags_as_it_is_found_without_cuts(
     for one, other in zip(whole, cut, strict=True):
         assert abs(one.start - other.start) <= made.period * S + 1
         assert abs(one.end - other.end) <= made.period * S + 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.one_of(worlds(), worlds(noise=0.01)),
+    st.integers(2, 15),
+    st.lists(st.integers(1, 12), min_size=1, max_size=4),
+)
+def test_bags_that_are_joined_beforehand_are_as_those_that_come_one_by_one(
+    made: World, bag_s: int, sizes: list[int]
+) -> None:
+    legs = len(made.poses) * made.period / bag_s
+    bags = bags_of(made.poses, cuts_of(made.poses, [nth / legs for nth in range(1, int(legs) + 1)]))
+    alone, joined = StandstillBuilder(), StandstillBuilder()
+    for each in bags:
+        alone.join(each)
+    rest = [*bags]
+    for size in sizes * len(bags):
+        run, rest = rest[:size], rest[size:]
+        if run:
+            joined.join(StandstillRun.of(run))
+    assert joined.standstills() == alone.standstills()
+    assert [*joined.drops] == [*alone.drops]
+    assert joined.last == alone.last
+
+
+def test_of_bags_that_are_joined_beforehand_few_are_joined_again() -> None:
+    made = world([(40.0, 0.0), (20.0, 0.5), (3.5, 0.0), (7.0, -0.5)] * 20, noise=0.005)
+    run = StandstillRun.of(bags_of(made.poses, [*range(500, len(made.poses), 500)]))
+    assert len(run.lead) + len(run.trail) <= 12
+    assert len(run.found) >= 30
+    assert run.drops
 
 
 @pytest.mark.parametrize("bag_s", [None, 1.0, 10.0, 60.0])

@@ -11,12 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.odometry import MotionTotals
+from ros2_memory.analysis.motion.odometry import MotionTotals, PoseDigest
 from ros2_memory.analysis.motion.trajectory import (
     TOLERANCE_M,
     PoseCollector,
     Trajectory,
     TrajectoryBuilder,
+    joined_poses,
 )
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
@@ -243,6 +244,38 @@ def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], c
     assert [point.position for point in joined.waypoints if point.jump] == [
         point.position for point in whole.waypoints if point.jump
     ] or not drawable
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 0.1, 0.5, 0.6, 40.0, -0.5]), min_size=40, max_size=160),
+    st.lists(st.integers(1, 60), min_size=1, max_size=5),
+    st.integers(1, 4),
+)
+def test_bags_that_are_joined_beforehand_are_as_those_that_come_one_by_one(
+    steps: list[float], sizes: list[int], at_once: int
+) -> None:
+    rest = driven(along_x(*accumulate(steps)))
+    found: list[tuple[PoseDigest, tuple[int, int]]] = []
+    for size in sizes * len(rest):
+        part, rest = rest[:size], rest[size:]
+        collector = PoseCollector(LIMIT_MPS)
+        for time, pose, speed in part:
+            collector.add(time, pose, speed)
+        if part:
+            found.append((collector.digest(), (part[0][0], part[-1][0])))
+    alone, joined = TrajectoryBuilder(LIMIT_MPS, 200), TrajectoryBuilder(LIMIT_MPS, 200)
+    for digest, _ in found:
+        alone.join(digest)
+    for nth in range(0, len(found), at_once):
+        for digest, _ in joined_poses(found[nth : nth + at_once], LIMIT_MPS):
+            joined.join(digest)
+    one, other = alone.result(), joined.result()
+    assert other.totals.distance_m == pytest.approx(one.totals.distance_m, abs=1e-9)
+    assert other.totals.path_sum_m == pytest.approx(one.totals.path_sum_m, abs=1e-9)
+    for name in ("jumps", "gaps", "resets", "speed_mps", "duration_s"):
+        assert getattr(other.totals, name) == getattr(one.totals, name)
+    for name in ("waypoints", "waypoint_error_m", "poses", "invalid", "max_speed"):
+        assert getattr(other, name) == getattr(one, name)
 
 
 def test_a_path_in_very_many_pieces_is_held_in_bounded_memory() -> None:

@@ -1,0 +1,246 @@
+"""Joins what bags hold of a topic: whole bags by their digests, the others by their messages.
+
+What is joined from consecutive bags of one segment serves every later question, so that a week need
+not be joined anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from weakref import WeakKeyDictionary
+
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.bag_groups import DigestKind, Group, Span, StoredDigests, groups_of
+from ros2_memory.history.duplicates import COPY_HORIZON_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.core.errors import UndecodableError
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.view import View
+    from ros2_memory.index.segment import Segment
+    from ros2_memory.index.timeline import Timeline
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_Crossings: TypeAlias = "dict[tuple[str, Segment], tuple[BagSpan, ...]]"
+_CROSSINGS: WeakKeyDictionary[Timeline, _Crossings] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """The groups of bags whose first bag is of one segment.
+
+    Attributes:
+        segment: the segment.
+        first: log time of the first message of its bags.
+        last: of the last one of all groups.
+        begins_in: its bags that belong to a group of the segment before.
+        ends_in: bags of the next segment that belong to its last group.
+        alone: whether these bags alone decide what is in them.
+    """
+
+    segment: Segment
+    first: Ns
+    last: Ns
+    begins_in: tuple[str, ...] = ()
+    ends_in: tuple[str, ...] = ()
+    alone: bool = True
+
+    def is_covered_by(self, window: TimeWindow) -> bool:
+        """Returns whether all groups lie in a window, and no other bag matters to them."""
+        return self.alone and window.covers(self.first, self.last)
+
+    def inside(self, window: TimeWindow) -> TimeWindow:
+        """Returns the part of a window that holds the groups.
+
+        Wide enough to see the bags before that a group may have begun with.
+        """
+        begin = max(self.first - COPY_HORIZON_NS, MIN_NS)
+        return window.intersect(TimeWindow(begin, self.last + 1))
+
+    def groups(self, view: View, topic: str, window: TimeWindow) -> list[Group]:
+        """Returns the groups with messages in a window, in order."""
+        segment_of = view.snapshot.timeline.segment_of
+        return [
+            group
+            for group in groups_of(view.stream, topic, self.inside(window))
+            if segment_of(group.bags[0].bag) is self.segment
+        ]
+
+
+def shares_of(view: View, topic: str, window: TimeWindow) -> list[Share]:
+    """Returns the shares of all segments with a topic in a window, in order."""
+    if view.stream.may_be_relatched([topic]):
+        # Any bag may hold the original of a duplicate in any other.
+        bags = view.stream.overlapping_bags([topic], window)
+        if not bags:
+            return []
+        segment = view.snapshot.timeline.segment_of(bags[0].bag)
+        return [Share(segment, bags[0].first, max(each.last for each in bags), alone=False)]
+    shares: list[Share] = []
+    for segment in view.snapshot.timeline.segments:
+        span = segment.spans.get(topic)
+        if span is None or not window.overlaps(*span):
+            continue
+        crossing = _crossing(view, topic, segment) if shares else ()
+        if crossing:
+            before = shares[-1]
+            last = max(before.last, *(each.last for each in crossing))
+            names = tuple(f"{each.bag.file} {each.bag.size}" for each in crossing)
+            shares[-1] = replace(before, last=last, ends_in=names)
+            shares.append(Share(segment, *span, begins_in=names))
+        else:
+            shares.append(Share(segment, *span))
+    return shares
+
+
+def _crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:
+    """Returns the bags from a segment on that belong to a group which begins before it."""
+    known = _CROSSINGS.setdefault(view.snapshot.timeline, {})
+    key = (topic, segment)
+    if key not in known:
+        known[key] = _found_crossing(view, topic, segment)
+    return known[key]
+
+
+def _found_crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:
+    timeline = view.snapshot.timeline
+    begin = segment.spans[topic][0]
+    end = begin
+
+    def crosses(group: Group) -> bool:
+        inside = [timeline.segment_of(each.bag) is segment for each in group.bags]
+        return any(inside) and not all(inside)
+
+    while True:
+        near = TimeWindow(
+            max(begin - COPY_HORIZON_NS, MIN_NS), min(end + COPY_HORIZON_NS + 1, MAX_NS)
+        )
+        group = next(filter(crosses, groups_of(view.stream, topic, near)), None)
+        if group is None:
+            return ()
+        last = max(each.last for each in group.bags)
+        if last <= end:
+            return tuple(each for each in group.bags if each.first >= begin)
+        end = last
+
+
+@dataclass(frozen=True, slots=True)
+class Fold(Generic[T, R]):
+    """How the messages of a topic and the digests of whole bags are joined into one result.
+
+    Attributes:
+        kind: the digests.
+        add: adds messages; returns the times of the first and the last of them, if any.
+        collect: makes a digest of messages, if they amount to one; their times as for `add`.
+        join: adds a digest, or what `reduce` returned.
+        reduce: joins consecutive digests, at least one, as far as that can be done for whatever
+            comes before and after them. It stays in memory, so later questions need not.
+        failures: where `add` and `collect` put messages that cannot be decoded; a digest without
+            these is not stored.
+        name: of what `reduce` depends on besides the kind.
+    """
+
+    kind: DigestKind[T]
+    add: Callable[[Iterable[StoredMessage]], Span | None]
+    collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]]
+    join: Callable[[T | R, Span], None]
+    reduce: Callable[[Sequence[tuple[T, Span]]], Sequence[tuple[T | R, Span]]]
+    failures: Sequence[UndecodableError] = ()
+    name: str = ""
+
+    def over(self, view: View, topic: str, window: TimeWindow) -> Span | None:
+        """Folds a window: groups that lie in it by their digests, the others by their messages.
+
+        Returns the times of the first and the last message; None where there is none.
+        """
+        spans: list[Span] = []
+        for share in shares_of(view, topic, window):
+            view.bags.check_deadline()
+            digests = view.bags.digests_of(share.segment)
+            stored = StoredDigests(view, topic, self.kind, share.inside(window))
+            known = None
+            if digests is not None and share.is_covered_by(window):
+                name = f"{topic} {share.begins_in} {share.ends_in}"
+                groups = partial(share.groups, view, topic, window)
+                known = self._reduced(digests, name, stored, groups)
+            if known is not None:
+                spans += self._joined(known)
+                continue
+            for is_whole, run in groupby(share.groups(view, topic, window), _is_whole):
+                if is_whole:
+                    spans += self._whole(digests, topic, stored, [*run])
+                    continue
+                found = [self.add(group.messages()) for group in run]
+                spans += [span for span in found if span is not None]
+        return (spans[0][0], spans[-1][1]) if spans else None
+
+    def _whole(
+        self,
+        digests: SegmentDigests | None,
+        topic: str,
+        stored: StoredDigests[T],
+        run: Sequence[Group],
+    ) -> Iterator[Span]:
+        """Folds consecutive groups that lie in the window, of bags that no crash cut short."""
+        known = None
+        if digests is not None and len(run) > 1:
+            # Bags of other segments decide which bags are one group.
+            name = f"{topic} {run[0].bags[0].bag.file} {[len(each.bags) for each in run]}"
+            known = self._reduced(digests, name, stored, partial(iter, run))
+        if known is None:
+            found = [self._digest(stored, group) for group in run]
+            # Reduced as above, so that rounding does not depend on what is stored.
+            known = self.reduce([each for each in found if each is not None]) if any(found) else ()
+        yield from self._joined(known)
+
+    def _digest(self, stored: StoredDigests[T], group: Group) -> tuple[T, Span] | None:
+        """Returns the digest of a whole group, made from its messages where none is stored."""
+        known = stored.of(group)
+        if known is not None:
+            return known
+        failed = len(self.failures)
+        made, span = self.collect(group.messages())
+        if made is None or span is None:
+            return None
+        if failed == len(self.failures):
+            stored.store(group, made, span)
+        return made, span
+
+    def _reduced(
+        self,
+        digests: SegmentDigests,
+        name: str,
+        stored: StoredDigests[T],
+        groups: Callable[[], Iterable[Group]],
+    ) -> Sequence[tuple[T | R, Span]] | None:
+        """Returns what is joined from groups of a segment; None where some digest is not stored."""
+
+        def compute() -> Sequence[tuple[T | R, Span]] | None:
+            found: list[tuple[T, Span]] = []
+            for group in groups():
+                known = stored.of(group) if _is_whole(group) else None
+                if known is None:
+                    return None
+                found.append(known)
+            return self.reduce(found) if found else ()
+
+        # The type of a name is one: it begins with the kind of the digests.
+        return digests.derived(f"{self.kind.name} joined {self.name} {name}", compute)
+
+    def _joined(self, known: Iterable[tuple[T | R, Span]]) -> Iterator[Span]:
+        for digest, span in known:
+            self.join(digest, span)
+            yield span
+
+
+def _is_whole(group: Group) -> bool:
+    return group.is_whole
