@@ -198,13 +198,31 @@ def serve(script: list[str], home: Path) -> None:
 def test_every_server_that_a_desktop_client_is_told_of_starts_and_answers(
     block: Block, home: Path
 ) -> None:
-    servers = json.loads(block.text)["mcpServers"]
+    [(key, servers)] = json.loads(block.text.replace("/home/me", str(home))).items()
+    assert key in {"mcpServers", "servers", "context_servers"}
+    (home / "ros2-memory").mkdir()
+    (home / "ros2-memory/bin").symlink_to(PROGRAMS)
     for name, entry in servers.items():
-        own = {key: value.replace("/home/me", str(home)) for key, value in entry["env"].items()}
-        program = str(PROGRAMS / entry["command"])
-        told = anyio.run(asked, program, entry.get("args", []), {**environment(home), **own})
+        if "command" not in entry:
+            served = load_settings(["server.transport=sse"], env={}).server
+            address = {entry.get("url"), entry.get("serverUrl")} - {None}
+            assert address == {f"http://127.0.0.1:{served.port}/mcp"}
+            assert entry.get("type", "http") == "http"
+            continue
+        env = {**environment(home), **entry.get("env", {})}
+        env["PATH"] = f"{stand_ins(home)}{os.pathsep}{env['PATH']}"
+        told = anyio.run(asked, entry["command"], entry.get("args", []), env)
         assert told["name"] == name
         assert told["reply"]["bags"] == 6
+
+
+def stand_ins(home: Path) -> Path:
+    """A folder with an `ssh` to this machine, without a network."""
+    folder = home / "stand-ins"
+    folder.mkdir(exist_ok=True)
+    (folder / "ssh").write_text('#!/bin/sh\nshift\nexec sh -c "$*"\n', encoding="utf-8")
+    (folder / "ssh").chmod(0o755)
+    return folder
 
 
 async def asked(program: str, arguments: list[str], env: Mapping[str, str]) -> dict[str, Any]:

@@ -91,6 +91,11 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "a simulated robot, asked questions with known answers",
         {0: "all answers were right", 1: "one was wrong"},
     ),
+    "serve": CommandEntry(
+        "serve.serve",
+        "answer questions over MCP, as ros2-memory-server",
+        {0: "it was ended", 1: "it cannot listen on the address"},
+    ),
     "index": CommandEntry(
         "index.index",
         "look into every bag once, so that answers take milliseconds",

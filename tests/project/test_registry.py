@@ -1,0 +1,109 @@
+"""`server.json`, by which the MCP registry lists the server.
+
+The checks follow the registry's schema (2025-12-11) and its requirements for packages of PyPI; the
+schema itself is not in this repository.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from mcp import Client
+from mcp.client.stdio import StdioServerParameters, stdio_client
+from mcp.types import TextContent
+
+from tests.support.memories import ROOT
+from tests.support.robot_run import write_run
+
+SERVER: Any = json.loads((ROOT / "server.json").read_text(encoding="utf-8"))
+[PACKAGE] = SERVER["packages"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SCHEMA = "https://static.modelcontextprotocol.io/schemas/2025-12-11/server.schema.json"
+KEYS = {
+    "server": {"$schema", "name", "title", "description", "version", "packages"},
+    "package": {
+        "registryType",
+        "identifier",
+        "version",
+        "runtimeHint",
+        "transport",
+        "packageArguments",
+        "environmentVariables",
+    },
+    "argument": {"type", "value", "description"},
+    "variable": {
+        "name",
+        "description",
+        "isRequired",
+        "format",
+        "placeholder",
+        "choices",
+        "default",
+    },
+}
+"""Those of the schema that are used here: a key that it does not know would be a misspelt one."""
+
+
+def test_it_has_what_the_schema_asks_for_and_no_key_that_it_does_not_know() -> None:
+    assert SERVER["$schema"] == SCHEMA
+    assert SERVER.keys() <= KEYS["server"]
+    assert re.fullmatch(r"[a-zA-Z0-9.-]+/[a-zA-Z0-9._-]+", SERVER["name"])
+    assert 3 <= len(SERVER["name"]) <= 200
+    assert 1 <= len(SERVER["description"]) <= 100
+    assert 1 <= len(SERVER["title"]) <= 100
+    assert PACKAGE.keys() <= KEYS["package"]
+    assert {"registryType", "identifier", "transport"} <= PACKAGE.keys()
+    for argument in PACKAGE["packageArguments"]:
+        assert argument.keys() <= KEYS["argument"]
+        assert argument["type"] == "positional"
+        assert argument["value"]
+    for variable in PACKAGE["environmentVariables"]:
+        assert variable.keys() <= KEYS["variable"]
+        assert variable.get("format", "string") in {"string", "number", "boolean", "filepath"}
+        assert isinstance(variable.get("default", ""), str)
+        assert isinstance(variable.get("isRequired", False), bool)
+
+
+def test_it_names_this_release_of_this_package_on_pypi() -> None:
+    assert (PACKAGE["registryType"], PACKAGE["identifier"]) == ("pypi", PROJECT["name"])
+    assert SERVER["version"] == PACKAGE["version"] == PROJECT["version"]
+
+
+def test_the_readme_that_pypi_shows_proves_whose_the_package_is() -> None:
+    readme = (ROOT / PROJECT["readme"]).read_text(encoding="utf-8")
+    assert re.findall(r"mcp-name: (\S+)", readme) == [SERVER["name"]]
+
+
+def test_every_variable_is_one_that_the_programs_read() -> None:
+    example = (ROOT / ".env.example").read_text(encoding="utf-8")
+    known = set(re.findall(r"^([A-Z_]+)=", example, re.MULTILINE))
+    assert {variable["name"] for variable in PACKAGE["environmentVariables"]} <= known
+
+
+async def test_a_client_that_runs_the_package_so_is_answered(tmp_path: Path) -> None:
+    write_run(tmp_path / "bags")
+    assert PACKAGE["runtimeHint"] == "uvx"
+    assert PACKAGE["transport"] == {"type": "stdio"}
+    # uvx runs the program of the package's own name.
+    program = shutil.which(PACKAGE["identifier"], path=str(Path(sys.executable).parent))
+    assert program
+    arguments = [each["value"] for each in PACKAGE["packageArguments"]]
+    given = {"MEMORY_BAG_DIR": str(tmp_path / "bags")}
+    for variable in PACKAGE["environmentVariables"]:
+        if variable["name"] not in given:
+            assert not variable.get("isRequired")
+            given[variable["name"]] = variable["default"]
+    server = StdioServerParameters(command=program, args=arguments, env=given)
+    with Path(os.devnull).open("w", encoding="utf-8") as log:
+        async with Client(stdio_client(server, errlog=log)) as client:
+            result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 1})
+    [block] = result.content
+    assert isinstance(block, TextContent)
+    assert json.loads(block.text)["topic"] == "/odom"
