@@ -17,7 +17,7 @@ from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.text import abbreviate, counted
-from ros2_memory.history.transforms import transform_at
+from ros2_memory.history.transforms import connects, transform_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,14 +70,20 @@ def placed_waypoints(
 
     Raises:
         InvalidArgumentsError: no transform places any of them.
+        QueryTimeoutError: the call's time is over before it is known whether any leads there.
     """
     found: list[Waypoint] = []
+    known_to_lead = False
     for each in waypoints:
         bags = view.stream.overlapping_bags([topic], TimeWindow(each.time, each.time + 1))
         half = math.nan if each.yaw_rad is None else each.yaw_rad / 2
         pose = Pose(each.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
         there = None if not bags else _pose_near(view, pose, frame_id, each.time, bags[0])
         if there is None or there.orientation is None:
+            # Asked once: to look for a frame that nothing leads to at each time takes long.
+            if not (found or known_to_lead) and not connects(view, (frame_id, own_frame)):
+                break
+            known_to_lead = True
             continue
         turn = None if each.yaw_rad is None else yaw(there.orientation)
         found.append(replace(each, position=there.position, yaw_rad=turn))
