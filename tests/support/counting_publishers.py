@@ -5,30 +5,38 @@
 Each argument is a topic, its messages a second, its reliability, and more of its QoS: `latched`
 (transient local) or `deadline` (of half a second). Messages are geometry_msgs/PointStamped: `x` is
 the number of the message, from 0, and the header's stamp that of its tick. `--first N` begins with
-another number. All of it ends with the process: kill it.
+another number. `--speed N` simulates: `/clock` begins at 0 and runs N times as fast as the wall
+clock, and the topics' rates and stamps are by it. All of it ends with the process: kill it.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 
 import rclpy
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+CLOCK_PERIOD_S = 0.01
 
 
 def main(arguments: list[str]) -> None:
     """Publishes until the process is killed."""
-    number = 0
-    if arguments[0] == "--first":
-        number, arguments = int(arguments[1]), arguments[2:]
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("topics", nargs="+")
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--speed", type=float)
+    given = parser.parse_args(arguments)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("counting")
     topics = []
-    for argument in arguments:
+    for argument in given.topics:
         topic, hz, reliability, *more = argument.split(":")
         profile = QoSProfile(depth=10, reliability=ReliabilityPolicy[reliability.upper()])
         if "latched" in more:
@@ -36,20 +44,29 @@ def main(arguments: list[str]) -> None:
         if "deadline" in more:
             profile.deadline = Duration(seconds=0.5)
         topics.append((node.create_publisher(PointStamped, topic, profile), 1 / float(hz)))
-    began = time.time()
+    clock = node.create_publisher(Clock, "/clock", 10) if given.speed else None
+    speed, origin = given.speed or 1.0, time.time()
+    began = 0.0 if clock else origin
+    shown = began - speed
     ticks = [0] * len(topics)
     while True:
-        now = time.time()
+        now = began + (time.time() - origin) * speed
+        if clock and now - shown >= CLOCK_PERIOD_S * speed:
+            clock.publish(Clock(clock=stamp(now)))
+            shown = now
         for index, (publisher, period_s) in enumerate(topics):
             due = began + ticks[index] * period_s
             if now >= due:
                 message = PointStamped()
-                message.header.stamp.sec = int(due)
-                message.header.stamp.nanosec = int(due % 1 * 1e9)
-                message.point.x = float(number + ticks[index])
+                message.header.stamp = stamp(due)
+                message.point.x = float(given.first + ticks[index])
                 publisher.publish(message)
                 ticks[index] += 1
         time.sleep(0.001)
+
+
+def stamp(seconds: float) -> Time:
+    return Time(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
 
 
 if __name__ == "__main__":

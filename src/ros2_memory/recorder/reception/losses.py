@@ -1,11 +1,13 @@
 """Adds up what is missing in closed splits, across splits and overlapping recordings.
 
-A hole counts once the next split has been measured: until then the other recording of a handover
-may turn out to have its messages.
+A hole counts once the next split has been measured, and the other recording of a handover up to
+there: until then that one may turn out to have its messages. After a split that does not show
+what it has of a topic, the topic is followed anew.
 """
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
 from dataclasses import dataclass, replace
@@ -16,11 +18,11 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.recorder.reception.continuity import Hole, Kind, Position, holes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
-_RECORDINGS: Final = 3
-"""How many recordings are compared: two of a handover, and one more."""
+_RECENT: Final = 6
+"""How many splits are compared, and after how many a recording is not waited for any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,26 +39,51 @@ class _Pending:
     topic: str
     kind: Kind
     hole: Hole
+    found_at: int
+    """How many splits had been measured before."""
 
 
 class LossCounter:
     """What is missing in the splits of one bag directory, measured one after the other."""
 
     def __init__(self) -> None:
-        # By recording and topic, the newest split's values, ascending.
-        self._newest: dict[str, dict[str, list[int]]] = {}
+        self._measured = 0
+        # Of each recording, how many splits had been measured when it was last heard of.
+        self._heard: dict[str, int] = {}
+        # Up to which log time each recording has been measured.
+        self._reached: dict[str, Ns] = {}
+        # The values of the newest splits by topic, ascending.
+        self._recent: deque[tuple[str, Mapping[str, array[int]]]] = deque(maxlen=_RECENT)
         self._last: dict[tuple[str, str], Position] = {}
         self._pending: list[_Pending] = []
         self._lately: deque[Loss] = deque(maxlen=10_000)
         self.counted: set[str] = set()
 
+    def begun(self, recording: str) -> None:
+        """Notes that a recording begins, which may have what another one misses."""
+        self._heard[recording] = self._measured
+
+    def unclear(self, recording: str, topics: Collection[str] | None = None) -> None:
+        """Notes that the next split does not show what it has of these topics; None: of any."""
+        self._last = {
+            key: at
+            for key, at in self._last.items()
+            if key[0] != recording or (topics is not None and key[1] not in topics)
+        }
+
     def measured(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
         """Takes the next split of a recording; returns the losses that are certain by now."""
         values = {
-            topic: sorted(each.value for each in found.positions) for topic, found in split.items()
+            topic: array("q", sorted(each.value for each in found.positions))
+            for topic, found in split.items()
         }
-        due = [self._reduced(each, recording, values) for each in self._pending]
-        self._pending = []
+        self._measured += 1
+        self._heard[recording] = self._measured
+        ends = [found.positions[-1].log_time for found in split.values()]
+        self._reached[recording] = max([self._reached.get(recording, 0), *ends])
+        self._pending = [each for each in self._pending if self._remains(each, recording, values)]
+        due = [each for each in self._pending if self._is_settled(each)]
+        self._pending = [each for each in self._pending if each not in due]
         for topic, found in split.items():
             last = self._last.get((recording, topic))
             positions = found.positions
@@ -68,18 +95,21 @@ class LossCounter:
                 continue
             self.counted.add(topic)
             for hole in new:
-                pending: _Pending | None = _Pending(recording, topic, found.kind, hole)
-                for other, known in self._newest.items():
-                    if pending is not None:
-                        pending = self._reduced(pending, other, known)
-                if pending is not None:
-                    self._pending.append(pending)
-        self._newest.pop(recording, None)
-        self._newest[recording] = values
-        for name in [*self._newest][:-_RECORDINGS]:
-            del self._newest[name]
-            self._last = {key: at for key, at in self._last.items() if key[0] != name}
-        return self._certain([each for each in due if each is not None])
+                pending = _Pending(recording, topic, found.kind, hole, self._measured)
+                if all(self._remains(pending, *each) for each in self._recent):
+                    known = [*self._pending, *due]
+                    pending.hole = replace(
+                        pending.hole, missing=pending.hole.missing - _shared(pending, known)
+                    )
+                    if pending.hole.missing > 0:
+                        self._pending.append(pending)
+        self._recent.append((recording, values))
+        for name, heard in [*self._heard.items()]:
+            if self._measured - heard >= _RECENT:
+                del self._heard[name]
+                self._reached.pop(name, None)
+                self.unclear(name)
+        return self._certain(due)
 
     def flush(self) -> list[Loss]:
         """Returns what no further split will fill."""
@@ -102,18 +132,22 @@ class LossCounter:
                 found[loss.topic] = found.get(loss.topic, 0) + loss.lost
         return found
 
-    def _reduced(
-        self, pending: _Pending, recording: str, values: Mapping[str, list[int]]
-    ) -> _Pending | None:
-        """Returns what is missing of a hole beside what another recording has."""
+    def _is_settled(self, pending: _Pending) -> bool:
+        """Whether no recording that is being measured may still have what is missing."""
+        return all(
+            self._reached.get(name, 0) >= pending.hole.after.log_time
+            for name, heard in self._heard.items()
+            if self._measured - max(heard, pending.found_at) < _RECENT
+        )
+
+    def _remains(self, pending: _Pending, recording: str, values: Mapping[str, array[int]]) -> bool:
+        """Takes from a hole what another recording has; returns whether anything is left."""
         if pending.recording == recording or pending.topic not in values:
-            return pending
+            return True
         known, hole = values[pending.topic], pending.hole
         inside = bisect_left(known, hole.after.value) - bisect_right(known, hole.before.value)
-        if inside >= hole.missing:
-            return None
         pending.hole = replace(hole, missing=hole.missing - inside)
-        return pending
+        return inside < hole.missing
 
     def _certain(self, due: Sequence[_Pending]) -> list[Loss]:
         losses = [
@@ -128,3 +162,19 @@ class LossCounter:
         ]
         self._lately += losses
         return losses
+
+
+def _shared(pending: _Pending, others: Sequence[_Pending]) -> int:
+    """Returns how much of a hole was found in another recording, too, where both miss it."""
+    hole = pending.hole
+    return max(
+        (
+            each.hole.missing
+            for each in others
+            if each.topic == pending.topic
+            and each.recording != pending.recording
+            and each.hole.before.value < hole.after.value
+            and hole.before.value < each.hole.after.value
+        ),
+        default=0,
+    )

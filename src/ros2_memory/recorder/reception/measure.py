@@ -13,7 +13,7 @@ from ros2_memory.recorder.reception.losses import Progress
 from ros2_memory.recorder.reception.profiles import HOLD_S, TopicFlow, offered_by_all
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.storage.base import BagReader
@@ -33,11 +33,13 @@ class SplitMeasure:
     Attributes:
         flows: of those whose offered QoS the split states.
         progress: of those with one publisher, whose messages show what is missing.
+        unclear: the other topics that have a message.
         span: first and last log time; None for a split without a message.
     """
 
     flows: Mapping[str, TopicFlow]
     progress: Mapping[str, Progress]
+    unclear: Collection[str]
     span: tuple[Ns, Ns] | None
 
 
@@ -89,7 +91,7 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
         for topic, found in positions.items()
         if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
     }
-    return SplitMeasure(flows, progress, span)
+    return SplitMeasure(flows, progress, times.keys() - progress.keys(), span)
 
 
 def burst_of(published: Sequence[Ns]) -> int:

@@ -107,6 +107,7 @@ class Reception:
         with self._lock:
             plan = plan_queues(self._planned_for(), self._queue_bytes)
             self._recordings[recording] = _Recording(plan, set())
+            self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
             latched = [topic for topic in self._latched if topic not in self._asked_anew]
@@ -219,6 +220,8 @@ class Reception:
         except (EpisodicError, OSError) as error:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
+            with self._lock:
+                self._losses.unclear(recording)
             return
         with self._lock:
             before = plan_queues(self._planned_for(), self._queue_bytes).cut_short
@@ -235,6 +238,7 @@ class Reception:
                 self._spans[recording] = (begun[0], split.span[1])
                 for name in [*self._spans][:-_PLANS_KEPT]:
                     del self._spans[name]
+            self._losses.unclear(recording, split.unclear)
             # What an earlier run recorded was counted by that.
             losses = self._losses.measured(recording, split.progress) if recording else []
         self._report(losses)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,50 @@ def test_what_no_recording_has_is_lost_also_in_a_handover() -> None:
     counter.measured("new", progress([*range(60, 160)]))
     assert [loss.lost for loss in counter.flush()] == []
     assert counter.in_last_hour(T0) == {"/odom": 1}
+
+
+@given(order=st.permutations(["old", "old", "old", "new", "new", "new"]), taken=st.booleans())
+def test_a_hole_waits_for_the_other_recording_of_a_long_handover(
+    order: list[str], taken: bool
+) -> None:
+    """Whichever splits are closed first: the new recording has what the old one stalled over."""
+    counter = LossCounter()
+    splits: dict[str, list[Iterable[int]]] = {
+        "old": [range(100), [*range(100, 110), *range(190, 200)], range(200, 300)],
+        "new": [range(60, 100), {*range(100, 200)} - {150 * taken}, range(200, 400)],
+    }
+    for name in splits:
+        counter.begun(name)
+    losses = [
+        loss
+        for name in order
+        for loss in counter.measured(name, progress(sorted(splits[name].pop(0))))
+    ]
+    assert sum(each.lost for each in [*losses, *counter.flush()]) == taken
+
+
+def test_a_recording_that_brings_nothing_is_not_waited_for_for_ever() -> None:
+    counter = LossCounter()
+    counter.begun("dead")
+    kept = [each for each in range(800) if each != 5]
+    losses = [
+        loss
+        for first in range(0, 799, 100)
+        for loss in counter.measured("live", progress(kept[first : first + 100]))
+    ]
+    assert [each.lost for each in losses] == [1]
+
+
+def test_nothing_is_missing_between_splits_around_one_that_was_not_measured() -> None:
+    counter = LossCounter()
+    counter.measured("a", progress([*range(100)]))
+    counter.unclear("a", {"/odom", "/tf"})
+    counter.measured("a", progress([*range(200, 300)]))
+    counter.unclear("a")
+    counter.measured("a", progress([*range(400, 500)]))
+    counter.unclear("a", {"/tf"})
+    counter.measured("a", progress([*range(510, 600)]))
+    assert [each.lost for each in counter.measured("a", progress([*range(600, 700)]))] == [10]
 
 
 def test_rosbags_own_count_counts_where_nothing_else_does() -> None:

@@ -1,0 +1,166 @@
+"""The real recorder under load, and by a simulated clock: what it keeps, and what that costs.
+
+Seconds of each; EPISODIC_LONG=1 makes it an hour of 10 topics at 200 Hz, and two simulated days.
+The figures are printed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.lost_file import read_losses
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.integration.test_recorder_reception import publishing
+from tests.support.live_recorder import NS_PER_S, bag_files, machine
+from tests.support.ros_processes import ros_environment, wait_for
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from tests.support.live_recorder import LiveRecorder, Machine
+    from tests.support.real_recorder import RealRecorder
+
+LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
+LOAD_S: Final = 3600 if LONG else 8
+LOAD: Final = [f"/sensor_{number}" for number in range(10 if LONG else 3)]
+HZ: Final = 200 if LONG else 50
+SIMULATED: Final = ["/odom", "/rare"]
+SPEED: Final = 100.0
+SIMULATED_S: Final = 2 * 86_400 if LONG else 1200
+SIMULATED_SPLIT_S: Final = 600 if LONG else 300
+TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
+MOST_DAEMON_MB: Final = 150
+
+
+@dataclass
+class Cost:
+    """Processor seconds of the daemon and of its recorders so far, and the most memory of each."""
+
+    daemon_s: float = 0.0
+    daemon_mb: float = 0.0
+    children_mb: float = 0.0
+    children_s: dict[int, float] = field(default_factory=dict)
+
+    def look(self, recorder: LiveRecorder) -> None:
+        self.daemon_s = processor_s(recorder.process.pid)
+        self.daemon_mb = max(self.daemon_mb, resident_mb(recorder.process.pid))
+        running = [child.pid for child in recorder.children()]
+        self.children_mb = max(self.children_mb, sum(map(resident_mb, running)))
+        self.children_s.update({pid: processor_s(pid) for pid in running})
+
+
+def processor_s(pid: int) -> float:
+    """Processor seconds of a process; 0 where it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+
+
+def resident_mb(pid: int) -> float:
+    """Resident memory in MB; 0 where the process is gone."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except OSError:
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def numbers(bag_dir: Path, topics: Sequence[str]) -> dict[str, Counter[int]]:
+    """How often each number of each topic counts in the closed splits."""
+    reader = BagDirReader(McapReader())
+    found: dict[str, Counter[int]] = {}
+    for path in bag_files(bag_dir):
+        for record in reader.records(path, topics, TimeWindow.everything()):
+            point = getattr(reader.decode(record), "point")  # noqa: B009 - its type is known there
+            found.setdefault(record.channel.topic, Counter())[round(point.x)] += 1
+    return found
+
+
+def missing(found: Counter[int]) -> int:
+    """How many numbers between the first and the last are in no split."""
+    return max(found) - min(found) + 1 - len(found)
+
+
+@pytest.fixture
+def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
+    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
+        yield found
+
+
+def test_what_is_lost_under_load_is_counted(site: Machine) -> None:
+    with publishing(site.env, *(f"{topic}:{HZ}:reliable" for topic in LOAD)):
+        recorder = site.record(
+            "load", *(() if LONG else ("recording.split_duration_s=2",)), topics=LOAD
+        )
+        recorder.wait_for("subscribed", len(LOAD))
+        cost, began = Cost(), time.monotonic()
+
+        def over() -> bool:
+            cost.look(recorder)
+            return time.monotonic() - began >= LOAD_S
+
+        wait_for(over, "the end", timeout_s=LOAD_S + 60, alive=recorder.process)
+        recorder.stop()
+    found = numbers(recorder.bag_dir, LOAD)
+    counted = Counter[str]()
+    for loss in read_losses(recorder.bag_dir, 0, time.time_ns()):
+        counted[loss.topic] += loss.lost
+    sys.stdout.write(
+        f"{LOAD_S} s, {len(LOAD)} topics at {HZ} Hz: {sum(map(len, found.values()))} messages, "
+        f"{sum(map(missing, found.values()))} missing, {counted.total()} counted as lost, "
+        f"{sum(each.total() - len(each) for each in found.values())} double, "
+        f"{len(recorder.events('rotated'))} rotations; daemon {cost.daemon_s / LOAD_S:.2%} of a "
+        f"core, {cost.daemon_mb:.0f} MB; recorders {sum(cost.children_s.values()) / LOAD_S:.2%}, "
+        f"{cost.children_mb:.0f} MB\n"
+    )
+    assert {topic: missing(each) for topic, each in found.items()} == {
+        topic: counted[topic] for topic in LOAD
+    }
+    assert all(set(each.values()) == {1} for each in found.values())
+    assert cost.daemon_mb < MOST_DAEMON_MB
+
+
+def test_simulated_time_is_recorded_by_its_clock(site: Machine) -> None:
+    """Rotations and losses among it: the wall clock that paces them runs at another speed."""
+    with publishing(site.env, "--speed", f"{SPEED:g}", "/odom:1:reliable", "/rare:0.1:reliable"):
+        recorder = site.record(
+            "simulated",
+            "recording.use_sim_time=true",
+            f"recording.split_duration_s={SIMULATED_SPLIT_S}",
+            f"recording.session_duration_s={2 * SIMULATED_SPLIT_S}",
+            topics=SIMULATED,
+        )
+        wait_for(
+            lambda: len(bag_files(recorder.bag_dir)) > SIMULATED_S // SIMULATED_SPLIT_S,
+            "that much simulated time",
+            timeout_s=SIMULATED_S / SPEED + 120,
+            alive=recorder.process,
+        )
+        recorder.stop()
+    found = numbers(recorder.bag_dir, SIMULATED)
+    sys.stdout.write(
+        f"{SIMULATED_S} simulated s: {len(bag_files(recorder.bag_dir))} splits, "
+        f"{len(recorder.events('rotated'))} rotations, "
+        f"{ {topic: (len(each), missing(each), each.total()) for topic, each in found.items()} }\n"
+    )
+    times = [
+        record.log_time / NS_PER_S
+        for path in bag_files(recorder.bag_dir)
+        for record in McapReader().records(path, ["/rare"], TimeWindow.everything())
+    ]
+    assert max(times) < 2 * SIMULATED_S
+    assert max(later - before for before, later in pairwise(sorted(times))) < SIMULATED_SPLIT_S
+    assert all(set(each.values()) == {1} for each in found.values())
