@@ -287,6 +287,7 @@ def build_memory(settings: Settings) -> Memory:
         known=partial(catalogue.known_files, bag_dir),
         include_active=settings.reader.include_active,
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
+        only=settings.data.recording,
     )
     recall = DigestCache(catalogue, bag_dir)
     return Memory(index, reader, extractor, clock, query_settings_of(settings), recall)
@@ -296,13 +297,15 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     """Returns the paths that the catalogue may have now, best first.
 
     It is beside the bags only where the configured recorder has recorded. Nothing is written to a
-    folder of other programs' bags.
+    folder of other programs' bags. Where one recording alone answers, its catalogue
+    is a file of its own beside that of all.
     """
     from ros2_memory.bag_dir.layout import has_recorded
     from ros2_memory.catalogue.store import FILE, FOLDER
 
-    bag_dir = settings.recording.bag_dir
+    bag_dir, only = settings.recording.bag_dir, settings.data.recording
     records = not isinstance(settings.recorder, NullRecorderNode) and has_recorded(bag_dir)
+    records = records and only is None
     beside = (bag_dir / FOLDER / FILE,) if records else ()
     given = os.environ.get("XDG_CACHE_HOME")
     try:
@@ -310,7 +313,8 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     except RuntimeError:  # a user without a home
         return beside
     name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
-    return (*beside, cache / PACKAGE / name / FILE) if cache.is_absolute() else beside
+    file = FILE if only is None else f"{hashlib.sha256(only.encode()).hexdigest()[:16]}-{FILE}"
+    return (*beside, cache / PACKAGE / name / file) if cache.is_absolute() else beside
 
 
 def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:

@@ -77,6 +77,12 @@ def _in_config_dir(path: Path, info: ValidationInfo[Path]) -> Path:
     return info.context.joinpath(*path.parts[1:])
 
 
+def _below(name: str) -> str:
+    if name.startswith("/") or ".." in name.split("/") or not name.strip("/. "):
+        raise ValueError("must be a path below recording.bag_dir, such as rec_20261120T043000Z")
+    return name
+
+
 def _message_type(name: str) -> str:
     if not re.fullmatch(r"\w+/msg/\w+", name):
         raise ValueError("must be a message type such as nav_msgs/msg/Odometry")
@@ -120,6 +126,7 @@ AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
 Folder: TypeAlias = Annotated[AnyPath, PathType("dir")]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
 MessageType: TypeAlias = Annotated[Text, AfterValidator(_message_type)]
+BelowBagDir: TypeAlias = Annotated[Text, AfterValidator(_below)]
 DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
 
 _REFUSE_UNKNOWN: Final = ConfigDict(extra="forbid")
@@ -158,9 +165,10 @@ class DataSettings:
     Positions are given in `map_frame` where transforms lead there. Detections whose score is below
     `min_score` count only where a call asks for them. "Ago" is relative to `now`: the wall clock,
     or the newest message. `tf_clock` is the time that orders transforms: header stamps,
-    log time, or stamps where the two agree.
+    log time, or stamps where the two agree. Where `recording` is set, no other recording answers.
     """
 
+    recording: BelowBagDir | None
     max_array_length: Count
     position_tolerance_m: Tolerance
     min_score: Tolerance

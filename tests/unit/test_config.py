@@ -36,6 +36,7 @@ class TestDefaults:
                 "keep_when": ROOT / "config/triggers.yaml",
             },
             "data": {
+                "recording": None,
                 "max_array_length": 50,
                 "position_tolerance_m": 0.5,
                 "min_score": 0.0,

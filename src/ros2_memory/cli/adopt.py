@@ -1,5 +1,6 @@
 """`ros2-memory adopt`: lists recordings of other programs as the recorder's own."""
 
+import json
 import os
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -15,6 +16,7 @@ from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
+    AsJson,
     BagDir,
     Sets,
     load_for,
@@ -39,6 +41,7 @@ def adopt(
         typer.Argument(metavar="DIR", help="Directories of bags, in the bag directory."),
     ],
     sets: Sets = None,
+    as_json: AsJson = False,
     bag_dir: BagDir = None,
 ) -> None:
     """Let the recorder delete bags that it did not make, as if it had made them.
@@ -61,10 +64,20 @@ def adopt(
     _require_list(root, own)
     new = {name: path for name, path in found.items() if not own.owns(path)}
     own.adopt({name: _identity(path) for name, path in new.items()})
-    for name, path in new.items():
-        files, size = _count_bags(path)
+    adopted = {name: _count_bags(path) for name, path in new.items()}
+    already = len(found) - len(new)
+    if as_json:
+        rows = [
+            {"directory": name, "bags": files, "size_mb": size / MB}
+            for name, (files, size) in adopted.items()
+        ]
+        print_line(json.dumps({"adopted": rows, "already": already}))
+        if not found:
+            raise typer.Exit(EXIT_NEGATIVE)
+        return
+    for name, (files, size) in adopted.items():
         print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size / MB:.1f} MB)")
-    if already := len(found) - len(new):
+    if already:
         folders = counted(already, "directory is", "directories are")
         print_line(f"{folders} the recorder's own already")
     if new:

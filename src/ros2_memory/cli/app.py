@@ -45,14 +45,27 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         },
     ),
     "topics": CommandEntry(
-        "info.topics",
+        "listing.info.topics",
         "every recorded topic, with its rate",
         {0: "there are some", 1: "nothing is recorded"},
     ),
     "info": CommandEntry(
-        "info.info",
-        "range, gaps, budget and how long it lasts",
+        "listing.info.info",
+        "what there is: how much, from when to when, gaps, damage, budget",
         {0: "it was shown", 1: "there are no bags"},
+    ),
+    "recordings": CommandEntry(
+        "listing.recordings.recordings",
+        "every recording: start, length, size, storage, whose",
+        {0: "there are some", 1: "there are none"},
+    ),
+    "cat": CommandEntry(
+        "listing.cat.cat",
+        "the messages of a topic, as text, CSV or JSON lines",
+        {
+            0: "there are some, and all were printed",
+            1: "there are none, or stderr says what could not be read",
+        },
     ),
     "watch": CommandEntry(
         "watch.watch",
@@ -214,6 +227,7 @@ def demo(
     once: Annotated[
         bool, typer.Option("--once", help="Leave after the answers; exit code 1: one was wrong.")
     ] = False,
+    *,
     port: Annotated[int, typer.Option(help="On 127.0.0.1; 0: any that is free.")] = 9203,
     bag_dir: Annotated[
         Path | None,
@@ -228,6 +242,9 @@ def demo(
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Show the server's log on stderr.")
     ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="A line of JSON for each question, for programs.")
+    ] = False,
 ) -> None:
     """A simulated robot, its bags, the query server and a client that asks it questions.
 
@@ -238,7 +255,12 @@ def demo(
     from ros2_memory.demo.run import DemoOptions, run_demo  # noqa: PLC0415
 
     options = DemoOptions(
-        once=once, port=port, bag_dir=bag_dir, duration_s=duration, verbose=verbose
+        once=once,
+        port=port,
+        bag_dir=bag_dir,
+        duration_s=duration,
+        verbose=verbose,
+        as_json=as_json,
     )
     code = run_demo(options, print_line)
     raise typer.Exit(code)

@@ -1,7 +1,9 @@
 """`ros2-memory ask`: any tool of the server, in process, without a server."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Annotated, Final
 
 import anyio
@@ -12,10 +14,13 @@ from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
     BagDir,
+    Recording,
     Sets,
     Verbose,
-    load_for,
+    load_to_look,
     open_memory,
+    parse_duration,
+    parse_time,
     present,
     print_line,
     spinner,
@@ -27,9 +32,16 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.tools.arguments import TIME_KINDS
 from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.spec_tools import build_tools
 
+_SETTING: Final = re.compile(
+    r"((recording|data|reader|retention|server|logging)\.\w|(deployment|storage|recorder)=).*",
+    re.DOTALL,
+)
+"""A word that sets a setting; no argument of a tool is named so."""
+_OF_TYPE: Final = ("type", "items")
 NEVER: Final = "never: no recorded message meets the condition"
 """Printed for `null`, the reply of tools that look for the last match."""
 
@@ -49,29 +61,41 @@ def ask(
     ] = None,
     given: Annotated[
         list[str] | None,
-        typer.Argument(metavar="key=value|JSON", help="What the tool is asked."),
+        typer.Argument(
+            metavar="key=value|JSON", help="What the tool is asked; and settings (data.now=latest)."
+        ),
     ] = None,
     *,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
+    recording: Recording = None,
     settings: Sets = None,
     verbose: Verbose = False,
 ) -> None:
     """Ask any tool of the query server, without a server.
 
-    Values are JSON where they read as such (seconds_ago=10, value=true), else text. With --json
-    the reply is exactly what an MCP client receives.
+    Values are JSON where they read as such (seconds_ago=10, value=true), else text; times and
+    durations also as people write them (start=14:05, seconds_ago=10m). With --json the reply is
+    exactly what an MCP client receives.
     """
-    loaded = load_for(bag_dir, settings)
+    words = [*(given or ())]
+    if tool is not None and _SETTING.fullmatch(tool):
+        tool, words = None, [tool, *words]
+    of_settings = [each for each in words if _SETTING.fullmatch(each)]
+    loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     memory = open_memory(loaded, verbose=verbose)
     dispatcher = build_dispatcher(loaded, memory)
     tools = {each.name: each for each in dispatcher.tools}
     if tool is None:
         rows: list[JsonValue] = [_tool_row(each.name, each.schema) for each in dispatcher.tools]
-        print_reply(stdout_console(), rows)
+        if as_json:
+            print_line(json.dumps(rows))
+        else:
+            print_reply(stdout_console(), rows)
         return
     schema = tools[tool].schema if tool in tools else {}
-    arguments = parse_arguments(given or (), schema)
+    asked = parse_arguments([each for each in words if each not in of_settings], schema)
+    arguments = with_times(asked, schema, unix_from_ns(present(memory)))
     with spinner(f"asking {tool}"):
         (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
@@ -129,6 +153,32 @@ def parse_arguments(given: Sequence[str], schema: Mapping[str, object]) -> dict[
             )
         arguments[key] = text if _takes_text(schema, key) else _from_json(text, text)
     return arguments
+
+
+def with_times(
+    arguments: Mapping[str, object], schema: Mapping[str, object], now: float
+) -> dict[str, object]:
+    """Returns the arguments of a tool with Unix seconds, or seconds, for the words of people.
+
+    What is no time stays as it is, and the tool says what it takes. `now` is in Unix seconds.
+    """
+    properties = schema.get("properties")
+    known = properties if isinstance(properties, dict) else {}
+    return {key: _in_seconds(value, known.get(key), now) for key, value in arguments.items()}
+
+
+def _in_seconds(value: object, schema: object, now: float) -> object:
+    kind, items = (schema.get(key) if isinstance(schema, dict) else None for key in _OF_TYPE)
+    if isinstance(value, list):
+        return [_in_seconds(each, items, now) for each in value]
+    if isinstance(value, str) and kind == "array":
+        return _in_seconds(value, items, now)
+    if isinstance(value, str) and kind == "number":
+        return parse_duration(value) or value
+    if isinstance(value, str) and kind == [*TIME_KINDS]:
+        with suppress(InvalidArgumentsError):
+            return parse_time(value, now)
+    return value
 
 
 def _from_json(text: str, otherwise: str | None) -> JsonValue:

@@ -11,6 +11,7 @@ import yaml
 
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import (
+    AsJson,
     BagDir,
     Overrides,
     load_with_sources,
@@ -34,12 +35,18 @@ def config_show(
     overrides: Overrides = None,
     bag_dir: BagDir = None,
     sources: Annotated[bool, typer.Option("--sources", help="Say of each key who set it.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """The configuration as YAML, composed of files, environment and arguments; no secrets.
 
     A comment shows whether there is a token for the server, never what it is.
     """
     settings, source = load_with_sources(bag_dir, overrides)
+    if as_json:
+        values = dict(_keys(plain_values(settings)))
+        rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}
+        print_line(json.dumps(rows if sources else values))
+        return
     if sources:
         for line in _lines_with_sources(settings, source):
             print_line(line)

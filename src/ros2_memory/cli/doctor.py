@@ -26,13 +26,14 @@ from rich.text import Text
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bootstrap import build_recorder, query_settings_of
-from ros2_memory.cli.info import assumed_active
+from ros2_memory.cli.listing.info import assumed_active
 from ros2_memory.cli.options import (
     AsJson,
     BagDir,
-    Overrides,
+    Recording,
     Verbose,
-    load_for,
+    Words,
+    load_to_look,
     open_memory,
     print_line,
     spinner,
@@ -95,16 +96,17 @@ _error = partial(Finding, Level.ERROR)
 
 
 def doctor(
-    overrides: Overrides = None,
+    words: Words = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
+    recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
     """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
 
     Each finding says what to do.
     """
-    findings = [*_examine(bag_dir, overrides, verbose=verbose)]
+    findings = [*_examine(bag_dir, words, recording, verbose=verbose)]
     worst = max(each.level for each in findings)
     if as_json:
         rows = [asdict(each) | {"level": each.level.name.lower()} for each in findings]
@@ -115,11 +117,11 @@ def doctor(
 
 
 def _examine(
-    bag_dir: Path | None, overrides: Sequence[str] | None, *, verbose: bool
+    bag_dir: Path | None, words: Sequence[str] | None, recording: str | None, *, verbose: bool
 ) -> Iterator[Finding]:
     """Yields all findings; one alone where the configuration is refused."""
     try:
-        settings = load_for(bag_dir, overrides)
+        settings = load_to_look(bag_dir, words, recording)
         memory = open_memory(settings, verbose=verbose)
     except ConfigError as error:
         yield _error("config", str(error), "correct the key that it names")

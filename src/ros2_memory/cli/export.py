@@ -1,22 +1,25 @@
 """`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain, islice
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import typer
 
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
+    AsJson,
     BagDir,
     End,
     Last,
-    Overrides,
+    Recording,
     Start,
     Verbose,
-    load_for,
+    Words,
+    load_to_look,
     open_memory,
     parse_window,
     print_line,
@@ -30,7 +33,7 @@ from ros2_memory.core.errors import (
     NoDataReason,
     UndecodableError,
 )
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
@@ -44,7 +47,7 @@ _REPORT_EVERY: Final = 512
 
 
 def export(
-    overrides: Overrides = None,
+    words: Words = None,
     *,
     mcap: Annotated[
         Path | None,
@@ -76,7 +79,9 @@ def export(
         str | None,
         typer.Option(metavar="NAME", help="Parquet by robot, too: one dataset for a fleet."),
     ] = None,
+    as_json: AsJson = False,
     bag_dir: BagDir = None,
+    recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
     """Copy a time window out of the memory, each message once.
@@ -86,7 +91,7 @@ def export(
     """
     if (mcap is None) == (parquet is None):
         raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
-    settings = load_for(bag_dir, overrides)
+    settings = load_to_look(bag_dir, words, recording)
     memory = open_memory(settings, verbose=verbose)
     view = View(memory, Call())
     window = parse_window(memory, start, end, last)
@@ -103,7 +108,10 @@ def export(
             done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
         elif parquet is not None:
             done = _write_parquet(parquet, messages, memory, robot)
-    print_line(done)
+    if as_json:
+        print_line(json.dumps({**done.as_object(), "notes": [*view.notes.sentences()]}))
+    else:
+        print_line(str(done))
     for note in view.notes.sentences():
         typer.echo(f"note: {note}", err=True)
     if not view.notes.complete or lost_in(view.snapshot, window):
@@ -175,8 +183,29 @@ def _profile(
     return profiles.pop() if len(profiles) == 1 else ""
 
 
-def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> str:
-    """Writes an MCAP file, which appears when it is complete; returns what was done, for people.
+class Exported(NamedTuple):
+    """How many messages lie where; `files` of Parquet, in a folder."""
+
+    messages: int
+    path: Path
+    files: int | None = None
+
+    def as_object(self) -> dict[str, JsonValue]:
+        """Returns it for programs."""
+        return {"path": str(self.path), "messages": self.messages, "files": self.files or 1}
+
+    def __str__(self) -> str:
+        """Returns it for people."""
+        messages = counted(self.messages, "message")
+        if self.files is None:
+            return f"{messages} in {self.path}"
+        return f"{messages} in {counted(self.files, 'file')} below {self.path}"
+
+
+def write_mcap(
+    path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE
+) -> Exported:
+    """Writes an MCAP file, which appears when it is complete.
 
     Raises:
         BagError: it cannot be written.
@@ -203,13 +232,13 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    return f"{counted(written, 'message')} in {path}"
+    return Exported(written, path)
 
 
 def _write_parquet(
     path: Path, messages: Iterator[StoredMessage], memory: Memory, robot: str | None
-) -> str:
-    """Writes rows of Parquet; returns what was done, for people.
+) -> Exported:
+    """Writes rows of Parquet.
 
     Raises:
         ConfigError: the optional dependency is missing.
@@ -223,7 +252,7 @@ def _write_parquet(
         ) from error
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)
-    return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
+    return Exported(dataset.rows, path, dataset.files)
 
 
 def _reported(

@@ -36,12 +36,14 @@ from ros2_memory.catalogue.store import BagKey
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
+    AsJson,
     BagDir,
     End,
     Last,
     Overrides,
     Start,
     Verbose,
+    collect_lines,
     load_for,
     open_memory,
     parse_window,
@@ -95,6 +97,7 @@ def forget(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say what would be deleted.")
     ] = False,
+    as_json: AsJson = False,
     bag_dir: BagDir = None,
     verbose: Verbose = False,
 ) -> None:
@@ -108,6 +111,7 @@ def forget(
     Latched messages (maps, static transforms) that later answers need are carried on. Only where
     this deployment records.
     """
+    collect_lines(as_json, is_answered=yes or dry_run)
     settings = load_for(bag_dir, overrides)
     require_recorder(settings)
     if last is None and (start is None or end is None):
@@ -277,7 +281,8 @@ class _Taking:
     def _forget_derived(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
         for path in catalogue_paths(self._settings):
-            purge(path, erasure.files)
+            for each in {path, *path.parent.glob(f"*-{path.name}")}:  # of one recording alone
+                purge(each, erasure.files)
 
 
 def _describe_erasure(erasure: Erasure) -> str:

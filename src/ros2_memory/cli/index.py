@@ -5,6 +5,7 @@ time from the process that answers.
 """
 
 import ctypes
+import json
 import os
 import signal
 import sys
@@ -18,16 +19,19 @@ import typer
 from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
+    AsJson,
     BagDir,
     Overrides,
     Verbose,
     load_for,
     open_memory,
+    print_line,
 )
 from ros2_memory.cli.output import progress_bar
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted
 from ros2_memory.serving.backfill import Backfill, Progress
 
@@ -42,6 +46,7 @@ _BAR_WIDTH: Final = 40
 
 def index(
     overrides: Overrides = None,
+    as_json: AsJson = False,
     bag_dir: BagDir = None,
     verbose: Verbose = False,
     for_server: Annotated[int | None, typer.Option(metavar="PID", hidden=True)] = None,
@@ -53,12 +58,16 @@ def index(
     """
     settings = load_for(bag_dir, overrides)
     if for_server is None:
-        _fill_for_people(settings, verbose=verbose)
+        progress = _fill_for_people(settings, verbose=verbose)
+        if as_json:
+            print_line(json.dumps(as_object(progress)))
+        else:
+            print(describe_progress(progress), file=sys.stderr)
     else:
         _fill_for_server(settings, for_server)
 
 
-def _fill_for_people(settings: Settings, *, verbose: bool) -> None:
+def _fill_for_people(settings: Settings, *, verbose: bool) -> Progress:
     memory = open_memory(settings, verbose=verbose)
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
@@ -75,8 +84,7 @@ def _fill_for_people(settings: Settings, *, verbose: bool) -> None:
             known = progress.closed - progress.waiting
             bar.update(task, completed=known, total=progress.closed)
 
-        progress = fill_catalogue(backfill, show)
-    print(describe_progress(progress), file=sys.stderr)
+        return fill_catalogue(backfill, show)
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
@@ -108,6 +116,12 @@ def fill_catalogue(
     backfill.prune()
     backfill.precompute()
     return backfill.progress()
+
+
+def as_object(progress: Progress) -> dict[str, JsonValue]:
+    """Returns how many bags are in the catalogue, for programs."""
+    known = progress.closed - progress.waiting - progress.refused
+    return {"bags": progress.closed, "in_catalogue": known, "refused": progress.refused}
 
 
 def describe_progress(progress: Progress) -> str:

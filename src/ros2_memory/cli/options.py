@@ -4,25 +4,37 @@ Typer reads annotations at run time, so modules with commands do without `annota
 `__future__`.
 """
 
+import json
 import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from datetime import datetime, time, timedelta
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.console import Console
 
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
+from ros2_memory.bag_dir.own_recordings import folders_with_bags
 from ros2_memory.config import NullRecorderNode, Settings, load_explained
-from ros2_memory.config_sources import Sources, quoted
+from ros2_memory.config_sources import GROUPS, Sources, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns, unix_from_text
+from ros2_memory.core.timebase import (
+    MAX_NS,
+    MIN_NS,
+    Ns,
+    WallClock,
+    unix_from_ns,
+    unix_from_text,
+)
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
@@ -39,7 +51,12 @@ TIMES: Final = (
 )
 _AGO: Final = re.compile(r"(\d+(?:\.\d+)?) ?([smhd])(?: ago)?")
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
-_TIME_OF_DAY: Final = re.compile(r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d)?))?")
+_TIME_OF_DAY: Final = re.compile(
+    r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{3,6})?)?))?"
+)
+_WHOLE_MS: Final = re.compile(r".*:\d\d\.\d{3}")
+"""A time as this program prints it: rounded down to the millisecond."""
+_REST_OF_MS: Final = 0.000_999
 
 _PIPE_WIDTH: Final = 160
 """Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
@@ -54,6 +71,22 @@ Overrides = Annotated[
     list[str] | None,
     typer.Argument(metavar="key=value", help="Settings, as for ros2-memory-server."),
 ]
+Words = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[PATH] [key=value]...",
+        help="A bag or a folder of bags to look at, instead of recording.bag_dir; and settings, as "
+        "for ros2-memory-server.",
+    ),
+]
+Recording = Annotated[
+    str | None,
+    typer.Option(
+        "--recording",
+        metavar="NAME",
+        help="This recording alone: a name of `ros2-memory recordings`.",
+    ),
+]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="key=value", help="A setting, as for ros2-memory-server."),
@@ -62,6 +95,9 @@ Verbose = Annotated[
     bool,
     typer.Option("--verbose", "-v", help="Show the log on stderr, from logging.level on."),
 ]
+_LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
+"""Settings for bags of others: any kind is read, "ago" counts from the newest data."""
+
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, for programs.")]
 Start = Annotated[
     str | None,
@@ -88,6 +124,77 @@ def load_with_sources(
 def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
     """Loads the configuration as `load_with_sources` does, without the sources."""
     return load_with_sources(bag_dir, overrides)[0]
+
+
+def load_to_look(
+    bag_dir: Path | None, words: Sequence[str] | None = None, recording: str | None = None
+) -> Settings:
+    """Loads the configuration for a command that only looks; a PATH among its words wins.
+
+    Bags that this deployment does not record are read whatever kind they are, and no recorder is
+    expected there, unless the words choose a recorder, a storage or a deployment.
+
+    Raises:
+        ConfigError: the configuration is refused.
+        InvalidArgumentsError: there is no such file or folder, or more than one is named.
+    """
+    path, overrides = _path_and_settings(words or ())
+    if path is not None and bag_dir is not None:
+        raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
+    chosen: list[str] = []
+    if path is not None and path.is_file():
+        path, recording = _folder_of(path, recording)
+    if recording is not None:
+        chosen.append(f"data.recording={quoted(recording)}")
+    named = bag_dir if path is None else path
+    settings, sources = load_with_sources(named, [*overrides, *chosen])
+    by_words = any(each.partition("=")[0] in GROUPS for each in overrides)
+    if by_words or not _is_of_others(settings, sources, named, is_path=path is not None):
+        return settings
+    return load_for(named, [*_LOOKING, *overrides, *chosen])
+
+
+def _path_and_settings(words: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """Returns the one word that is a path, and the others."""
+    paths = [each for each in words if "=" not in each or Path(each).exists()]
+    if len(paths) > 1:
+        raise InvalidArgumentsError(f"one file or folder at a time: {' and '.join(paths)}")
+    if paths and not Path(paths[0]).exists():
+        raise InvalidArgumentsError(
+            f"{paths[0]}: there is no such file or folder; name a bag or a folder of bags, or "
+            "write a setting as key=value"
+        )
+    return (Path(paths[0]) if paths else None), [each for each in words if each not in paths]
+
+
+def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
+    """Returns the folder of a file, and the recording to look at there: the file itself."""
+    if file.name == METADATA_FILE:
+        return file.parent, recording
+    if bag_kind(file.name) is None:
+        kinds = ", ".join(BAG_KINDS)
+        raise InvalidArgumentsError(f"{file} is no bag: their names end in {kinds}")
+    if recording is not None:
+        raise InvalidArgumentsError(f"--recording is for a folder, and {file} is one bag")
+    real = file.resolve()
+    return real.parent, real.name
+
+
+def _is_of_others(
+    settings: Settings, sources: Sources, named: Path | None, *, is_path: bool
+) -> bool:
+    """Returns whether the bags are none of this deployment, which may record elsewhere."""
+    bag_dir = settings.recording.bag_dir
+    own_files = bool(os.environ.get("MEMORY_CONFIG_DIR"))
+    is_chosen = own_files or any(each.key in GROUPS for each in sources.overrides)
+    if named is None or (is_chosen and not is_path):
+        if is_chosen or has_recorded(bag_dir) or not bag_dir.is_dir():
+            return False
+        return next(folders_with_bags(bag_dir), None) is not None
+    if is_chosen and named.absolute() == load_for(None, None).recording.bag_dir.absolute():
+        return False
+    heartbeat = read_heartbeat(bag_dir).heartbeat
+    return heartbeat is None or not heartbeat.is_live(WallClock().now())
 
 
 def require_recorder(settings: Settings) -> None:
@@ -120,8 +227,18 @@ def open_memory(settings: Settings, *, verbose: bool = False) -> "Memory":
         withhold_warnings()
     memory = build_memory(settings)
     with spinner(f"looking through {settings.recording.bag_dir}"):
-        memory.index.refresh()
+        snapshot = memory.index.refresh()
+    if settings.data.recording is not None and snapshot.problem:
+        raise InvalidArgumentsError(
+            f"{snapshot.problem}; {_recordings_like(settings.data.recording, memory.index.bag_dir)}"
+        )
     return memory
+
+
+def _recordings_like(name: str, bag_dir: Path) -> str:
+    there = [str(each.relative_to(bag_dir)) for each in folders_with_bags(bag_dir)]
+    near = get_close_matches(name, there, n=3)
+    return f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
 
 
 def present(memory: "Memory") -> Ns:
@@ -141,12 +258,20 @@ def parse_window(
     if last is None:
         first = unix_from_ns(MIN_NS) if start is None else parse_time(start, now)
         until = unix_from_ns(MAX_NS) if end is None else parse_time(end, now)
+        if end is not None and _WHOLE_MS.fullmatch(end.strip()):
+            until += _REST_OF_MS  # or what was printed would lie just after it
         return TimeWindow.from_unix(first, until)
     if start is not None or end is not None:
         raise InvalidArgumentsError("give --last, or --start and --end, not both")
     if not last > 0:
         raise InvalidArgumentsError(f"--last is {last:g}; it must be more than 0 seconds")
     return TimeWindow.from_unix(now - last, now)
+
+
+def parse_duration(text: str) -> float | None:
+    """Returns the seconds of a duration as people write it (`90s`, `10m`, `2h`, `3d`) or None."""
+    found = _AGO.fullmatch(text.strip().lower())
+    return None if found is None else float(found[1]) * _SECONDS_OF[found[2]]
 
 
 def parse_time(text: str, now: float) -> float:
@@ -162,8 +287,9 @@ def parse_time(text: str, now: float) -> float:
     words = text.strip().lower()
     with suppress(ValueError):
         return float(words)
-    if ago := _AGO.fullmatch(words):
-        return now - float(ago[1]) * _SECONDS_OF[ago[2]]
+    ago = parse_duration(words)
+    if ago is not None:
+        return now - ago
     with suppress(ValueError, OverflowError, OSError):
         if clock := _TIME_OF_DAY.fullmatch(words):
             midnight = datetime.fromtimestamp(now).astimezone().date()
@@ -177,7 +303,7 @@ def parse_time(text: str, now: float) -> float:
 def reported_errors(command: str) -> Iterator[None]:
     """Prints an error of the block as one line on stderr, and exits with code 2.
 
-    Also prints how many warnings were logged and not shown.
+    Also prints how many warnings were logged and not shown, and the lines of `collect_lines`.
     """
     try:
         yield
@@ -187,6 +313,7 @@ def reported_errors(command: str) -> Iterator[None]:
         print(f"ros2-memory {command}: {error}", file=sys.stderr)
         raise typer.Exit(EXIT_CANNOT_RUN) from None
     finally:
+        _print_collected()
         if events := withheld_warnings():
             names = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
             print(
@@ -211,5 +338,35 @@ def stdout_console() -> Console:
 
 
 def print_line(line: str) -> None:
-    """Prints a line on stdout, and flushes it."""
-    print(line, flush=True)
+    """Prints a line on stdout, and flushes it, unless lines are being collected."""
+    if _collected:
+        _collected[-1].append(line)
+    else:
+        print(line, flush=True)
+
+
+_collected: Final[list[list[str]]] = []
+_STAYS: Final = "stays: "
+
+
+def collect_lines(as_json: bool, *, is_answered: bool) -> None:
+    """Has a command with --json print its lines at its end, as one JSON object.
+
+    `stays` are those on what it left as it is, `lines` all others.
+
+    Raises:
+        InvalidArgumentsError: the command would have to ask.
+    """
+    if as_json and not is_answered:
+        raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
+    if as_json:
+        _collected.append([])
+
+
+def _print_collected() -> None:
+    if not _collected:
+        return
+    lines = _collected.pop()
+    stays = [each.removeprefix(_STAYS) for each in lines if each.startswith(_STAYS)]
+    others = [each for each in lines if not each.startswith(_STAYS)]
+    print(json.dumps({"lines": others, "stays": stays}), flush=True)

@@ -142,7 +142,13 @@ def _table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
             max_width=each.min_width if is_narrow and each.has_times else None,
         )
     for row in flattened:
-        table.add_row(*(Text(_format_for_key(key, row.get(key))) for key in keys))
+        cells = [_format_for_key(key, row.get(key)) for key in keys]
+        if is_narrow:  # times take two lines
+            cells = [
+                cell.replace("T", "\n") if _is_time(row.get(key)) else cell
+                for key, cell in zip(keys, cells, strict=True)
+            ]
+        table.add_row(*map(Text, cells))
     return table
 
 
@@ -239,9 +245,12 @@ def _is_time(value: JsonValue) -> bool:
 
 
 def format_time(unix_s: float) -> str:
-    """Formats a time in this machine's zone, to the millisecond."""
+    """Formats a time in this machine's zone, rounded down to the millisecond.
+
+    Every option that takes a time reads it, and it is one word for a shell.
+    """
     local = datetime.fromtimestamp(unix_s, tz=UTC).astimezone()
-    return f"{local:%Y-%m-%d %H:%M:%S}.{local.microsecond // 1000:03d}"
+    return f"{local:%Y-%m-%dT%H:%M:%S}.{local.microsecond // 1000:03d}"
 
 
 def format_duration(seconds: float) -> str:

@@ -4,8 +4,9 @@ A recorder does the same when it starts. The command is for files that it does n
 that another recorder wrote, copies on a laptop, files so large that a recorder would start late.
 """
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
@@ -18,7 +19,7 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE
 from ros2_memory.bootstrap import build_repairer
-from ros2_memory.cli.options import EXIT_NEGATIVE, print_line
+from ros2_memory.cli.options import EXIT_NEGATIVE, AsJson, print_line
 from ros2_memory.cli.output import progress_bar
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
@@ -45,13 +46,17 @@ def recover(
             help="Also files that changed in the last half minute; nothing must be writing them.",
         ),
     ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Repair MCAP files that a crash, a full disk or a pulled plug left unfinished.
 
     Rewrites each from all that can be read of it, in place: the original stays until the whole one
     has been read back and is on the disk. Files of 0 bytes are removed.
     """
-    outcome = recover_files(path, print_line, force=force)
+    lines: list[str] = []
+    outcome = recover_files(path, lines.append if as_json else print_line, force=force)
+    if as_json:
+        print_line(json.dumps({**asdict(outcome), "lines": lines[:-1]}))
     if outcome.failed:
         raise typer.Exit(EXIT_NEGATIVE)
 

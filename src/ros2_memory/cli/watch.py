@@ -1,6 +1,7 @@
 """`ros2-memory watch`: what is being recorded, compared with what is usual."""
 
 import itertools
+import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -15,19 +16,21 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.cli.info import usual_rate
+from ros2_memory.cli.listing.info import usual_rate
 from ros2_memory.cli.options import (
+    AsJson,
     BagDir,
-    Overrides,
+    Recording,
     Verbose,
-    load_for,
+    Words,
+    load_to_look,
     open_memory,
     print_line,
     stdout_console,
 )
 from ros2_memory.cli.output import escape, format_duration, format_time
 from ros2_memory.core.errors import BagError, InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -117,7 +120,10 @@ class Observation:
             return "no data"
         if self.status.now == latest != self.now:
             return f"{format_time(unix_from_ns(latest))}, which is now (data.now=latest)"
-        return f"{format_duration(unix_from_ns(self.status.now - latest))} old"
+        age_s = unix_from_ns(self.status.now - latest)
+        if age_s < 0:
+            return f"dated {format_duration(-age_s)} ahead of the clock"
+        return f"{format_duration(age_s)} old"
 
     @property
     def not_live(self) -> str:
@@ -126,27 +132,33 @@ class Observation:
 
 
 def watch(
-    overrides: Overrides = None,
+    words: Words = None,
     *,
     every: Annotated[float, typer.Option(metavar="S", help="Seconds between two looks.")] = 2.0,
     count: Annotated[
         int | None, typer.Option(metavar="N", help="Leave after so many looks.")
     ] = None,
+    as_json: AsJson = False,
     bag_dir: BagDir = None,
+    recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
     """Watch what is being recorded: the recorder, the newest data, rates against the usual ones.
 
     Ages count as in the tools' answers (data.now). Rates are judged only while data comes in.
-    On a terminal a table that is kept up to date, elsewhere a line for each look. Ends with Ctrl-C.
+    On a terminal a table that is kept up to date, elsewhere a line for each look, or with --json
+    an object. Ends with Ctrl-C.
     """
     if not every > 0 or (count is not None and count < 1):
         raise InvalidArgumentsError("--every and --count must be more than 0")
-    settings = load_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
+    settings = load_to_look(bag_dir, ["reader.include_active=true", *(words or ())], recording)
     memory = open_memory(settings, verbose=verbose)
     console = stdout_console()
     try:
-        if console.is_terminal:
+        if as_json:
+            for each in _observations(memory, every, count):
+                print_line(json.dumps(as_object(each)))
+        elif console.is_terminal:
             with Live(console=console, auto_refresh=False) as live:
                 for each in _observations(memory, every, count):
                     live.update(Group(*as_screen(each)), refresh=True)
@@ -210,6 +222,30 @@ def _count(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -
         with suppress(BagError):
             count += len(memory.reader.log_times(bag.path, topic, window))
     return count
+
+
+def as_object(seen: Observation) -> dict[str, JsonValue]:
+    """Returns an observation for programs: times in Unix seconds, rates in Hz, ages in seconds."""
+    status = seen.status
+    latest = status.latest
+    return {
+        "now": unix_from_ns(seen.now),
+        "recorder": status.recorder,
+        "recorder_alive": status.live,
+        "latest": None if latest is None else unix_from_ns(latest),
+        "is_live": seen.live,
+        "topics": [
+            {
+                "topic": each.topic,
+                "rate_hz": round(each.rate, 3),
+                "usual_hz": each.usual,
+                "age_s": round(each.age_s, 3),
+                "assessment": each.assessment if seen.live else None,
+            }
+            for each in seen.rates
+        ],
+        "problems": [*seen.problems],
+    }
 
 
 def as_line(seen: Observation) -> str:

@@ -18,7 +18,10 @@ _JSON_LINES: Final = 4
 
 
 def format_exchange(number: int, exchange: Exchange) -> str:
-    """Returns the question, the tool call, the answer in words, and the reply as received."""
+    """Returns the question, the tool call, the answer in words, and the reply as received.
+
+    An empty line follows.
+    """
     mark = "" if exchange.right else "WRONG: "
     answer = textwrap.fill(
         f"{mark}{exchange.sentence}",
@@ -28,7 +31,23 @@ def format_exchange(number: int, exchange: Exchange) -> str:
         break_on_hyphens=False,
     )
     lines = [f"{number:>2}. {exchange.question.words}", *_call(exchange.question), answer]
-    return "\n".join([*lines, *_reply(exchange.reply)])
+    return "\n".join([*lines, *_reply(exchange.reply), ""])
+
+
+def exchange_as_json(number: int, exchange: Exchange) -> str:
+    """Returns the same in one line, for programs."""
+    question = exchange.question
+    return json.dumps(
+        {
+            "number": number,
+            "question": question.words,
+            "tool": question.tool,
+            "arguments": dict(question.arguments),
+            "right": exchange.right,
+            "answer": exchange.sentence,
+            "reply": exchange.reply,
+        }
+    )
 
 
 def connection_hints(sse_url: str, http_url: str) -> str:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import anyio
 from mcp import Client, MCPError
@@ -18,7 +18,7 @@ from mcp.types import TextContent
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
 from ros2_memory.demo.answer_checks import CallContext
-from ros2_memory.demo.output import connection_hints, format_exchange
+from ros2_memory.demo.output import connection_hints, exchange_as_json, format_exchange
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.questions import QUESTIONS, Exchange, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ros2_memory.demo.questions import Question
+
+    _Show: TypeAlias = Callable[[int, Exchange], None]
 
 SPLIT_DURATION_S: Final = 5.0
 SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
@@ -50,6 +52,7 @@ class DemoOptions:
         bag_dir: an empty or new folder for the bags, kept; None for a temporary one.
         duration_s: length of the history that exists when the questions are asked.
         verbose: the server's log goes to stderr.
+        as_json: a line of JSON for each question, and nothing else.
     """
 
     once: bool = False
@@ -57,6 +60,7 @@ class DemoOptions:
     bag_dir: Path | None = None
     duration_s: float = 120.0
     verbose: bool = False
+    as_json: bool = False
 
 
 def run_demo(
@@ -83,14 +87,20 @@ def run_demo(
             )
         )
         url = f"http://{HOST}:{port}"
-        say(_heading(recorder, options, url))
-        wrong = _count_wrong(f"{url}/sse", recorder, say, questions)
+        tell = _say_nothing if options.as_json else say
+        tell(_heading(recorder, options, url))
+        show = exchange_as_json if options.as_json else format_exchange
+        wrong = _count_wrong(f"{url}/sse", recorder, lambda *each: say(show(*each)), questions)
         total = len(questions)
-        say(f"{total - wrong} of {total} answers are right.")
+        tell(f"{total - wrong} of {total} answers are right.")
         if not options.once:
-            say(f"\n{connection_hints(f'{url}/sse', f'{url}/mcp')}")
+            tell(f"\n{connection_hints(f'{url}/sse', f'{url}/mcp')}")
             _wait(server, recorder)
     return 1 if wrong else 0
+
+
+def _say_nothing(_: str) -> None:
+    return
 
 
 def _check(options: DemoOptions) -> None:
@@ -139,10 +149,10 @@ def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
 
 
 def _count_wrong(
-    url: str, recorder: DemoRecorder, say: Callable[[str], None], questions: Sequence[Question]
+    url: str, recorder: DemoRecorder, show: _Show, questions: Sequence[Question]
 ) -> int:
     try:
-        return anyio.run(_ask_all, url, recorder, say, questions)
+        return anyio.run(_ask_all, url, recorder, show, questions)
     except ExceptionGroup as group:
         # What the client raises, and what is raised while it is open, comes nested in groups.
         cause: BaseException = group
@@ -153,14 +163,14 @@ def _count_wrong(
 
 
 async def _ask_all(
-    url: str, recorder: DemoRecorder, say: Callable[[str], None], questions: Sequence[Question]
+    url: str, recorder: DemoRecorder, show: _Show, questions: Sequence[Question]
 ) -> int:
     """Asks every question over one connection; returns how many answers were wrong."""
     wrong = 0
     async with Client(sse_client(url)) as client:
         for number, question in enumerate(questions, start=1):
             exchange = await _ask(client, question, recorder)
-            say(f"{format_exchange(number, exchange)}\n")
+            show(number, exchange)
             wrong += not exchange.right
     return wrong
 

@@ -78,6 +78,7 @@ class BagTable:
         reader: reads its bags.
         known: returns, by path, closed files that were read earlier: they are not read again while
             they are unchanged.
+        only: the name of the one recording that counts; see `scan.Tree`.
     """
 
     def __init__(
@@ -86,10 +87,11 @@ class BagTable:
         reader: BagReader,
         *,
         known: Callable[[], Mapping[str, BagFile]] | None,
+        only: str | None = None,
     ) -> None:
         self._reader = reader
         self._known = known
-        self._tree = Tree(bag_dir)
+        self._tree = Tree(bag_dir, only)
         self._unchanged = UnchangedBags()
         self._files: dict[str, FileNotes] = {}
         self._links = HardLinks(bag_dir)

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -38,6 +40,8 @@ _OTHER_DISK = (
     "the bag directory lies on another disk than before, and no bag lies there: the disk of the "
     "bags has been unmounted; they are found again when it is mounted"
 )
+_OF_NAME: Final = r"(?:/.*|(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?)?"
+"""What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
 _LINK = "a symbolic link, which is not followed: move or mount the bags into the bag directory"
 
 
@@ -132,10 +136,17 @@ class Tree:
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
     with a dot are left out, and so is `lost+found`. Of the hard links of one file only the first
     path is found, except for those in saved moments, among which `BagTable` chooses.
+
+    Args:
+        root: the directory.
+        only: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
+            and its like): nothing else is found then.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, only: str | None = None) -> None:
         self._root = str(root)
+        self._only = None if only is None else f"{self._root.rstrip('/')}/{only.strip('/')}"
+        self._named = None if only is None else re.compile(re.escape(str(self._only)) + _OF_NAME)
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
         self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}"
@@ -154,6 +165,8 @@ class Tree:
             self._folders = before
             return ScanResult(problem=_problem(fault))
         problem = self._unmounted() if fault is None else _problem(fault)
+        if problem is None and not self._has_named():
+            problem = f"no bag is named {self._only} (data.recording)"
         if problem is not None:
             self._folders = {}
             result = ScanResult(problem=problem)
@@ -212,6 +225,28 @@ class Tree:
             self._device = device
         return None if self._device in {None, device} else _OTHER_DISK
 
+    def _has_named(self) -> bool:
+        folders = self._folders.values()
+        return self._only is None or any(each.files or each.odd for each in folders)
+
+    def _leave_out_others(self, path: str, folder: _Folder, stamps: dict[str, Stamp]) -> None:
+        """Leaves out of a folder what `only` does not name."""
+        if self._only is None or self._named is None:
+            return
+        is_named = self._named.fullmatch
+        kept = [bool(is_named(file)) for file in folder.files]
+        for file, is_kept in zip(folder.files, kept, strict=True):
+            if not is_kept:
+                stamps.pop(file, None)
+        folder.files = list(compress(folder.files, kept))
+        folder.inodes = list(compress(folder.inodes, kept))
+        folder.folders = [
+            each for each in folder.folders if is_named(each) or self._only.startswith(f"{each}/")
+        ]
+        folder.links = [each for each in folder.links if is_named(str(each))]
+        folder.odd = [each for each in folder.odd if is_named(str(each.path))]
+        folder.has_metadata &= bool(is_named(path))
+
     def _descend(self, before: dict[str, _Folder], now: Ns, result: ScanResult) -> OSError | None:
         """Visits every folder; returns the error where the root cannot be listed."""
         waiting = [self._root]
@@ -220,6 +255,7 @@ class Tree:
             try:
                 is_root = path == self._root
                 folder = _visit(path, before.get(path), now, result.stamps, is_root=is_root)
+                self._leave_out_others(path, folder, result.stamps)
             except OSError as error:
                 if path == self._root:
                     return error

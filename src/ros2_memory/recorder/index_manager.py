@@ -62,6 +62,7 @@ class IndexManager:
             for programs that delete, repair or save bags, which work on finished files.
         trusts_mtime: whether a young file without an end is being written; else it may be a copy,
             and its content decides.
+        only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
 
     Attributes:
         bag_dir: the bag directory.
@@ -80,8 +81,10 @@ class IndexManager:
         known: Callable[[], Mapping[str, BagFile]] | None = None,
         include_active: bool = False,
         trusts_mtime: bool = True,
+        only: str | None = None,
     ) -> None:
         self._trusts_mtime = trusts_mtime
+        self._only = only
         self.bag_dir = bag_dir
         self._known = known
         self._include_active = include_active
@@ -157,7 +160,7 @@ class IndexManager:
     # The methods below run under the lock.
 
     def _new_table(self) -> BagTable:
-        return BagTable(self.bag_dir, self._reader, known=self._known)
+        return BagTable(self.bag_dir, self._reader, known=self._known, only=self._only)
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         with _gc_paused() if self.published is None else nullcontext():

@@ -148,7 +148,7 @@ def _status(answer: results.Status) -> JsonObject:
         "earliest": moment(answer.earliest),
         "latest": moment(latest),
         **local.of(answer.earliest, latest),
-        "newest_age_s": None if latest is None else seconds(answer.now - latest),
+        "newest_age_s": None if latest is None else max(seconds(answer.now - latest), 0.0),
         **{name: topics[:_MAX_TOPICS] for name, topics in lists.items()},
         "damaged": answer.damaged,
         "incomplete": answer.incomplete,

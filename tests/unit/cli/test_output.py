@@ -76,7 +76,7 @@ def test_the_rows_of_a_table_have_the_names_of_its_columns() -> None:
     lines = [line.split() for line in shown(reply).splitlines() if line]
     assert lines[:3] == [["total", "2"], ["rows"], ["timestamp", "percentage"]]
     assert [line[-1] for line in lines[-2:]] == ["80.5", "-"]
-    assert " ".join(lines[-1][:2]) == format_time(T0 + 1.0)
+    assert lines[-1][0] == format_time(T0 + 1.0)
 
 
 def test_what_there_is_not_is_reported_in_words() -> None:
@@ -93,7 +93,7 @@ def test_a_table_for_which_there_is_room_has_a_row_for_each() -> None:
 def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
     rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
     output = shown(rows)
-    day, _, time = format_time(T0).partition(" ")
+    day, _, time = format_time(T0).partition("T")
     assert [line.count(day) for line in output.splitlines() if day in line] == [2]
     assert [line.count(time) for line in output.splitlines() if time in line] == [2]
     assert "12345" in output

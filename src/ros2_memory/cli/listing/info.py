@@ -8,15 +8,18 @@ from typing import Final
 
 import typer
 
+from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import call_tools, is_error
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
+    MB,
     AsJson,
     BagDir,
-    Overrides,
+    Recording,
     Verbose,
-    load_for,
+    Words,
+    load_to_look,
     open_memory,
     print_line,
     stdout_console,
@@ -26,27 +29,32 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.index.overlaps import overlapping_recordings
+from ros2_memory.index.recordings import recordings_of
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.insights.status import nothing_here
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.results import TopicRow
 
 _WHOLE_REPLY: Final = "server.max_reply_chars=1000000000"
 """A planner's context is short; a person's screen scrolls."""
+_TOLD_TWICE: Final = frozenset({"earliest_local", "latest_local", "now_local", "newest_age_s"})
+_OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
 def topics(
-    overrides: Overrides = None,
+    words: Words = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
+    recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
     """Every recorded topic: type, messages, usual rate, when it was first and last heard.
 
     The rate is that of the topic's newest hour, without the gaps between bags.
     """
-    settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY])
+    settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY], recording)
     memory = open_memory(settings, verbose=verbose)
     dispatcher = build_dispatcher(settings, memory)
     (answer,) = call_tools(dispatcher, {"list_recorded_topics": {}})
@@ -99,13 +107,14 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
 
 
 def info(
-    overrides: Overrides = None,
+    words: Words = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
+    recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
     """What the memory covers: range, gaps, damaged files, the budget, and how long it lasts."""
-    settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY, "server.tools=all"])
+    settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY, "server.tools=all"], recording)
     memory = open_memory(settings, verbose=verbose)
     dispatcher = build_dispatcher(settings, memory)
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
@@ -126,18 +135,51 @@ def info(
             for path, until in assumed_active(memory, snapshot)
         ],
     }
+    held = _held(snapshot)
     if as_json:
-        print_line(json.dumps(dict(zip(tools, replies, strict=True)) | lists))
+        print_line(json.dumps(dict(zip(tools, replies, strict=True)) | {"held": held} | lists))
+    elif not _has_files(snapshot):
+        print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
     else:
         console = stdout_console()
-        for reply in replies:
-            print_reply(console, _with_budget_sentence(reply))
-            console.print()
+        status, covered = map(_for_people, replies)
+        print_reply(console, {**held, **status, **covered})
         for name, rows in lists.items():
             if rows:
                 print_reply(console, {name: rows})
     if not snapshot.bags:
         raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
+    """Returns how much is recorded, as `ros2 bag info` tells it."""
+    bags = snapshot.bags
+    kinds = sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})
+    return {
+        "recordings": len(recordings_of(snapshot)),
+        "bags": len(bags),
+        "storage": ", ".join(kinds) or None,
+        "messages": sum(bag.summary.count for bag in bags),
+        "topics": len(snapshot.timeline.topics()),
+        "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
+    }
+
+
+def _has_files(snapshot: Snapshot) -> bool:
+    aside = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread)
+    return any(aside) or bool(snapshot.empty)
+
+
+def _for_people(reply: JsonValue) -> dict[str, JsonValue]:
+    """Returns a reply without what is empty, told twice, or of a recorder that is not there."""
+    row = _with_budget_sentence(reply)
+    if not isinstance(row, dict):
+        return {}
+    has_recorder = row.get("recorder", "") is not None
+    left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
+    return {
+        key: value for key, value in row.items() if key not in left_out and value not in ([], 0)
+    }
 
 
 def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, Ns]]:

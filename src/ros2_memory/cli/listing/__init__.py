@@ -1,0 +1,1 @@
+"""Commands that list what is recorded: topics, recordings, and messages one by one."""

@@ -1,0 +1,197 @@
+"""`ros2-memory cat`: the messages of one topic, as lines for people, CSV, or JSON lines."""
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from io import StringIO
+from itertools import islice
+from typing import Annotated, Final, NamedTuple
+
+import typer
+
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
+    BagDir,
+    End,
+    Last,
+    Recording,
+    Start,
+    Verbose,
+    Words,
+    load_to_look,
+    open_memory,
+    parse_window,
+)
+from ros2_memory.cli.output import format_time, format_value
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import JsonValue
+from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.context import Call
+from ros2_memory.history.coverage import note_unread
+from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.no_data import resolve_topic
+from ros2_memory.history.view import View
+
+_TIME: Final = "time"
+
+
+class Row(NamedTuple):
+    """One message: its log time and its extracted value."""
+
+    time: Ns
+    value: JsonValue
+
+
+def cat(
+    topic: Annotated[str, typer.Argument(metavar="TOPIC", help="Its name, such as /odom.")],
+    words: Words = None,
+    *,
+    field: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PATH", help="Only this field, such as pose.covariance; repeatable."),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    last: Last = None,
+    limit: Annotated[
+        int | None, typer.Option("--limit", "-n", metavar="N", help="The first N messages alone.")
+    ] = None,
+    tail: Annotated[
+        int | None, typer.Option(metavar="N", help="The newest N messages alone.")
+    ] = None,
+    as_csv: Annotated[
+        bool, typer.Option("--csv", help="CSV: time in Unix seconds, a column for each field.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON lines: time (Unix s), time_ns, value.")
+    ] = False,
+    bag_dir: BagDir = None,
+    recording: Recording = None,
+    verbose: Verbose = False,
+) -> None:
+    """The messages of a topic in a time window, each once, by log time.
+
+    They have the fields that replies show (`describe_type`), and others by their --field. CSV and
+    JSON have numbers as they were recorded; lines for people are rounded, and shorten long arrays.
+    """
+    if as_csv and as_json:
+        raise InvalidArgumentsError("give --csv or --json, not both")
+    if limit is not None and tail is not None:
+        raise InvalidArgumentsError("give --limit or --tail, not both")
+    memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
+    view = View(memory, Call())
+    name = resolve_topic(view, topic)
+    window = parse_window(memory, start, end, last)
+    messages = view.stream.messages([name], window, newest_first=tail is not None)
+    chosen = islice(messages, limit if tail is None else tail)
+    exact = as_csv or as_json
+    rows = _extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
+    count = 0
+    for line in (_csv if as_csv else _json_lines if as_json else _lines)(rows):
+        count += 1
+        print(line)
+    sys.stdout.flush()
+    note_unread(view, window)
+    for note in view.notes.sentences():
+        typer.echo(f"note: {note}", err=True)
+    if not count:
+        typer.echo(
+            f"no message of {name} lies in this time: ros2-memory topics says when", err=True
+        )
+    if not count or not view.notes.complete:
+        raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _extracted(
+    view: View, messages: Iterable[StoredMessage], fields: Sequence[str], exact: bool
+) -> Iterator[Row]:
+    """Yields the values of messages; those that cannot be decoded are counted in a note.
+
+    Raises:
+        InvalidArgumentsError: the first message that has another value has no such field.
+    """
+    extractor, left_out = view.memory.extractor, 0
+    is_checked = False
+    for each in messages:
+        message, type_name = view.bags.decode(each), each.record.channel.type
+        if message is None:
+            left_out += 1
+            continue
+        if not is_checked or not exact:  # `exact_at` does not tell which fields there are
+            shown = extractor.shown(message, type_name, fields).value
+            is_checked = True
+        if not exact:
+            yield Row(each.time, shown)
+        elif fields:
+            found = {path: extractor.exact_at(message, type_name, path) for path in fields}
+            yield Row(each.time, found)
+        else:
+            yield Row(each.time, extractor.exact(message, type_name))
+    if left_out:
+        view.notes.complete = False
+        what = counted(left_out, "message")
+        view.notes.add(
+            f"{what} left out, since they cannot be decoded: `ros2-memory info` says why"
+        )
+
+
+def _lines(rows: Iterable[Row]) -> Iterator[str]:
+    for time, value in rows:
+        yield f"{format_time(unix_from_ns(time))}  {format_value(value)}"
+
+
+def _json_lines(rows: Iterable[Row]) -> Iterator[str]:
+    for time, value in rows:
+        yield json.dumps(
+            {"time": unix_from_ns(time), "time_ns": time, "value": _finite(value)},
+            ensure_ascii=False,
+        )
+
+
+def _finite(value: JsonValue) -> JsonValue:
+    """Returns a value as strict JSON has it: NaN and infinities become null."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    return value
+
+
+def _csv(rows: Iterable[Row]) -> Iterator[str]:
+    """Yields a header and a line for each row; the columns are those of the first row."""
+    columns: list[str] | None = None
+    beside: set[str] = set()
+    for time, value in rows:
+        cells = dict(_cells(value))
+        if columns is None:
+            columns = [*cells]
+            yield _csv_line([_TIME, *columns])
+        beside.update(cells.keys() - columns)
+        seconds, rest = divmod(time, NS_PER_S)
+        yield _csv_line([f"{seconds}.{rest:09d}", *(cells.get(each, "") for each in columns)])
+    if beside:
+        names = listed(sorted(beside))
+        typer.echo(f"note: no column, as the first message has no such field: {names}", err=True)
+
+
+def _cells(value: JsonValue, name: str = "") -> Iterator[tuple[str, str]]:
+    """Yields the columns of a value: an object's under names with dots, a list as JSON."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _cells(each, f"{name}.{key}" if name else key)
+    elif isinstance(value, list):
+        yield name or "value", json.dumps(_finite(value), ensure_ascii=False)
+    else:
+        shown = "" if value is None else value if isinstance(value, str) else json.dumps(value)
+        yield name or "value", shown
+
+
+def _csv_line(cells: Sequence[str]) -> str:
+    line = StringIO()
+    csv.writer(line, lineterminator="").writerow(cells)
+    return line.getvalue()

@@ -1,0 +1,127 @@
+"""`ros2-memory recordings`: every recording of a folder, with its time, size and maker."""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import typer
+
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bootstrap import supposed_own
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
+    MB,
+    AsJson,
+    BagDir,
+    Recording,
+    Verbose,
+    Words,
+    load_to_look,
+    open_memory,
+    print_line,
+    stdout_console,
+)
+from ros2_memory.cli.output import print_reply
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import BagFile, BagState, JsonValue
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.index.recordings import recordings_of, stem_of
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.insights.status import nothing_here
+
+_NOT_SHOWN = frozenset({"end"})
+"""Keys of a row that people have no column for: there is the length."""
+_OWN = "this recorder"
+_OTHERS = "another program"
+_MOMENT = "saved moment"
+
+
+def recordings(
+    words: Words = None,
+    as_json: AsJson = False,
+    bag_dir: BagDir = None,
+    recording: Recording = None,
+    verbose: Verbose = False,
+) -> None:
+    """Every recording of a folder: when it began, its length and size, and who made it.
+
+    --recording NAME has the other commands look at one of them alone, and data.recording=NAME the
+    server.
+    """
+    settings = load_to_look(bag_dir, words, recording)
+    memory = open_memory(settings, verbose=verbose)
+    snapshot, root = memory.index.snapshot(), settings.recording.bag_dir
+    rows = [*_rows(snapshot, root)]
+    if as_json:
+        print_line(json.dumps(rows))
+    elif rows:
+        console = stdout_console()
+        shown = [{key: row[key] for key in row if key not in _NOT_SHOWN} for row in rows]
+        print_reply(console, [row for row in shown if "start" in row])
+        others: list[JsonValue] = [row for row in rows if "start" not in row]
+        if others:
+            print_reply(console, {"not_read": others})
+    else:
+        print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
+    if not rows:
+        raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
+    own = _own_recordings(root)
+    left = {str(each.path): each.reason for each in (*snapshot.damaged, *snapshot.unread)}
+    found = sorted(recordings_of(snapshot).items(), key=lambda each: each[1][0].start)
+    for path, bags in found:
+        inside = [file for file in left if file.startswith(f"{path}/")]
+        row = _row(_name(path, bags, root), bags)
+        row["whose"] = _maker(Path(path), bags, root, own)
+        if inside:
+            row["not_read"] = len(inside)
+        for file in inside:
+            del left[file]
+        yield row
+    for file, reason in sorted(left.items()):
+        name = file.removeprefix(f"{root}/")
+        yield {"recording": name, "reason": reason}
+
+
+def _row(name: str, bags: Sequence[BagFile]) -> dict[str, JsonValue]:
+    start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
+    topics = {topic for bag in bags for topic in bag.summary.schema.positions}
+    is_open = any(bag.state is BagState.ACTIVE for bag in bags)
+    return {
+        "recording": name,
+        "start": unix_from_ns(start),
+        "end": None if is_open else unix_from_ns(end),
+        "length_s": round(unix_from_ns(end - start), 3),
+        "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
+        "bags": len(bags),
+        "messages": sum(bag.summary.count for bag in bags),
+        "topics": len(topics),
+        "storage": ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})),
+    }
+
+
+def _name(path: str, bags: Sequence[BagFile], root: Path) -> str:
+    """Returns the name under which `--recording` finds a recording."""
+    if Path(path) == root:  # its bags lie in the folder itself
+        name = stem_of(bags[0].file).removeprefix(f"{root}/")
+        return name if len(bags) == 1 else name.rpartition("_")[0]
+    return path.removeprefix(f"{root}/")
+
+
+def _own_recordings(root: Path) -> OwnRecordings | None:
+    """Returns which recordings this program made; None where that cannot be known."""
+    try:
+        return supposed_own(root)
+    except (OSError, RecorderError):
+        return None
+
+
+def _maker(path: Path, bags: Sequence[BagFile], root: Path, own: OwnRecordings | None) -> JsonValue:
+    if path.is_relative_to(root / MOMENTS_FOLDER):
+        return _MOMENT
+    if own is None:
+        return None
+    return _OWN if own.owns(bags[0].path.parent) else _OTHERS

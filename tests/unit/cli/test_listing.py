@@ -1,0 +1,339 @@
+"""`info`, `topics`, `recordings` and `cat` on bags of any origin, and `--recording`."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory import cli
+from ros2_memory.cli.ask import with_times
+from ros2_memory.cli.options import parse_time
+from ros2_memory.cli.output import format_time
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import Msg, odom, text, write_mcap
+from tests.support.housekeepers import own_all
+from tests.support.shared_bags import REAL, needs_real
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+
+
+def run(capsys: Capture, *words: object) -> tuple[int, str]:
+    code = cli.main([str(each) for each in words])
+    return code, capsys.readouterr().out
+
+
+def seconds(first: int, count: int, x: float = 0.0) -> list[Msg]:
+    return [odom(T0 + (first + n) * NS_PER_S, x, float(n)) for n in range(count)]
+
+
+@pytest.fixture(autouse=True)
+def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MEMORY_DEPLOYMENT", "MEMORY_BAG_DIR", "MEMORY_CONFIG_OVERRIDES"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("COLUMNS", "160")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two recordings in folders of their own, and two files that lie loose together."""
+    write_mcap(tmp_path / "a" / "a_0.mcap", [*seconds(0, 5), text(T0, "one")])
+    write_mcap(tmp_path / "a" / "a_1.mcap", seconds(5, 5))
+    write_mcap(tmp_path / "b" / "b_0.mcap", seconds(100, 4, 7.0))
+    write_mcap(tmp_path / "loose" / "red.mcap", seconds(200, 2))
+    write_mcap(tmp_path / "loose" / "blue.mcap", seconds(200, 3))
+    return tmp_path
+
+
+class TestPaths:
+    @pytest.mark.parametrize("path", [".", "a", "a/a_0.mcap", "loose/red.mcap"])
+    def test_info_and_topics_take_a_folder_or_a_bag(
+        self, folder: Path, capsys: Capture, path: str
+    ) -> None:
+        counts = {".": (5, 19), "a": (2, 10), "a/a_0.mcap": (1, 5), "loose/red.mcap": (1, 2)}
+        bags, poses = counts[path]
+        code, shown = run(capsys, "info", folder / path, "--json")
+        assert (code, json.loads(shown)["data_time_range"]["bags"]) == (0, bags)
+        assert json.loads(shown)["memory_status"]["recorder"] is None
+        _, shown = run(capsys, "topics", folder / path, "--json")
+        counted = {row["topic"]: row["count"] for row in json.loads(shown)}
+        # The two loose files hold the same messages, and lie in one folder.
+        assert counted["/odom"] == poses
+
+    def test_a_metadata_file_is_its_folder(self, folder: Path, capsys: Capture) -> None:
+        (folder / "b" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+        code, shown = run(capsys, "info", folder / "b" / "metadata.yaml", "--json")
+        assert (code, json.loads(shown)["held"]["messages"]) == (0, 4)
+
+    @pytest.mark.parametrize(
+        ("name", "words"),
+        [
+            ("gone", "no such file or folder"),
+            ("notes.txt", "is no bag"),
+            ("a b", "one file or fol"),
+        ],
+    )
+    def test_what_is_no_bag_is_refused_by_name(
+        self, folder: Path, capsys: Capture, name: str, words: str
+    ) -> None:
+        (folder / "notes.txt").write_text("not a bag")
+        code = cli.main(["info", *(str(folder / each) for each in name.split())])
+        assert code == 2
+        assert words in capsys.readouterr().err
+
+    def test_of_an_empty_folder_one_line_says_so(self, tmp_path: Path, capsys: Capture) -> None:
+        (tmp_path / "empty").mkdir()
+        for command in ("info", "topics", "recordings"):
+            code, shown = run(capsys, command, tmp_path / "empty")
+            assert (code, len(shown.splitlines())) == (1, 1)
+            assert str(tmp_path / "empty") in shown
+
+    def test_bags_of_others_need_no_recorder_and_no_preset(
+        self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        code, shown = run(capsys, "doctor", folder / "a", "--json")
+        findings = {each["about"]: each for each in json.loads(shown)["findings"]}
+        assert code == 0
+        assert "recorder=none" in findings["recorder"]["seen"]
+        assert "ros" not in findings
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+        _, shown = run(capsys, "ask", "get_position_seconds_ago", "seconds_ago=0", "--json")
+        assert json.loads(shown)["age_s"] == 0
+
+    def test_a_deployment_that_records_there_is_looked_at_as_it_is(
+        self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        own_all(folder)
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+        _, shown = run(capsys, "info", "--json")
+        assert json.loads(shown)["memory_status"]["budget"]["max_gb"] == 5.0
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+        _, shown = run(capsys, "info", folder, "--json")
+        assert json.loads(shown)["memory_status"]["budget"]["max_gb"] == 5.0
+        _, shown = run(capsys, "info", folder / "a", "--json")
+        assert json.loads(shown)["memory_status"]["budget"]["max_gb"] is None
+
+    def test_nothing_is_written_beside_them(self, folder: Path, capsys: Capture) -> None:
+        before = sorted(folder.rglob("*"))
+        for words in (["info"], ["topics"], ["recordings"], ["cat", "/odom"], ["doctor"]):
+            cli.main([*words, str(folder)])
+        capsys.readouterr()
+        assert sorted(folder.rglob("*")) == before
+
+    @needs_real
+    @pytest.mark.parametrize(
+        ("path", "recordings", "messages"),
+        [
+            ("plotjuggler_pose_db3", 1, 1071),
+            ("novatel_customtypes_nometa_db3/bestpos.db3", 1, 55),
+            ("rosbag2_3split_nometa_mcap", 1, 3177),
+            ("rosbag2_msgzstd_nometa_db3", 1, 1127),
+            ("bagel_filezstd_db3", 1, 6),
+        ],
+    )
+    def test_bags_of_other_projects_are_read_whatever_kind_they_are(
+        self, path: str, recordings: int, messages: int, capsys: Capture
+    ) -> None:
+        code, shown = run(capsys, "info", REAL / path, "--json")
+        held = json.loads(shown)["held"]
+        assert (code, held["recordings"], held["messages"]) == (0, recordings, messages)
+
+
+class TestRecordings:
+    def test_folders_are_recordings_and_so_are_files_that_lie_loose(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        code, shown = run(capsys, "recordings", folder, "--json")
+        rows = {row["recording"]: row for row in json.loads(shown)}
+        assert code == 0
+        assert {name: row["bags"] for name, row in rows.items()} == {
+            "a": 2,
+            "b": 1,
+            "loose/red": 1,
+            "loose/blue": 1,
+        }
+        assert (rows["a"]["start"], rows["a"]["length_s"]) == (1_700_000_000.0, 9.0)
+        assert (rows["a"]["messages"], rows["a"]["topics"], rows["a"]["storage"]) == (11, 2, "mcap")
+
+    def test_it_says_whose_they_are_and_names_what_is_not_read(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        own_all(folder)
+        write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
+        (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
+        os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
+        _, shown = run(capsys, "recordings", folder, "--json")
+        rows = {row["recording"]: row for row in json.loads(shown)}
+        assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another program")
+        assert rows["c"]["not_read"] == 1
+
+    @pytest.mark.parametrize(("name", "count"), [("a", 10), ("b", 4), ("loose/blue", 3)])
+    def test_each_can_be_looked_at_alone(
+        self, folder: Path, capsys: Capture, name: str, count: int
+    ) -> None:
+        code, shown = run(capsys, "cat", "/odom", folder, "--recording", name, "--json")
+        assert (code, len(shown.splitlines())) == (0, count)
+        _, shown = run(capsys, "recordings", folder, "--recording", name, "--json")
+        assert [row["recording"] for row in json.loads(shown)] == [name]
+
+    def test_a_name_that_there_is_not_is_refused_with_one_like_it(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        write_mcap(folder / "kitchen_run" / "kitchen_run_0.mcap", seconds(400, 1))
+        assert cli.main(["info", str(folder), "--recording", "kitchen_rum"]) == 2
+        assert "similar: kitchen_run" in capsys.readouterr().err
+        assert cli.main(["info", str(folder), "--recording", "../a"]) == 2
+        assert "data.recording" in capsys.readouterr().err
+
+    def test_what_is_forgotten_is_forgotten_of_one_recording_too(
+        self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        own_all(folder)
+        for bag in folder.rglob("*.mcap"):  # one that changed just now is not digested yet
+            os.utime(bag, (1_700_000_000,) * 2)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+        monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
+        _, shown = run(capsys, "index", "data.recording=a", "--json")
+        assert json.loads(shown) == {"bags": 2, "in_catalogue": 2, "refused": 0}
+        (catalogue,) = (folder / ".cache").rglob("*.sqlite")
+        with closing(sqlite3.connect(catalogue)) as base:
+            assert base.execute("SELECT count(*) FROM bags").fetchone() == (2,)
+        forgetting = ["forget", "--last", "9000", "--topic", "/chatter", "--yes", "--json"]
+        code, shown = run(capsys, *forgetting)
+        assert (code, json.loads(shown)["stays"]) == (0, [])
+        with closing(sqlite3.connect(catalogue)) as base:  # less the bag that had some of it
+            assert base.execute("SELECT count(*) FROM bags").fetchone() == (1,)
+
+
+class TestCat:
+    def test_lines_for_people_have_a_time_that_can_be_pasted_back(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        _, shown = run(capsys, "cat", "/odom", folder / "a")
+        lines = shown.splitlines()
+        assert len(lines) == 10
+        third = lines[2].split()[0]
+        _, shown = run(capsys, "cat", "odom", folder / "a", "--start", third, "--end", third)
+        assert shown.splitlines() == lines[2:3]
+
+    def test_json_lines_are_whole_and_strict(self, tmp_path: Path, capsys: Capture) -> None:
+        messages = [odom(T0 + 1, math.nan, 0.123456789), odom(T0 + 2, 1.0, 2.0)]
+        write_mcap(tmp_path / "r" / "r_0.mcap", messages)
+        _, shown = run(capsys, "cat", "/odom", tmp_path, "--json")
+        first, second = (
+            json.loads(line, parse_constant=pytest.fail) for line in shown.splitlines()
+        )
+        assert (first["time_ns"], second["time_ns"]) == (T0 + 1, T0 + 2)
+        assert first["value"]["position"] == {"x": None, "y": 0.123456789, "z": 0.0}
+
+    def test_csv_has_a_column_for_each_field(self, folder: Path, capsys: Capture) -> None:
+        words = ("--csv", "--field", "position.y", "--field", "header.frame_id")
+        _, shown = run(capsys, "cat", "/odom", folder / "b", *words)
+        rows = [*csv.reader(shown.splitlines())]
+        assert rows[0] == ["time", "position.y", "header.frame_id"]
+        assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
+
+    @pytest.mark.parametrize(
+        ("words", "expected"),
+        [
+            (["--limit", "2"], [0, 1]),
+            (["--tail", "2"], [8, 9]),
+            (["--last", "1.5"], [8, 9]),
+            (["--start", "3s", "--end", "2s"], [6, 7]),
+        ],
+    )
+    def test_some_can_be_chosen(
+        self, folder: Path, capsys: Capture, words: list[str], expected: list[int]
+    ) -> None:
+        _, shown = run(capsys, "cat", "/odom", folder / "a", "--json", *words)
+        times = [json.loads(line)["time_ns"] for line in shown.splitlines()]
+        assert times == [T0 + n * NS_PER_S for n in expected]
+
+    def test_a_topic_or_a_field_that_there_is_not_is_named_with_those_there_are(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["cat", "/odon", str(folder)]) == 2
+        assert "/odom" in capsys.readouterr().err
+        assert cli.main(["cat", "/odom", str(folder), "--csv", "--field", "pose.nothing"]) == 2
+        assert "position" in capsys.readouterr().err
+
+    def test_where_nothing_lies_in_the_time_the_exit_code_is_1(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["cat", "/odom", str(folder / "a"), "--end", "2001-01-01"]) == 1
+        assert "no message of /odom" in capsys.readouterr().err
+
+    def test_a_reader_that_ends_early_is_no_error(self, folder: Path) -> None:
+        program = [sys.executable, "-m", "ros2_memory.cli", "cat", "/odom", str(folder / "a")]
+        reading, writing = os.pipe()
+        os.close(reading)  # as `head` does once it has its lines
+        done = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, check=False)
+        os.close(writing)
+        assert (done.returncode, done.stderr) == (1, b"")
+
+
+@given(st.integers(946_684_800_000, 4_102_444_800_000))
+def test_a_time_that_is_printed_is_read_back_to_the_millisecond(ms: int) -> None:
+    assert parse_time(format_time(ms / 1000), 0.0) == pytest.approx(ms / 1000, abs=0.001_001)
+
+
+def test_times_and_durations_of_tools_may_be_words() -> None:
+    schema = {
+        "properties": {
+            "start": {"type": ["number", "string"]},
+            "timestamps": {"type": "array", "items": {"type": ["number", "string"]}},
+            "seconds": {"type": "number"},
+            "topic": {"type": "string"},
+        }
+    }
+    given_words = {"start": "10m", "timestamps": ["1s", "soon"], "seconds": "2h", "topic": "3d"}
+    assert with_times(given_words, schema, 1_700_000_000.0) == {
+        "start": 1_700_000_000.0 - 600,
+        "timestamps": [1_699_999_999.0, "soon"],
+        "seconds": 7200.0,
+        "topic": "3d",
+    }
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info"],
+        ["topics"],
+        ["recordings"],
+        ["ask"],
+        ["watch", "--count", "1"],
+        ["config", "show"],
+        ["export", "--mcap", "copy.mcap"],
+        ["index"],
+        ["recover", "a"],
+        ["forget", "--last", "100", "--dry-run"],
+        ["adopt", "b"],
+    ],
+    ids=" ".join,
+)
+def test_every_command_prints_json(
+    folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    own_all(folder)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    _, shown = run(capsys, *words, "--json")
+    assert json.loads(shown)
