@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.timebase import unix_from_ns
+
 if TYPE_CHECKING:
-    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
 
 MAX_FIELDS: Final = 48
@@ -140,7 +142,12 @@ class FieldRangesBuilder:
             total, each = math.fsum(constant) * messages, len(constant)
             bounds = min(constant), max(constant)
             self._numbers(path).add(bounds, total, each * messages, each, messages)
-        for path in template.computed:
+        for path, offsets in template.times:
+            times = np.concatenate([template.nanoseconds(rows, offset) for offset in offsets])
+            ends = unix_from_ns(int(times.min())), unix_from_ns(int(times.max()))
+            total = unix_from_ns(sum(times.tolist()))  # may take more than 64 bits
+            self._numbers(path).add(ends, total, times.size, len(offsets), messages)
+        for path in template.angles:
             self._numbers(path).bound(-math.inf, math.inf)
 
     def ranges(self) -> dict[str, FieldRange] | None:

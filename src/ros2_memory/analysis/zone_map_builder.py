@@ -19,9 +19,10 @@ from ros2_memory.analysis.zone_map import (
     rounded,
     words_of,
 )
+from ros2_memory.core.timebase import unix_from_ns
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
 
 MAX_TEXTS: Final = 2_000
@@ -73,6 +74,15 @@ class ZoneMapBuilder:
         """Takes many messages of a template, the first of which was added as a value."""
         if self._open:
             return
+        # Times first: these are many, and of numbers that are too many only the ends are taken.
+        for _, offsets in template.times:
+            for offset in offsets:
+                times = template.nanoseconds(rows, offset)
+                ends = [int(times.min()), int(times.max())]
+                few = self._numbers is not None and len(times) <= MAX_NUMBERS
+                self._add_numbers([*map(unix_from_ns, times.tolist() if few else ends)])
+                if not few:
+                    self._numbers = None
         for offset in template.numbers:
             column = template.column(rows, offset)
             numbers = column[~np.isnan(column)]
@@ -80,8 +90,6 @@ class ZoneMapBuilder:
                 self._add_numbers([float(numbers.min()), float(numbers.max())])
             elif numbers.size:
                 self._add_numbers(np.unique(numbers).tolist())
-        for offset in template.times:
-            self._add_numbers(template.seconds(rows, offset))
         if template.angles:
             self._add_numbers([-180.0, 180.0])
             self._numbers = None

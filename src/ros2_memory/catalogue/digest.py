@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.catalogue.map_digest import NO_STATICS, MapCollector, MapSettings
 from ros2_memory.catalogue.topic_digest import TopicCollector
 from ros2_memory.core.errors import BagError
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader
 
-DIGEST_VERSION: Final = 17
+DIGEST_VERSION: Final = 18
 """Version of what is stored of a bag and how; another one has every bag digested again."""
 _ALWAYS_READ_BYTES: Final = 64 << 20
 _MESSAGE_BYTES: Final = 200
@@ -66,6 +67,7 @@ class Digester:
         self._map_settings = map_settings
         self._sights = sights
         self._extractor = extractor
+        self._templates = Templates(reader, extractor)
         self._max_plausible_speed_mps = max_plausible_speed_mps
 
     def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
@@ -86,6 +88,7 @@ class Digester:
                 topic,
                 self._reader,
                 self._extractor,
+                self._templates,
                 self._max_plausible_speed_mps,
                 latched=is_latched,
                 in_map=in_map,

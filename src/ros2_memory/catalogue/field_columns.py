@@ -8,6 +8,7 @@ throughout takes no byte: of odometry that is most fields of a robot that stands
 from __future__ import annotations
 
 import json
+import math
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
@@ -35,8 +36,15 @@ _LAYOUTS: Final = {
     _BOUNDS: np.dtype([("low", "<f4"), ("high", "<f4")]),
     _UNKNOWN: np.dtype([]),
 }
+_PACKERS: Final = {
+    kind: struct.Struct("<" + "".join(layout[name].char for name in layout.names or ()))
+    for kind, layout in _LAYOUTS.items()
+}
+"""As `_LAYOUTS`: for the few numbers of one field numpy is slow."""
 _MESSAGES: Final = struct.Struct("<I")
 """How many messages there are, before the numbers of the fields."""
+_SINGLE: Final = struct.Struct("<f")
+_BITS: Final = struct.Struct("<i")
 _EXACT_BELOW: Final = 2.0**53
 _MOST_NUMBERS: Final = 2**32
 
@@ -87,22 +95,38 @@ def _kind(found: FieldRange) -> str:
 
 
 def _packed(found: FieldRange, kind: str) -> bytes:
-    layout = _LAYOUTS[kind]
-    values = {
-        "low": found.low if kind == _CONSTANT else outward(found.low, -np.inf),
-        "high": outward(found.high, np.inf),
-        "total": found.total,
-        "count": found.size or 0,
-    }
-    return np.array([tuple(values[name] for name in layout.names or ())], layout).tobytes()
+    packer = _PACKERS[kind]
+    if not packer.size:
+        return b""
+    if kind == _CONSTANT:
+        return packer.pack(found.low)
+    bounds = outward(found.low, -math.inf), outward(found.high, math.inf)
+    if kind == _BOUNDS:
+        return packer.pack(*bounds)
+    if kind == _EVEN:
+        return packer.pack(*bounds, found.total)
+    return packer.pack(*bounds, found.total, found.size)
 
 
-def outward(number: float, towards: float) -> np.float32:
-    """Returns a float32 near a number that lies no less towards an infinity."""
-    with np.errstate(over="ignore"):
-        near = np.float32(number)
-    beyond = float(near) > number if towards < 0 else float(near) < number
-    return np.nextafter(near, np.float32(towards)) if beyond else near
+def outward(number: float, towards: float) -> float:
+    """Returns a number that a float32 holds, near another and no less towards an infinity."""
+    try:
+        [near] = _SINGLE.unpack(_SINGLE.pack(number))
+    except OverflowError:
+        near = math.copysign(math.inf, number)
+    beyond = near > number if towards < 0 else near < number
+    return _next_single(near, towards) if beyond else near
+
+
+def _next_single(near: float, towards: float) -> float:
+    """Returns the float32 next to another, towards an infinity."""
+    [bits] = _BITS.unpack(_SINGLE.pack(near))
+    if near:
+        bits += 1 if (near > 0) == (towards > 0) else -1  # away from 0, or to it
+    else:
+        bits = 1 if towards > 0 else 1 - 2**31
+    [after] = _SINGLE.unpack(_BITS.pack(bits))
+    return float(after)
 
 
 @dataclass(frozen=True, slots=True)

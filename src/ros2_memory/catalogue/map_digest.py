@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.bag_frames import Floats, Mask, Times
-    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.messages.detections import Detection

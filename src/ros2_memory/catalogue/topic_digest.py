@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
+from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample
 from ros2_memory.analysis.field_ranges import FieldRangesBuilder
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
@@ -20,10 +20,10 @@ from ros2_memory.messages.detections import detections_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.analysis.field_ranges import FieldRange
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
+    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector
@@ -38,6 +38,8 @@ MAX_STORED: Final = 64
 MAX_STORED_BYTES: Final = 1 << 20
 _MAX_EDGES: Final = 1_000
 _BATCH_BYTES: Final = 1 << 20
+_FEWEST: Final = 8
+"""Messages below which decoding them one by one costs no more than using a known template."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,13 +85,15 @@ class TopicDigest:
 class _Sample(NamedTuple):
     """What one message contributes to the digest besides its numbers and edges.
 
-    `detections` are known where somebody asked for them, and the message was decoded alone.
+    `detections` are known where somebody asked for them, and the message was decoded alone;
+    `pairs` are the frames of its valid transforms then, None where nobody asked.
     """
 
     pose: Pose | None
     speed_mps: float | None
     state: State
     detections: tuple[Detection, ...] | None = None
+    pairs: frozenset[tuple[str, str]] | None = frozenset()
 
 
 class TopicCollector:
@@ -99,6 +103,7 @@ class TopicCollector:
         topic: its name.
         reader: decodes the messages.
         extractor: gives the values that conditions are tested on.
+        templates: of the same reader and extractor.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         latched: whether its messages are stored whole where they are few.
         in_map: takes the robot's poses, moving transforms and sights of all topics of the bag.
@@ -109,6 +114,7 @@ class TopicCollector:
         topic: str,
         reader: BagReader,
         extractor: SchemaExtractor,
+        templates: Templates,
         max_plausible_speed_mps: float,
         *,
         latched: bool,
@@ -121,6 +127,7 @@ class TopicCollector:
         self._sights: dict[str, bool] = {}
         self._reader = reader
         self._extractor = extractor
+        self._templates = templates
         self._latched = latched
         self._zone_map = ZoneMapBuilder()
         self._fields = FieldRangesBuilder()
@@ -131,7 +138,7 @@ class TopicCollector:
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
         self._kept_bytes = 0
-        self._decoder = BulkDecoder(self._decode, self._template, self._apply)
+        self._decoder = BulkDecoder(self._decode, self._template, self._apply, fewest=_FEWEST)
         self._batch: list[Record] = []
         self._batch_bytes = 0
 
@@ -225,31 +232,30 @@ class TopicCollector:
         value = self._extractor.exact(message, type_name)
         self._zone_map.add(value)
         self._fields.add(value)
+        pairs = None
         if self._pairs is not None or self._map_transforms:
-            self._add_transforms(self._transforms(message, record))
+            pairs = self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
         seen = detections_of(value) if self._wants_sights(type_name) else None
-        return _Sample(*motion, state_of(value, type_name, seen), seen)
+        return _Sample(*motion, state_of(value, type_name, seen), seen, pairs)
 
-    def _add_transforms(self, transforms: Sequence[StampedTransform]) -> None:
+    def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
+        """Takes the valid transforms of a message, and returns their frames."""
         if self._map is not None and self._map_transforms:
             self._map.add_transforms(transforms)
-        if self._pairs is not None:
-            self._pairs.update((each.parent, each.child) for each in transforms)
+        pairs = frozenset([(each.parent, each.child) for each in transforms])
+        if self._pairs is not None and pairs:
+            self._pairs |= pairs
             if len(self._pairs) > _MAX_EDGES:
                 self._pairs = None
+        return pairs
 
-    def _template(self, record: Record) -> PayloadTemplate | None:
-        message = self._reader.decode(record)
-        value = self._extractor.exact(message, record.channel.type)
-        if state_of(value, record.channel.type).scores:
+    def _template(self, record: Record, sample: _Sample) -> PayloadTemplate | None:
+        if sample.state.scores:
             return None  # they differ from message to message
-        template = template_for(self._reader, self._extractor, record)
-        valid = self._transforms(message, record)
+        template = self._templates.of(record)
         # A transform that is invalid in this message may be valid in others of the template.
-        if template is None or template.pairs != {(each.parent, each.child) for each in valid}:
-            return None
-        return template
+        return template if template is not None and template.pairs == sample.pairs else None
 
     def _apply(
         self, template: PayloadTemplate, first: _Sample, records: Sequence[Record], rows: Bytes

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder, template_for
+from ros2_memory.analysis.bulk_decode import BulkDecoder
+from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.counts.segment_fold import SegmentFold
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.segment_fold import Digested, Folded
@@ -142,7 +143,7 @@ class FieldReader:
         at = partial(self._view.memory.extractor.exact_at, message, record.channel.type)
         return tuple([*numbers_in(at(field))] for field in self._fields)
 
-    def _template(self, record: Record) -> PayloadTemplate | None:
+    def _template(self, record: Record, _: _Sample) -> PayloadTemplate | None:
         """Returns the template of a message, where it has all fields."""
         template = template_for(self._view.memory.reader, self._view.memory.extractor, record)
         if template is None or not {*self._fields} <= {path for path, _ in template.fields}:

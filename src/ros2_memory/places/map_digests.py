@@ -12,7 +12,8 @@ from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
+from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample
+from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.catalogue.map_digest import MapCollector, MapDigest, MapSettings
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
@@ -21,7 +22,7 @@ from ros2_memory.places.bag_statics import BagStatics
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
+    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.catalogue.map_digest import SightsSource, Statics
     from ros2_memory.core.model import BagFile, Pose
@@ -180,7 +181,7 @@ class _MapReader:
             )
         return motion_sample(extractor, message, record.channel.type).pose
 
-    def _template(self, record: Record) -> PayloadTemplate | None:
+    def _template(self, record: Record, _: Pose | None) -> PayloadTemplate | None:
         memory = self._view.memory
         template = template_for(memory.reader, memory.extractor, record)
         valid = memory.extractor.transforms(

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.bulk_decode import template_for
 from ros2_memory.analysis.conditions import (
     Condition,
     Contains,
     Equals,
     NearPosition,
 )
+from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
@@ -184,6 +184,39 @@ def test_a_message_without_a_layout_has_no_template(tmp_path: Path) -> None:
     )
     big_endian = record._replace(payload=b"\x00\x00" + record.payload[2:])
     assert reader.layout(big_endian) is None
+
+
+def test_templates_that_are_remembered_change_no_digest(tmp_path: Path) -> None:
+    def bag(name: str, frame: str, x: float) -> Path:
+        messages = [
+            each
+            for n in range(40)
+            for at in [T0 + n * S // 20]
+            for each in (
+                odom(at, x + n / 7, 1.0, n / 10),
+                tf(at, transform(at, frame, "base_link", (x, n / 3, 0.0), 0.2)),
+                text(at, frame),
+            )
+        ]
+        return write_mcap(tmp_path / name, messages)
+
+    paths = [bag("a.mcap", "odom", 1.0), bag("b.mcap", "moda", 2.0), bag("c.mcap", "odom", 3.0)]
+    remembering = Digester(McapReader(), extractor(), 10.0)
+    for path in paths:
+        alone = Digester(McapReader(), extractor(), 10.0)
+        assert remembering.digest(path).topics == alone.digest(path).topics
+
+
+def test_times_of_a_template_have_their_exact_range(tmp_path: Path) -> None:
+    stamps = [T0 + n * S // 7 for n in range(40)] + [0]
+    messages = [
+        tf(T0 + n, transform(at, "odom", "base", (1.0, 0.0, 0.0))) for n, at in enumerate(stamps)
+    ]
+    at_once, singly = both(write_mcap(tmp_path / "bag.mcap", messages))
+    name = "transforms.header.stamp"
+    one, other = ((each.topics[0].fields or {})[name] for each in (at_once, singly))
+    assert one._replace(total=0.0) == other._replace(total=0.0)
+    assert one.total == pytest.approx(other.total, rel=1e-15)
 
 
 def test_a_pose_array_has_every_place_in_its_box(tmp_path: Path) -> None:

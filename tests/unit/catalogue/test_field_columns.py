@@ -7,6 +7,7 @@ import math
 import sys
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -19,7 +20,7 @@ from ros2_memory.analysis.field_ranges import (
     joined,
 )
 from ros2_memory.catalogue.digest import Digester
-from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column
+from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column, outward
 from ros2_memory.catalogue.lookup import FieldBounds
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
@@ -52,6 +53,22 @@ bodies = st.fixed_dictionaries(
 values = st.lists(st.one_of(bodies, bodies, json_values), min_size=1, max_size=6)
 fields = st.sampled_from(["x", "seen.score", "seen.0.score", "seen", "a.b", "0.x", "0", "nothing"])
 limits = st.one_of(st.floats(allow_nan=False), st.integers(), st.sampled_from([0.1, 0.2, -50.0]))
+
+
+@given(st.floats(allow_nan=False), st.sampled_from([-math.inf, math.inf]))
+@example(0.0, math.inf)
+@example(-0.0, -math.inf)
+@example(1e-300, math.inf)
+@example(1e-300, -math.inf)
+@example(-1e-300, math.inf)
+@example(1e39, -math.inf)
+@example(-1e39, math.inf)
+def test_a_bound_is_the_next_float32_outwards(number: float, towards: float) -> None:
+    with np.errstate(over="ignore"):
+        near = np.float32(number)
+    off = float(near) > number if towards < 0 else float(near) < number
+    expected = np.nextafter(near, np.float32(towards)) if off else near
+    assert np.float32(outward(number, towards)).tobytes() == np.float32(expected).tobytes()
 
 
 def ranges_of(some: list[JsonValue]) -> dict[str, FieldRange] | None:

@@ -50,12 +50,20 @@ class SpeedDrop(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """The first pose of a slot, rounded."""
+    """The first pose of a slot, its time and place rounded; `turn` may be a rounded heading."""
 
     time: Ns
     x: int
     y: int
-    heading: int
+    turn: Quaternion | int | None
+
+    @property
+    def heading(self) -> int:
+        """About Z, rounded; computed for few of the slots, since most show no drop."""
+        if isinstance(self.turn, int):
+            return self.turn
+        unit = None if self.turn is None else normalised(self.turn)
+        return _NO_HEADING if unit is None else round(yaw(unit) / _TURN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +105,9 @@ class _Finder:
         speeds = [_speed(rows[nth], rows[nth + 1]) for nth in range(_ROWS - 1)]
         if not _falls(speeds[1:]) or _falls(speeds[:-1]):
             return None
-        turned = rows[6].heading - rows[2].heading
-        if _NO_HEADING not in {rows[6].heading, rows[2].heading} and (
-            abs(math.remainder(turned * _TURN, math.tau)) > TURNS_RAD
+        before, after = rows[2].heading, rows[6].heading
+        if _NO_HEADING not in {before, after} and (
+            abs(math.remainder((after - before) * _TURN, math.tau)) > TURNS_RAD
         ):
             return None
         return SpeedDrop(rows[3].time, min(speeds[1:3]), max(speeds[4:]))
@@ -181,16 +189,15 @@ class SpeedDropBuilder:
 
 
 def _row(time: Ns, position: Vector3, turn: Quaternion | None) -> _Row:
-    unit = None if turn is None else normalised(turn)
-    heading = _NO_HEADING if unit is None else round(yaw(unit) / _TURN)
     # Down, so that a time stays in its slot.
     at = time // _STEP_NS * _STEP_NS
-    return _Row(at, round(position[0] / _STEP), round(position[1] / _STEP), heading)
+    return _Row(at, round(position[0] / _STEP), round(position[1] / _STEP), turn)
 
 
 def _encode(rows: Iterable[_Row]) -> bytes:
     """Encodes rows column by column as differences, which compress well."""
-    columns = np.array([*rows], "<i8").reshape(-1, len(_Row._fields)).T
+    table = [(each.time, each.x, each.y, each.heading) for each in rows]
+    columns = np.array(table, "<i8").reshape(-1, len(_Row._fields)).T
     columns[0] //= _STEP_NS
     return np.diff(columns, prepend=0).tobytes()
 
