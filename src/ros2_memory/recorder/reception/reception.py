@@ -16,7 +16,7 @@ import structlog
 from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.lost_file import append_losses
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import counted, listed
 from ros2_memory.recorder.reception.losses import LossCounter
 from ros2_memory.recorder.reception.measure import measure_split
 from ros2_memory.recorder.reception.profiles import (
@@ -157,8 +157,8 @@ class Reception:
                 "messages_missing",
                 topic=topic,
                 lost=lost,
-                reason=f"{topic}: {lost} messages are missing by its counter, its stamps or "
-                "rosbag2's count: lost on their way to the disk, or never published",
+                reason=f"{topic}: {counted(lost, 'message')} missing, by its counter, its stamps "
+                "or rosbag2's count: lost on the way to the disk, or never published",
             )
         if self._bag_dir is not None:
             try:
