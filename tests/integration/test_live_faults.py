@@ -77,8 +77,10 @@ def _log_losses(campaign: Campaign) -> None:
         kills = sum(fault.kind == kind for fault in campaign.faults)
         figures = (statistics.median(lost), max(lost)) if lost else (0.0, 0.0)
         _log.info(
-            "%s, %s: %d kills, %d of a recording under way; lost in s: median %.2f, most %.2f",
+            "%s, %s: %d kills, %d of a recording under way; "
+            "lost in s: median %.2f, most %.2f; all: %s",
             *(campaign.terms.name, kind, kills, len(lost), *figures),
+            " ".join(f"{each:.2f}" for each in sorted(lost)),
         )
 
 

@@ -196,6 +196,17 @@ class OwnRecordings:
                 return False
             return self.lists(name, identity)
 
+    def began(self, directory: Path) -> bool:
+        """Returns whether a recording was to begin there, and no directory was listed for it.
+
+        Raises:
+            OSError: the list cannot be read.
+        """
+        with self._lock:
+            self._read()
+            entry = self._list.entries.get(self.name_of(directory))
+            return entry is not None and entry.identity is None
+
     def lists(self, name: str, identity: Identity | None) -> bool:
         """Returns whether the list, as last read, has a directory of this name and identity."""
         entry = self._list.entries.get(name)

@@ -27,6 +27,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
+from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector
 from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
 from ros2_memory.retention.disk import free_bytes
@@ -147,6 +148,9 @@ class Housekeeping(Housekeeper):
                 continue
             if self._keeps_foreign:
                 is_own = self._own.owns(directory)
+                if not is_own and self._own.began(directory):
+                    # Killed before it was listed as a directory: nothing shows whose it is.
+                    remove_if_empty(directory)
             else:
                 is_own = directory in named or has_own_name(directory.name)
             # It was never written, or the disk was full at that time.

@@ -228,6 +228,28 @@ class TestUpgrade:
 
 
 class TestRepair:
+    def test_what_a_killed_recorder_began_goes_where_it_holds_no_byte(self, tmp_path: Path) -> None:
+        own_all(tmp_path)
+        own = OwnRecordings(tmp_path)
+        own.begin(A)
+        for name in (A, B):
+            (tmp_path / name).mkdir()
+            (tmp_path / name / f"{name}_0.mcap").touch()
+        keeper_of(tmp_path, keeps_foreign=True).repair()
+        assert not (tmp_path / A).exists()
+        assert (tmp_path / B / f"{B}_0.mcap").exists()
+
+    def test_what_a_killed_recorder_began_stays_if_anything_lies_there(
+        self, tmp_path: Path
+    ) -> None:
+        own_all(tmp_path)
+        OwnRecordings(tmp_path).begin(A)
+        (tmp_path / A).mkdir()
+        (tmp_path / A / "notes").touch()
+        (tmp_path / A / f"{A}_0.mcap").touch()
+        keeper_of(tmp_path, keeps_foreign=True).repair()
+        assert (tmp_path / A / f"{A}_0.mcap").exists()
+
     def test_another_programs_bag_is_neither_rewritten_nor_removed(self, tmp_path: Path) -> None:
         own_all(tmp_path)
         folder = tmp_path / A
