@@ -144,6 +144,31 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
 
+def renew_entry(connection: sqlite3.Connection, row_id: int, sidecar: int) -> None:
+    """Has an entry hold for another time of the sidecar, under a new row id.
+
+    The cached answers that used it are deleted.
+    """
+    columns = "config, path, size, mtime, shape, counts"
+    row = connection.execute(f"SELECT {columns} FROM bags WHERE id = ?", (row_id,)).fetchone()
+    connection.execute("DELETE FROM bags WHERE id = ?", (row_id,))
+    cursor = connection.execute(
+        f"INSERT INTO bags ({columns}, sidecar) VALUES (?, ?, ?, ?, ?, ?, ?)", (*row, sidecar)
+    )
+    new = cursor.lastrowid
+    for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
+        base = topic << ROW_ID_BITS
+        for table in ("held", "tales"):
+            connection.execute(
+                f"UPDATE {table} SET id = ? + ? WHERE id = ? + ?", (base, new, base, row_id)
+            )
+        connection.execute(
+            "UPDATE kept SET bag = ? WHERE topic = ? AND bag = ?", (new, topic, row_id)
+        )
+    connection.execute("UPDATE maps SET bag = ? WHERE bag = ?", (new, row_id))
+    connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
+
+
 def insert_entry(
     connection: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
 ) -> None:

@@ -48,6 +48,7 @@ from ros2_memory.catalogue.sql import (
     model_of,
     packed_by_model,
     range_rows,
+    renew_entry,
     topic_number,
     topic_rows,
 )
@@ -403,6 +404,38 @@ class Catalogue(CatalogueDatabase):
 
         return self.write(write)
 
+    def with_other_sidecar(self, keys: Sequence[BagKey]) -> set[BagKey]:
+        """Returns the keys from which that of an entry differs in the time of the sidecar alone."""
+
+        def ask(connection: sqlite3.Connection) -> set[BagKey]:
+            rows = entry_rows(connection, self._config, [key.path for key in keys])
+            known = {path: BagKey(path, *rest) for _, path, *rest in rows}
+            return {
+                key
+                for key in keys
+                if (before := known.get(key.path)) is not None
+                and before != key == before._replace(sidecar_ns=key.sidecar_ns)
+            }
+
+        return self.read(ask, set())
+
+    def renew(self, entries: Sequence[tuple[BagKey, BagSummary]]) -> set[BagKey]:
+        """Gives entries that `with_other_sidecar` returned their key; returns the keys of these.
+
+        Only entries that have this very summary.
+        """
+        renewed: set[BagKey] = set()
+
+        def write(connection: sqlite3.Connection) -> None:
+            renewed.clear()
+            for key, summary in entries:
+                for row_id, *_ in entry_rows(connection, self._config, [key.path]):
+                    if _summary_of(connection, row_id) == summary:
+                        renew_entry(connection, row_id, key.sidecar_ns)
+                        renewed.add(key)
+
+        return renewed if entries and self.write(write) else set()
+
     def forget(self, paths: Sequence[str]) -> None:
         """Deletes the entries of these files, and payloads that no other entry shares."""
 
@@ -440,6 +473,17 @@ class Catalogue(CatalogueDatabase):
     def _delete_paths(self, connection: sqlite3.Connection, paths: Sequence[str]) -> None:
         rows = entry_rows(connection, self._config, paths)
         delete_entries(connection, [row[0] for row in rows])
+
+
+def _summary_of(connection: sqlite3.Connection, row_id: int) -> BagSummary:
+    """Returns the summary of an entry."""
+    number, text, counts = connection.execute(
+        "SELECT shape, text, counts FROM bags JOIN shapes ON shapes.id = shape WHERE bags.id = ?",
+        (row_id,),
+    ).fetchone()
+    schema, plain = decode_schema(text), unpacked(counts, model_of(connection, number, COUNTS))
+    [numbers] = decode_counts([plain], len(schema.topics))
+    return BagSummary.decoded(schema, numbers.tobytes())
 
 
 def _kind_of(question: str) -> str:

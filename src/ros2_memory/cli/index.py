@@ -108,9 +108,11 @@ def fill_catalogue(
     """
     done = 1
     while done:
-        done = 0
         progress = backfill.progress()
-        for number, bag in enumerate(backfill.waiting()[:_BATCH]):
+        waiting = backfill.waiting()[:_BATCH]
+        left = backfill.renew(waiting)
+        done = len(waiting) - len(left)
+        for number, bag in enumerate(left, done):
             show(replace(progress, waiting=progress.waiting - number))
             done += backfill.digest(bag)
     backfill.prune()

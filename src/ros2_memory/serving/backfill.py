@@ -19,6 +19,7 @@ import anyio
 import anyio.to_thread
 
 from ros2_memory.analysis.topic_events import has_events
+from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.catalogue.store import BagKey
@@ -42,8 +43,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.handover_file import Handover
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.catalogue.map_digest import Statics
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.context import Memory
     from ros2_memory.index.timeline import Timeline
@@ -171,6 +174,32 @@ class Backfill:
         )
         return True
 
+    def renew(self, bags: Sequence[BagFile]) -> list[BagFile]:
+        """Keeps the entries of bags in which their recording's handover has changed nothing.
+
+        Each rotation writes the `handover.json` of a recording with many bags anew, and concerns
+        one or two of these. Returns the bags that are to be digested.
+        """
+        among = self.catalogue.with_other_sidecar([self._key(bag) for bag in bags])
+        handovers: dict[Path, Handover] = {}
+        whole: list[tuple[BagKey, BagSummary]] = []
+        for bag in bags if among else ():
+            key = self._key(bag)
+            if key not in among or not self._is_unchanged(bag):
+                continue
+            with suppress(BagError, OSError):
+                if bag.recording not in handovers:
+                    handovers[bag.recording] = sure_handover(bag.recording).handover
+                if handovers[bag.recording].rule(bag.path.name) is not None:
+                    continue
+                # All messages of the bag count now. If an entry has as many, all did when it was
+                # made: so it is the entry that would be made now.
+                summary = self._memory.reader.summarize(bag.path)
+                if summary == bag.summary and self._is_unchanged(bag):
+                    whole.append((key, summary))
+        renewed = self.catalogue.renew(whole)
+        return [bag for bag in bags if self._key(bag) not in renewed] if renewed else [*bags]
+
     def _statics_of(self, bag: BagFile) -> Statics:
         view = self._view_of(self._memory.index.snapshot().timeline)
         return BagStatics(view).of(bag)
@@ -259,6 +288,7 @@ async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: fl
             due = time.monotonic() - pruned_s > PRUNE_INTERVAL_S
             await _in_thread(partial(backfill.look_after, thorough=due))
             waiting = await _in_thread(backfill.waiting)
+            waiting = await _in_thread(partial(backfill.renew, waiting))
             # A catalogue that is in memory cannot be filled by another process.
             has_file = backfill.catalogue.path is not None
             if len(waiting) > BACKLOG and has_file and await _run_helper(helper):

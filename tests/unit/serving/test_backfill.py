@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import sys
 import time
 from dataclasses import replace
@@ -16,11 +17,13 @@ import pytest
 import structlog
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
-from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
+from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.cli import main
 from ros2_memory.cli.index import describe_progress, fill_catalogue
 from ros2_memory.core.errors import BagError
@@ -28,6 +31,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.serving.backfill import BACKLOG, Backfill, Progress, keep_backfilled
 from ros2_memory.serving.health import Health
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorded_before
@@ -51,7 +55,8 @@ def bag(bag_dir: Path, number: int, *, finish: bool = True) -> Path:
 
 def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
     recall = DigestCache(Catalogue([bag_dir / FOLDER / FILE], "test"), bag_dir)
-    return replace(memory_of(bag_dir, clock=clock), recall=recall)
+    reader = BagDirReader(McapReader(), bag_dir)
+    return replace(memory_of(bag_dir, clock=clock, reader=reader), recall=recall)
 
 
 def backfill_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Backfill:
@@ -126,6 +131,77 @@ def test_a_changed_bag_or_sidecar_has_the_bag_digested_again(tmp_path: Path) -> 
     fill_catalogue(backfill_of(recalling(tmp_path), tmp_path))
     path.write_bytes(bag(tmp_path, 1).read_bytes())
     assert path in [each.path for each in backfill_of(recalling(tmp_path), tmp_path).waiting()]
+
+
+class Counting(Digester):
+    """Knows which bags it digested."""
+
+    names: list[str]
+
+    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
+        self.names = [*getattr(self, "names", ()), path.name]
+        return super().digest(path, statics)
+
+
+def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
+    """Returns all that a catalogue knows of each bag, by its path below the directory."""
+    files = catalogue.known_files(bag_dir)
+    keys = {file: BagKey.of(bag, bag_dir) for file, bag in files.items()}
+    numbers = dict(zip(keys, catalogue.find([*keys.values()]), strict=True))
+    assert None not in numbers.values()
+    return {
+        os.path.relpath(file, bag_dir): [
+            files[file].summary,
+            catalogue.map_keys([number]).get(number),
+            *(
+                each(topic, [number]).get(number)
+                for topic in sorted({each.topic for each in files[file].summary.topics})
+                for each in (
+                    catalogue.zone_maps,
+                    catalogue.poses,
+                    catalogue.standstills,
+                    catalogue.topic_events,
+                    catalogue.edges,
+                    catalogue.messages,
+                )
+            ),
+        ]
+        for file, number in numbers.items()
+        if number is not None
+    }
+
+
+def test_a_handover_has_only_those_bags_digested_again_that_it_changes(tmp_path: Path) -> None:
+    bags = tmp_path / "bags"
+    paths = [bag(bags, number) for number in range(4)]
+    folder, cut = paths[0].parent, T0 + 35 * NS_PER_S
+    begun = Handover(next="later")
+    ended = replace(begun, counts_until=cut, end=Overlap(None, None, (paths[3].name,)))
+    compared = replace(ended, counts_elsewhere={paths[1].name: {"/odom": ("1 00000000",)}})
+    steps: list[tuple[Handover | None, list[int]]] = [
+        (None, [3, 2, 1, 0]),
+        (begun, []),
+        (ended, [3]),
+        (compared, [3, 1]),  # a rule concerns these
+        (Handover(), [3]),  # nothing was hidden of the other one
+    ]
+    for number, (handover, digested) in enumerate(steps):
+        if handover is not None:
+            write_handover(folder, handover)
+            at = paths[0].stat().st_mtime + number
+            os.utime(folder / HANDOVER_FILE, (at, at))
+        memory = recalling(bags)
+        digester = Counting(memory.reader, memory.extractor, 10.0)
+        backfill = backfill_of(memory, bags, digester)
+        assert fill_catalogue(backfill) == Progress(4, 0, 0)
+        assert getattr(digester, "names", []) == [paths[each].name for each in digested]
+        copy = tmp_path / f"copy_{number}"
+        shutil.copytree(bags, copy, ignore=shutil.ignore_patterns(FOLDER))
+        fresh = backfill_of(recalling(copy), copy)
+        fill_catalogue(fresh)
+        assert content(backfill.catalogue, bags) == content(fresh.catalogue, copy)
+        assert backfill.waiting() == []
+        backfill.catalogue.close()
 
 
 class Meddling(Digester):
