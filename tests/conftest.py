@@ -57,12 +57,16 @@ UNMEASURED = (
     "oracle/*.py",
     "soak/*.py",
     "test_benchmarks.py",
+    "test_bins.py::test_a_label_counts_the_same",
+    "test_bins.py::test_no_count_depends",
     "test_cancelled.py",
     "test_catalogue_versions.py",
+    "test_deep_directories.py",
     "test_demo.py::test_it_",
     "test_documents.py",
     "test_export.py::test_other_programs_open_what_comes_of_public_robots_bags",
     "test_home_questions.py",
+    "test_home_week.py",
     "test_home_world.py",
     "test_hostile_*.py",
     "test_index_killed.py",
@@ -72,7 +76,9 @@ UNMEASURED = (
     "test_path_length.py",
     "test_planner_questions.py",
     "test_real_bags*.py",
+    "test_recap.py::test_a_recap_of_a_place_is_the_same",
     "test_recorded_sessions.py",
+    "test_reply_size.py",
     "test_same_answers.py",
     "test_standstills.py",
     "test_time_zero.py",
@@ -88,8 +94,6 @@ is run by other tests of the same room, or of the tools above it, as well.
 """
 DRAWN = "hypothesis"
 """The mark of tests that draw their examples: the same lines many times, so not measured either."""
-_IN_PROGRAMS = "COVERAGE_PROCESS_CONFIG"
-"""By this, coverage.py measures in the programs that are started."""
 
 
 def pytest_unconfigure() -> None:
@@ -112,18 +116,15 @@ def is_measured(item: pytest.Item) -> bool:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Measures no coverage in some tests, their fixtures, and the programs that they start."""
+    """Measures no coverage in some tests and their fixtures."""
     measuring = Coverage.current()
     if measuring is None or is_measured(item):
         return (yield)
-    in_programs = os.environ.pop(_IN_PROGRAMS, None)
     measuring.stop()
     try:
         return (yield)
     finally:
         measuring.start()
-        if in_programs is not None:
-            os.environ[_IN_PROGRAMS] = in_programs
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
