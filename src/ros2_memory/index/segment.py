@@ -203,14 +203,16 @@ class Segment:
         column = _columns(self).of(topic)
         if column is None:
             return {}
-        folders = [self.bags[row].recording for row in column.bags.tolist()]
+        folders = [_folder_of(self.bags[row]) for row in column.bags.tolist()]
         if folders.count(folders[0]) == len(folders):
-            return {folders[0]: self.spans[topic]}
-        spans: dict[Path, Span] = {}
+            return {self.bags[column.bags[0]].recording: self.spans[topic]}
+        spans: dict[str, Span] = {}
         rows = zip(folders, column.firsts.tolist(), column.lasts.tolist(), strict=True)
         for folder, first, last in rows:
             spans[folder] = wider(spans.get(folder), (first, last))
-        return spans
+        # A path for each bag of a week would take longer than all else.
+        paths = dict(zip(folders, column.bags.tolist(), strict=True))
+        return {self.bags[paths[folder]].recording: span for folder, span in spans.items()}
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""

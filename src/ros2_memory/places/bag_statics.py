@@ -19,7 +19,6 @@ from ros2_memory.history.transforms import sessions_of, static_at, static_change
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator
-    from pathlib import Path
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile, StampedTransform, Transform
@@ -92,17 +91,18 @@ class BagStatics:
         self._topics = view.memory.limits.tf_static_topics
         of_timeline = _OF_TIMELINES.setdefault(view.snapshot.timeline, {})
         self._known = of_timeline.setdefault(self._topics, _OfTimeline())
-        self._complete: dict[Path, _SessionStatics] = {}
+        self._complete: dict[str, _SessionStatics] = {}
 
     def of(self, bag: BagFile) -> Statics:
         """Returns the static transforms of a bag's session at its end."""
-        known = self._complete.get(bag.recording)
+        folder = bag.file.rpartition("/")[0]  # a path for each bag takes longer than all else
+        known = self._complete.get(folder)
         if known is not None:
             return known.at(bag.end)
         sessions = sessions_of(self._view)
         own = sessions.of(bag.recording)
         if sessions.has_all_kinds(own):
-            self._complete[bag.recording] = known = self._statics(own)
+            self._complete[folder] = known = self._statics(own)
             return known.at(bag.end)
         session = sessions.lending_to(bag.recording, bag.end)
         return self._statics(session).at(bag.end) if session else NO_STATICS

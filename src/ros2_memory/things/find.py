@@ -156,12 +156,18 @@ class _Finder:
         A bag counts where each was seen at least half as often as the one seen most.
         """
         spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
+        many = counts >= _FEWEST_BESIDE
+        of = spots[many]
+        order = np.argsort(of[:, Spot.BAG], kind="stable")
+        bags, together, often = of[order, Spot.BAG], of[order, Spot.TOGETHER], counts[many][order]
+        begins = np.flatnonzero(np.diff(bags, prepend=-1))
         numbers: list[int] = []
-        for bag in np.unique(spots[:, Spot.BAG]).tolist():
-            of = (spots[:, Spot.BAG] == bag) & (counts >= _FEWEST_BESIDE)
-            if of.any():
-                often = int((2 * counts[of] >= counts[of].max()).sum())
-                numbers.append(min(often, int(spots[of, Spot.TOGETHER].max())))
+        if len(begins):
+            sizes = np.diff(begins, append=len(bags))
+            most = np.repeat(np.maximum.reduceat(often, begins), sizes)
+            beside = np.add.reduceat((2 * often >= most).astype(np.int64), begins)
+            at_once = np.maximum.reduceat(together, begins)
+            numbers = np.minimum(beside, at_once).tolist()
         # What most bags have, so that no single one with a false detection counts.
         number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
         return number if number > 1 else None

@@ -13,7 +13,12 @@ from threading import Lock
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
-from ros2_memory.analysis.sights import Sights, decode_sights, joined, no_sights
+from ros2_memory.analysis.sights import (
+    Sights,
+    decode_joined,
+    decode_sights,
+    joined,
+)
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagState
@@ -69,19 +74,19 @@ class _Made:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._sights: OrderedDict[tuple[object, ...], Sights] = OrderedDict()
+        self._sights: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
         self._estimates: WeakKeyDictionary[
             Timeline, OrderedDict[tuple[object, ...], KnownThings]
         ] = WeakKeyDictionary()
 
-    def sights(self, key: tuple[object, ...]) -> Sights | None:
+    def sights(self, key: tuple[object, ...]) -> bytes | None:
         with self._lock:
             found = self._sights.get(key)
             if found is not None:
                 self._sights.move_to_end(key)
             return found
 
-    def put_sights(self, key: tuple[object, ...], sights: Sights) -> None:
+    def put_sights(self, key: tuple[object, ...], sights: bytes) -> None:
         with self._lock:
             self._sights[key] = sights
             if len(self._sights) > _MADE:
@@ -175,26 +180,27 @@ class _Loader:
         self, segment: Segment, valid: Mapping[str, int], stored: Mapping[int, bytes]
     ) -> _Part:
         """Returns the sights of a segment's bags: stored ones decoded, others made."""
-        found: list[tuple[BagFile, Sights]] = []
+        found: list[tuple[BagFile, bytes]] = []
         for bag in sorted(segment.bags, key=lambda each: (each.start, each.file), reverse=True):
             packed = stored.get(valid.get(bag.file, -1))
-            sights = None if packed is None else _decoded(packed)
-            if sights is None:
-                sights = self._made(bag)
-            if sights is None:
+            if packed is None:
+                packed = self._made(bag)
+            if packed is None:
                 self._since = found[-1][0].start if found else bag.end
                 break
-            found.append((bag, sights))
+            found.append((bag, packed))
         found.reverse()
+        try:
+            sights, which, frames = decode_joined([packed for _, packed in found])
+        except ValueError:  # a damaged entry
+            sound = {number: packed for number, packed in stored.items() if _is_sound(packed)}
+            if len(sound) == len(stored):
+                raise
+            return self._read(segment, valid, sound)
         # Bags in which no detector published add nothing, and a week has thousands.
-        seen = [(bag, sights) for bag, sights in found if sights.topics]
-        return _Part(
-            joined(sights for _, sights in seen),
-            tuple(sights.frame_id for _, sights in seen),
-            tuple(bag for bag, _ in seen),
-        )
+        return _Part(sights, tuple(frames), tuple(found[nth][0] for nth in which))
 
-    def _made(self, bag: BagFile) -> Sights | None:
+    def _made(self, bag: BagFile) -> bytes | None:
         """Returns the sights of a bag without an entry; None where there is no time to read it."""
         memory = self._view.memory
         stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
@@ -211,10 +217,9 @@ class _Loader:
             digest = self._maps.made(bag, DetectorSights(memory.reader, memory.extractor))
         except QueryTimeoutError:
             return None
-        sights = _decoded(digest.sights) or no_sights()
         if bag.state is not BagState.ACTIVE and self._view.notes.keys() == before:
-            _CACHE.put_sights(key, sights)
-        return sights
+            _CACHE.put_sights(key, digest.sights)
+        return digest.sights
 
     def _epochs(
         self, frames: Sequence[str], bags: Sequence[BagFile]
@@ -237,9 +242,10 @@ class _Loader:
         return epochs, tuple(names)
 
 
-def _decoded(packed: bytes) -> Sights | None:
-    """Returns the sights in stored bytes; None where they are damaged."""
+def _is_sound(packed: bytes) -> bool:
+    """Returns whether stored bytes are sights."""
     try:
-        return decode_sights(packed)
+        decode_sights(packed)
     except ValueError:
-        return None
+        return False
+    return True

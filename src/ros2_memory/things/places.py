@@ -67,7 +67,8 @@ def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
             near = free & (_away(centre, middle) <= _PEAK_MM)
             if not near.any():
                 break
-            middle = np.average(centre[near], axis=0, weights=mass[near])
+            # As `numpy.average`, which takes ten times as long for few rows.
+            middle = (centre[near] * mass[near, None]).sum(axis=0) / mass[near].sum()
         claimed = free & (_away(centre, middle) <= _CLAIM_MM)
         claimed[at] = True
         free &= ~claimed
@@ -92,17 +93,19 @@ def _is_halo(middle: Floats, weight: float, peaks: list[Floats], masses: list[fl
 def _density(cells: Ints, mass: Floats) -> Floats:
     """Returns for each cell the mass of the cells around it."""
     reach = _PEAK_MM // _CELL_MM
-    known = {(int(a), int(b)): nth for nth, (a, b) in enumerate(cells)}
+    low = cells.min(axis=0) - reach
+    width = int(cells[:, 1].max() - low[1]) + reach + 1
+    keys = (cells[:, 0] - low[0]) * width + (cells[:, 1] - low[1])
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
     density = np.zeros(len(cells))
-    for (a, b), nth in known.items():
-        total = 0.0
-        for da in range(-reach, reach + 1):
-            for db in range(-reach, reach + 1):
-                if da * da + db * db <= reach * reach:
-                    other = known.get((a + da, b + db))
-                    if other is not None:
-                        total += float(mass[other])
-        density[nth] = total
+    for da in range(-reach, reach + 1):
+        for db in range(-reach, reach + 1):
+            if da * da + db * db <= reach * reach:
+                near = keys + da * width + db
+                at = np.minimum(np.searchsorted(ordered, near), len(ordered) - 1)
+                # Whole numbers, whose sums do not depend on their order.
+                density += np.where(ordered[at] == near, mass[order[at]], 0.0)
     return density
 
 

@@ -17,6 +17,7 @@ from ros2_memory.analysis.sights import (
     SightsBuilder,
     Spot,
     Unplaced,
+    decode_joined,
     decode_sights,
     encode_sights,
     joined,
@@ -175,6 +176,17 @@ def test_joining_is_associative(
     one, two, three = built([*a]), built([*b]), built([*c])
     assert joined([joined([one, two]), three]) == joined([one, joined([two, three])])
     assert joined([no_sights(), one]).spots.shape == one.spots.shape
+
+
+@given(st.lists(messages, max_size=5))
+def test_stored_bags_are_decoded_together_as_they_are_joined_one_by_one(
+    bags: list[list[tuple[str, int, None, list[SeenThing]]]],
+) -> None:
+    every = [built(bag) for bag in bags]
+    found, which, frames = decode_joined([encode_sights(each) for each in every])
+    assert which == [nth for nth, each in enumerate(every) if each.topics]
+    assert found == joined(every[nth] for nth in which)
+    assert frames == [every[nth].frame_id for nth in which]
 
 
 @pytest.mark.parametrize(
