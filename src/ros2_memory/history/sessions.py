@@ -68,10 +68,29 @@ class Sessions:
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
+        self._recordings: dict[tuple[Session, tuple[str, ...]], dict[Path, tuple[Ns, Ns]]] = {}
 
     def folder(self, recording: Path) -> str:
         """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
         return self._names.recorded_as(str(recording))
+
+    def recordings_of(
+        self, session: Session, topics: tuple[str, ...]
+    ) -> Mapping[Path, tuple[Ns, Ns]]:
+        """Returns the recordings of a session that hold some topics.
+
+        With the log times of the first and the last message of these.
+        """
+        key = (session, topics)
+        if key not in self._recordings:
+            found: dict[Path, tuple[Ns, Ns]] = {}
+            for topic in topics:
+                for path, span in self._view.snapshot.timeline.recordings(topic).items():
+                    if self.folder(path) in session:
+                        first, last = found.get(path, span)
+                        found[path] = min(first, span[0]), max(last, span[1])
+            self._recordings[key] = found
+        return self._recordings[key]
 
     def has(self, session: Session, found: StoredMessage) -> bool:
         """Whether a message is of a session; a carried one that names no recording is of each."""

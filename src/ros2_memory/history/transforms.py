@@ -515,10 +515,12 @@ def _transforms(
 def _bags_of(
     view: View, topics: Sequence[str], window: TimeWindow, among: Session
 ) -> list[BagSpan]:
-    bags = view.stream.overlapping_bags(topics, window)
-    sessions = sessions_of(view)
-    recordings = {each.bag.recording for each in bags}
-    chosen = {each for each in recordings if sessions.folder(each) in among}
+    chosen = sessions_of(view).recordings_of(among, tuple(topics))
+    if not chosen:
+        return []
+    first, last = min(span[0] for span in chosen.values()), max(span[1] for span in chosen.values())
+    # A session is mostly some minutes of a week, whose bags are many.
+    bags = view.stream.overlapping_bags(topics, window.intersect(TimeWindow(first, last + 1)))
     return [each for each in bags if each.bag.recording in chosen]
 
 

@@ -182,7 +182,7 @@ def test_joining_is_associative(
 def test_stored_bags_are_decoded_together_as_they_are_joined_one_by_one(
     bags: list[list[tuple[str, int, None, list[SeenThing]]]],
 ) -> None:
-    every = [built(bag) for bag in bags]
+    every = [built([*bag]) for bag in bags]
     found, which, frames = decode_joined([encode_sights(each) for each in every])
     assert which == [nth for nth, each in enumerate(every) if each.topics]
     assert found == joined(every[nth] for nth in which)
