@@ -465,7 +465,7 @@ class _VisitSearch:
     def _positions(self, part: TimeWindow) -> Iterator[tuple[StoredMessage, Vector3]]:
         """Returns the positions of a part, newest first."""
         messages = self._view.stream.messages([self._topic], part, newest_first=True)
-        return positions_of(self._view, messages)
+        return positions_of(self._view, self._decoder, messages)
 
 
 def _away(position: Vector3, target: tuple[float, float]) -> float:
