@@ -277,12 +277,13 @@ class Sighting:
         topic: of the messages.
         first: log time of the first of them; of the earliest one read where `begun` is False.
         last: of the last.
-        messages: how many there are.
+        messages: how many there are; 0 for a goal of an action, which is no run of messages.
         begun: whether the message before the first is known not to belong.
         robot: where the robot was at the last.
         thing: where the thing itself was then, if the message has that.
         matched: the texts of the last message that met the condition, where that is on texts.
-        value: the requested fields of the last message; None where none were, or it has none.
+        value: the requested fields of the last message; None where none were, or it has none. Of a
+            goal its id and its status.
         score: of the detection, if the message has that; the best of several.
         skipped: how much of the time from the first to the last the clock skipped.
     """

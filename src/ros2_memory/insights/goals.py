@@ -3,42 +3,72 @@
 A status message lists every goal that its server still knows, also those that ended some minutes
 before. So a goal begins where a message lists it that the one before does not, and ends where its
 status becomes succeeded, canceled or aborted (action_msgs/msg/GoalStatus).
+
+`goals_asked` is for searches: a condition on the status of such a topic is met by goals, not by
+messages, since what a server lists says nothing of when it happened.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.state_changes import GOAL, GOALS
 from ros2_memory.analysis.topic_events import TopicEventsBuilder
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.insights.topic_events import add_events
+from ros2_memory.insights.topic_events import add_events, events_in, note_limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
+    from ros2_memory.places.scope import Scope
 
 STATUS_TOPIC: Final = "/_action/status"
 GOAL_WORDS: Final = {3: "canceling", 4: "succeeded", 5: "canceled", 6: "aborted"}
 FAILURES: Final = frozenset({"canceled", "aborted"})
 _ENDED: Final = frozenset({4, 5, 6})
+_STATUS: Final = "status"
+_STATUS_WORDS: Final = {0: "unknown", 1: "accepted", 2: "executing", **GOAL_WORDS}
+_FAILED: Final = "failed"
 
 
 class GoalRun(NamedTuple):
-    """A goal: when it was accepted and when it ended, as log times, and how.
+    """A goal: when it was accepted and when it ended, as log times, and its last status.
 
-    `accepted` is None for a goal that was active before the window, `ended` and `outcome` for one
-    that is active at its end.
+    `accepted` is None for a goal that was active before the window, `ended` for one that is active
+    at its end. `first` and `last` are the log times between which it is known (inclusive); `goal`
+    is its id in hexadecimal digits.
     """
 
-    action: str
+    topic: str
+    goal: str
     accepted: Ns | None
     ended: Ns | None
-    outcome: str | None
+    status: int
+    first: Ns
+    last: Ns
+
+    @property
+    def action(self) -> str:
+        """The name of its action."""
+        return action_of(self.topic)
+
+    @property
+    def outcome(self) -> str | None:
+        """How it ended; None for one that has not."""
+        return None if self.ended is None else GOAL_WORDS[self.status]
+
+    @property
+    def status_word(self) -> str:
+        """Its last status in a word."""
+        return _STATUS_WORDS.get(self.status, str(self.status))
 
 
 def action_of(topic: str) -> str:
@@ -63,10 +93,48 @@ def goals_in(
             add_events(view, listed, [before])
         earlier = listed.events()
         old = {} if earlier is None else {each.name: each.last for each in earlier.changes.known}
-        yield from _goals(action_of(topic), found, old)
+        yield from _goals(topic, found, old)
 
 
-def _goals(action: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:
+def goals_asked(
+    view: View, topics: Sequence[str], condition: Condition, scope: Scope
+) -> list[GoalRun] | None:
+    """Returns the goals whose last status meets a condition, the one that is known last first.
+
+    A status is its number and its word; canceled and aborted are failed as well. With a bounded
+    scope a goal counts by where that held when it ended. None where the condition is not on the
+    status of goals alone.
+
+    Raises:
+        InvalidArgumentsError: no status meets the condition.
+        QueryTimeoutError: the call's time is over.
+    """
+    types = {name for topic in topics for name in view.snapshot.timeline.types_of(topic)}
+    field = None if condition.field is None else condition.field.rsplit(".", 1)[-1]
+    if types != {GOALS} or field not in {None, _STATUS}:
+        return None
+    on_status = replace(condition, field=_STATUS)
+    wanted = {number for number in _STATUS_WORDS if on_status.matches({_STATUS: _facts(number)})}
+    if not wanted:
+        raise InvalidArgumentsError(
+            f"{topics[0]}: the status of a goal is {', '.join(_STATUS_WORDS.values())} "
+            f"(0 to {max(_STATUS_WORDS)}), or {_FAILED}, which is canceled or aborted"
+        )
+    found = {topic: events_in(view, topic, scope.window) for topic in topics}
+    for topic, events in found.items():
+        if events is not None:
+            note_limits(view, topic, replace(events, left_out=events.all_left_out))
+    goals = [each for each in goals_in(view, scope.window, found) if each.status in wanted]
+    goals.sort(key=lambda each: (each.last, each.first, each.goal), reverse=True)
+    return [each for each in goals if scope.holds_at(each.last)]
+
+
+def _facts(status: int) -> JsonValue:
+    word = _STATUS_WORDS[status]
+    return [status, word, _FAILED] if word in FAILURES else [status, word]
+
+
+def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:
     """Yields the goals of an action, given those that were listed before with their statuses."""
     ends: dict[str, tuple[Ns, int]] = {}
     for change in found.changes.changes:
@@ -80,6 +148,8 @@ def _goals(action: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[
             if known.name not in old and is_listed_first:
                 continue  # it may have ended long before
             ends[known.name] = (known.at, known.first)
-        ended, status = ends.get(known.name, (None, 0))
+        ended, status = ends.get(known.name, (None, known.last))
         accepted = None if known.name in old else known.at
-        yield GoalRun(action, accepted, ended, GOAL_WORDS.get(status))
+        last = found.last if ended is None else ended
+        name = known.name.removeprefix(GOAL)
+        yield GoalRun(topic, name, accepted, ended, status, known.at, last)

@@ -16,8 +16,7 @@ from ros2_memory.analysis.motion.standstills import SHORTEST_NS
 from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, counted, listed
-from ros2_memory.history.context import Note
+from ros2_memory.core.text import counted, listed
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
@@ -33,7 +32,7 @@ from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in
-from ros2_memory.insights.topic_events import events_in, toggled
+from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.places.driven_inside import driven_way
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.scope import times_in_region
@@ -65,7 +64,6 @@ _MOST_CHARS: Final = 1_200
 _CHANGE_CHARS: Final = 30
 """What the reply adds to a change's text."""
 
-_UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
 _STANDSTILLS_UNKNOWN: Final = (
     "the positions are too noisy, or too few, to tell when the robot stood: stood_s is null"
 )
@@ -304,7 +302,7 @@ def _topic_events(
         visible.append(seen)
         throughout.update(seen.throughout(start, end))
         last_seen |= dict.fromkeys(seen.at_end(found.last, known_to), found.last)
-        _note_limits(view, topic, found)
+        note_limits(view, topic, found)
     if below:
         sights = counted(below, "sight of a thing", "sights of things")
         view.notes.add(f"{sights} left out: no score in it reaches min_score {min_score:g}")
@@ -326,19 +324,6 @@ def _topic_events(
         for each in things.longest(MOST_EVENTS)
     ]
     return events, things.size, throughout
-
-
-def _note_limits(view: View, topic: str, events: TopicEvents) -> None:
-    if events.undecodable:
-        messages = counted(events.undecodable, "message")
-        view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
-    if events.left_out:
-        view.notes.add(f"{topic} changes too often to tell each: {events.left_out} more")
-    if events.beyond:
-        view.notes.add(
-            f"{topic} has too many booleans or things in one message: {events.beyond} more are "
-            "not followed"
-        )
 
 
 def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:

@@ -2,7 +2,8 @@
 
 A sighting is message after message of one topic that meets a condition. It ends with a message of
 that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector may
-publish only what it sees. A message that cannot be decoded is neither a match nor an end.
+publish only what it sees. A message that cannot be decoded is neither a match nor an end. Of the
+status of an action each goal is a sighting.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unas
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
+from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.pose_frames import placed, with_place
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.history.view import View
+    from ros2_memory.insights.goals import GoalRun
     from ros2_memory.messages.detections import Detection
     from ros2_memory.places.scope import WhileCondition
 
@@ -117,7 +120,9 @@ def find_matches(
     window = clamped(view, search_window(span, now))
     collected = _Sightings(limit, oldest_first=oldest_first)
     scope = Scope(view, window, where, during)
-    _collect(view, topic, condition, scope, collected)
+    goals = goals_asked(view, matching_topics(view, topic), condition, scope)
+    if goals is None:
+        _collect(view, topic, condition, scope, collected)
     searched = window
     if collected.cut and collected.selected:
         searched = TimeWindow(collected.selected[-1].first, window.stop)
@@ -130,7 +135,17 @@ def find_matches(
         )
         for matches in collected.selected
     )
-    if fields:
+    total = None if collected.cut else collected.count
+    if goals is not None:
+        total = len(goals)
+        found = tuple(
+            replace(
+                _goal_sighting(view, each, frame_id),
+                skipped=elapsed.skipped_between(each.first, each.last),
+            )
+            for each in (goals[::-1] if oldest_first else goals)[:limit]
+        )
+    elif fields:
         found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)
     if not found:
@@ -143,8 +158,8 @@ def find_matches(
         start, end = window.asked()
     return Sightings(
         found,
-        more=collected.cut or collected.count > len(found),
-        total=None if collected.cut else collected.count,
+        more=total is None or total > len(found),
+        total=total,
         start=start,
         end=end,
         now=now,
@@ -164,6 +179,9 @@ def read_sightings(
         NoDataError: there is no such topic, or none of its messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
+    goals = goals_asked(view, matching_topics(view, pattern), condition, scope)
+    if goals is not None:
+        return [(each.first, each.last) for each in reversed(goals)], None
     found = _Sightings(MAX_COUNTED, oldest_first=True)
     _collect(view, pattern, condition, scope, found)
     if found.count > MAX_COUNTED:
@@ -360,6 +378,21 @@ def _sighting(
         thing=_spot(view, thing, newest, robot),
         matched=matched_texts(condition, value),
         score=None if thing is None else thing.score,
+    )
+
+
+def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
+    """Returns a goal of an action as a sighting, with where the robot was when it ended."""
+    newest = view.stream.newest(goal.topic, TimeWindow(MIN_NS, goal.last + 1))
+    return Sighting(
+        topic=goal.topic,
+        first=goal.first,
+        last=goal.last,
+        messages=0,
+        begun=goal.accepted is not None,
+        robot=None if newest is None else _robot(view, newest, frame_id),
+        thing=None,
+        value={"goal": goal.goal, "status": goal.status_word},
     )
 
 

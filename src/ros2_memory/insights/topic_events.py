@@ -14,8 +14,10 @@ from ros2_memory.analysis.topic_events import (
 )
 from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
 from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.bag_fold import Fold
 from ros2_memory.history.bag_groups import DigestKind, store_shared
+from ros2_memory.history.context import Note
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -32,6 +34,8 @@ TOPIC_EVENTS: Final = DigestKind(
     encode=encode_topic_events,
     decode=decode_topic_events,
 )
+
+_UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
 
 
 def toggled(topic: str, toggle: Toggle) -> str:
@@ -103,3 +107,17 @@ def add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMess
             continue
         value = view.memory.extractor.exact(message, channel.type)
         to.add(found.time, state_of(value, channel.type))
+
+
+def note_limits(view: View, topic: str, events: TopicEvents) -> None:
+    """Notes what of a topic is not told, since it is too much or cannot be decoded."""
+    if events.undecodable:
+        messages = counted(events.undecodable, "message")
+        view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
+    if events.left_out:
+        view.notes.add(f"{topic} changes too often to tell each: {events.left_out} more")
+    if events.beyond:
+        view.notes.add(
+            f"{topic} has too many booleans or things in one message: {events.beyond} more are "
+            "not followed"
+        )

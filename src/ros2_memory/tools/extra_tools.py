@@ -29,7 +29,8 @@ from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
     "When, where, how often and how long a condition held, newest first; "
-    'matches in a row are one sighting. while: {{"topic": "/is_docked", "condition_type": '
+    "matches in a row are one sighting; on /_action/status each goal is: failed, aborted, "
+    'succeeded. while: {{"topic": "/is_docked", "condition_type": '
     '"equals", "value": false}} takes those while another topic meets a condition. '
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: where it "

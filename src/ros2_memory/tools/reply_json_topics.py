@@ -236,7 +236,7 @@ def _sighting(sighting: results.Sighting, now: Ns, local: LocalTimes) -> JsonObj
         **local.of(sighting.first, sighting.last),
         "duration_s": seconds(sighting.last - sighting.first - sighting.skipped),
         "ago_s": seconds(now - sighting.last),
-        "count": sighting.messages,
+        **({"count": sighting.messages} if sighting.messages else {}),
         "robot": None
         if robot is None
         else {**planar_pose(robot), "frame_id": robot.frame_id or None},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,13 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.history.context import Call
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import JsonValue
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
 from tests.support.bags import Msg, goals, write_mcap
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, recalling, replied
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -83,12 +86,92 @@ def test_the_first_message_of_all_tells_nothing_of_what_ended(tmp_path: Path) ->
     ]
 
 
-def test_a_search_finds_when_goals_were_aborted(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+Found = tuple[int, str, float, float, bool]
+
+
+def found_in(
+    memory: Memory,
+    condition: str,
+    value: JsonValue,
+    field: str | None = None,
+    *,
+    begin: float = 0,
+    end: float = 10**6,
+) -> list[Found]:
+    """The goals that a search finds: number, status, first and last second, whether it began."""
     found = find_matches(
-        memory_of(tmp_path), Call(), TOPIC, "equals", 6, field="status_list.status"
+        memory,
+        Call(),
+        TOPIC,
+        condition,
+        value,
+        field=field,
+        start_s=BEGIN / S + begin,
+        end_s=BEGIN / S + end,
+        limit=50,
     )
-    assert [(each.first - BEGIN) / S for each in found.sightings] == [42]
+    assert found.total == len(found.sightings)
+    return [
+        (
+            int(str(each.value["goal"]), 16),
+            str(each.value["status"]),
+            (each.first - BEGIN) / S,
+            (each.last - BEGIN) / S,
+            each.begun,
+        )
+        for each in found.sightings
+        if isinstance(each.value, dict)
+    ]
+
+
+ABORTED = (2, "aborted", 30, 42, True)
+CANCELED = (3, "canceled", 50, 56, True)
+
+
+@pytest.mark.parametrize(
+    ("condition", "value", "field", "expected"),
+    [
+        ("equals", 6, "status_list.status", [ABORTED]),
+        ("equals", 6, None, [ABORTED]),
+        ("equals", "Aborted", None, [ABORTED]),
+        ("contains", "abort", "status", [ABORTED]),
+        ("equals", "failed", None, [CANCELED, ABORTED]),
+        ("above", 4, "status_list.status", [CANCELED, ABORTED]),
+        ("equals", "succeeded", None, [(1, "succeeded", 10, 20, True)]),
+        ("equals", "executing", None, [(4, "executing", 60, 60, True)]),
+        ("equals", "canceling", None, []),
+    ],
+)
+def test_a_search_finds_goals_by_how_they_ended(
+    tmp_path: Path, condition: str, value: JsonValue, field: str | None, expected: list[Found]
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    assert found_in(memory_of(tmp_path), condition, value, field) == expected
+
+
+def test_a_search_of_a_window_finds_what_ended_in_it(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    found = found_in(memory_of(tmp_path), "equals", "failed", begin=35, end=55)
+    assert found == [(2, "aborted", 42, 42, False)]
+
+
+def test_a_status_that_no_goal_can_have_is_refused(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    with pytest.raises(InvalidArgumentsError, match=r"aborted \(0 to 6\), or failed"):
+        found_in(memory_of(tmp_path), "equals", "lost")
+
+
+def test_a_reply_has_a_row_for_each_goal_and_counts_them_by_day(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", DAY)
+    asked = {"topic": TOPIC, "condition_type": "equals", "value": "failed"}
+    memory = memory_of(tmp_path)
+    reply = json.loads(replied(memory, tmp_path, "find_matches", asked).text)
+    rows = [(row["value"]["status"], row["duration_s"]) for row in reply["sightings"]]
+    assert rows == [("canceled", 6), ("aborted", 12)]
+    assert "count" not in reply["sightings"][0]
+    day = {"by": "day", "start": BEGIN / S, "end": BEGIN / S + 70}
+    reply = json.loads(replied(memory, tmp_path, "find_matches", {**asked, **day}).text)
+    assert [dict(zip(reply["columns"], row, strict=True))["count"] for row in reply["rows"]] == [2]
 
 
 ENDS = st.sampled_from([4, 5, 6])
@@ -116,4 +199,12 @@ def test_however_the_history_is_cut_the_same_is_told(
         expected.append((f"/drive goal {words[end]} after {length} s", begun, at))
     with TemporaryDirectory() as folder:
         found = told(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
+        memory = memory_of(Path(folder))
+        searched = found_in(
+            recalling(memory, Path(folder)) if recalls else memory, "above", 3, "status"
+        )
     assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
+    assert [
+        (f"/drive goal {status} after {end - begin:g} s", begin, end)
+        for _, status, begin, end, _ in reversed(searched)
+    ] == expected
