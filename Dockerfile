@@ -11,6 +11,7 @@
 #
 # The recorder needs the robot's own ROS installation and is not in here.
 
+# Pinned by tag, not by digest, which could not be looked up where this was written.
 FROM python:3.11-slim AS build
 WORKDIR /src
 RUN pip install --no-cache-dir uv==0.13.8

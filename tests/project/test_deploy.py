@@ -12,8 +12,10 @@ import pytest
 import yaml
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
+from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import Ros2BagNode, load_settings
 from ros2_memory.serving.auth import CREDENTIAL
+from tests.support.bags import odom, write_db3
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RECORDER = DEPLOY / "ros2-memory-recorder.service"
@@ -139,6 +141,16 @@ def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() 
     assert service["read_only"] is True
     # The bags of the units are their group's; without one given, a group that owns nothing.
     assert service["group_add"] == ["${MEMORY_BAG_GID:-65534}"]
+
+
+def test_the_container_reads_bags_of_every_kind(tmp_path: Path) -> None:
+    _, _, image = (DEPLOY.parent / "Dockerfile").read_text().partition("\nENV PATH=")
+    given = re.findall(r"\b((?:MEMORY|MCP)_[A-Z_]+)=(\S+)", image)
+    write_db3(tmp_path / "rec" / "rec_0.db3", [odom(10**18, 1.0, 2.0)])
+    settings = load_settings((), {**dict(given), "MEMORY_BAG_DIR": str(tmp_path)})
+    memory = build_memory(settings)
+    memory.index.refresh()
+    assert memory.index.snapshot().timeline.topics() == ("/odom",)
 
 
 @needs_sysusers

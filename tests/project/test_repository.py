@@ -26,6 +26,7 @@ GATES = (
     "uv run mypy",
     "uv run lint-imports",
     "uv run pytest --cov",
+    "uv run pytest -n0 --no-cov tests/project/test_first_commands.py",
     "uv run pip-audit --strict",
 )
 SERVER_UNIT = ROOT / "deploy/ros2-memory-server.service"
@@ -53,13 +54,15 @@ def read_yaml(name: str) -> Any:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     folder = tmp_path_factory.mktemp("wheel")
     built = subprocess.run(
-        ["uv", "build", "--quiet", "--wheel", "--out-dir", folder, ROOT],
+        # The source distribution, and the wheel that is made of it.
+        ["uv", "build", "--quiet", "--out-dir", folder, ROOT],
         check=False,
         capture_output=True,
         text=True,
     )
     assert built.returncode == 0, built.stderr
     (path,) = folder.glob("*.whl")
+    assert len([*folder.glob("*.tar.gz")]) == 1
     return zipfile.ZipFile(path)
 
 
@@ -96,6 +99,20 @@ class TestWheel:
         names = wheel.namelist()
         assert "ros2_memory/py.typed" in names
         assert any(name.endswith("licenses/LICENSE") for name in names)
+
+    def test_ships_every_file_of_the_package_and_no_other(self, wheel: zipfile.ZipFile) -> None:
+        shipped = {name for name in wheel.namelist() if name.startswith("ros2_memory/")}
+        tracked = subprocess.run(
+            ["git", "ls-files", "src"], cwd=ROOT, check=True, capture_output=True, text=True
+        )
+        files = {name.removeprefix("src/") for name in tracked.stdout.split()}
+        assert {name for name in shipped if "/_config/" not in name} == files
+
+    def test_starts_each_program(self, wheel: zipfile.ZipFile) -> None:
+        (name,) = [name for name in wheel.namelist() if name.endswith("entry_points.txt")]
+        declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+        starts = wheel.read(name).decode().split("[console_scripts]\n")[1].split()
+        assert "".join(starts) == "".join(f"{each}={to}" for each, to in declared.items())
 
     def test_ships_the_page(self, wheel: zipfile.ZipFile) -> None:
         page = ROOT / "src/ros2_memory/serving/page/index.html"
@@ -141,7 +158,8 @@ class TestGates:
     def test_the_workflow_runs_each_on_both_pythons_for_every_change(self) -> None:
         workflow = read_yaml(".github/workflows/ci.yml")
         job = workflow["jobs"]["gates"]
-        commands = "\n".join(step.get("run", "") for step in job["steps"])
+        steps = [*job["steps"], *workflow["jobs"]["bare"]["steps"]]
+        commands = "\n".join(step.get("run", "") for step in steps)
         assert [gate for gate in GATES if gate not in commands] == []
         assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12"]
         assert set(workflow[True]) == {"pull_request", "push"}  # YAML 1.1 reads the key "on" so

@@ -50,19 +50,19 @@ def exchange_as_json(number: int, exchange: Exchange) -> str:
     )
 
 
-def connection_hints(sse_url: str, http_url: str) -> str:
-    """Returns how another client connects, while the robot drives on."""
+def connection_hints(url: str) -> str:
+    """Returns where the page is and how a client connects, while the robot drives on."""
     return "\n".join(
         [
-            "The robot drives on, and the server stays up until Ctrl-C. Ask it yourself:",
+            "The robot drives on, and the server stays up until Ctrl-C. Look at it, or ask it:",
             "",
-            f"  over SSE               {sse_url}",
-            f"  over streamable HTTP   {http_url}",
+            f"  in a browser           {url}/",
+            f"  from an MCP client     {url}/mcp (streamable HTTP)",
             "  from a brain           with this in its tools/mcp.yaml:",
             "",
             "    - name: episodic",
             "      transport: sse",
-            f'      url: "{sse_url}"',
+            f'      url: "{url}/sse"',
         ]
     )
 

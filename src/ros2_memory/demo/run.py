@@ -94,7 +94,7 @@ def run_demo(
         total = len(questions)
         tell(f"{total - wrong} of {total} answers are right.")
         if not options.once:
-            tell(f"\n{connection_hints(f'{url}/sse', f'{url}/mcp')}")
+            tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
     return 1 if wrong else 0
 
