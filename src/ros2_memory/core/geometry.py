@@ -193,11 +193,30 @@ def simplify_to(
     Raises:
         ValueError: `at_most` is below 2: both ends are always kept.
     """
+    kept, off = simplifying(points, tolerance_m, at_most, seconds)
+    return sorted(kept), off[-1]
+
+
+def simplifying(
+    points: Sequence[Vector3],
+    tolerance_m: float,
+    at_most: int,
+    seconds: Sequence[float] | None = None,
+) -> tuple[list[int], list[float]]:
+    """Simplifies a path as `simplify_to` does, and returns what that takes step by step.
+
+    So it is known for any wider tolerance, too: `simplify_to` keeps the first points up to the
+    first deviation that is not beyond it.
+
+    Returns:
+        The indices of the kept points, in the order in which they are kept; and the largest
+        deviation (m) of a dropped one with the first two of them, the first three, and so on.
+    """
     if at_most < 2:
         raise ValueError(f"a path cannot be drawn with {at_most} vertices; allow 2 or more")
     last = len(points) - 1
     if last < 2:
-        return list(range(last + 1)), 0.0
+        return list(range(last + 1)), [0.0]
     # Starting from the chord of the whole path, the worst interval is split again and again.
     # Splitting the worst first makes the limits on tolerance and on count one loop: without a limit
     # on count the result is that of the recursive algorithm, found in another order.
@@ -206,7 +225,8 @@ def simplify_to(
     clock = None if seconds is None else (seconds, np.array(seconds, dtype=np.float64))
     worst = [_farthest(points, columns, 0, last, clock)]
     scans_left = _SCANS_PER_POINT * len(points)
-    while worst and -worst[0][0] > tolerance_m and len(kept) < at_most:
+    off = [-worst[0][0]]
+    while off[-1] > tolerance_m and len(kept) < at_most:
         _, split, start, end = heapq.heappop(worst)
         if scans_left < 0:
             split = (start + end) // 2
@@ -215,7 +235,8 @@ def simplify_to(
             if high - low > 1:
                 scans_left -= high - low
                 heapq.heappush(worst, _farthest(points, columns, low, high, clock))
-    return sorted(kept), -worst[0][0] if worst else 0.0
+        off.append(-worst[0][0] if worst else 0.0)
+    return kept, off
 
 
 def _columns(points: Sequence[Vector3]) -> Columns | None:

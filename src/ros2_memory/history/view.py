@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 from bisect import bisect_left
 from dataclasses import astuple, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Sessions
+    from ros2_memory.index.timeline import Timeline
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,9 @@ class Census:
     first: Ns
     last: Ns
     count: int
+
+
+_CENSUSES: Final[WeakKeyDictionary[Timeline, dict[str, dict[str, Census]]]] = WeakKeyDictionary()
 
 
 class View:
@@ -88,8 +93,19 @@ class View:
     def census(self, topic: str) -> dict[str, Census]:
         """Returns what is recorded of a topic under each of its types, each message counted once.
 
-        From the summaries of bags; messages are read only where recordings overlap.
+        From the summaries of bags; messages are read only where recordings overlap. What is counted
+        without a doubt stays in memory until a bag comes or goes.
         """
+        counted = _CENSUSES.setdefault(self.snapshot.timeline, {})
+        if topic in counted:
+            return counted[topic]
+        before = self.notes.keys()
+        found = self._census(topic)
+        if self.notes.complete and self.notes.keys() == before and not self.call.used_active:
+            counted[topic] = found
+        return found
+
+    def _census(self, topic: str) -> dict[str, Census]:
         everything = TimeWindow.everything()
         if self.stream.may_be_relatched([topic]):
             return _counted(self.stream.messages([topic], everything))

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 
+_NO_WAYPOINTS: Final = 2
+"""The fewest that a path is drawn with: drawing takes long, and these are not shown."""
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
 """A standstill that begins so soon after a loss of speed is what that led to."""
 
@@ -103,7 +105,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     elapsed = elapsed_in(view, window)
     try:
         topic = resolve_pose_topic(view)
-        path = driven_path(view, topic, window)
+        path = driven_path(view, topic, window, _NO_WAYPOINTS)
         note_robots(view, topic, window)
         standstills, drops = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:

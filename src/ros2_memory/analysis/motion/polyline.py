@@ -13,7 +13,7 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.geometry import distance, simplify_to
+from ros2_memory.core.geometry import distance, simplifying
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -162,21 +162,42 @@ def _drawn(
     if len(pieces) == 1:
         kept, error = _thinned(pieces[0], tolerance_m, at_most)
         return [kept], error
+    # One more than are allowed is enough to know that a tolerance is too narrow.
+    steps = [_thinning(piece, tolerance_m, at_most + 1) for piece in pieces]
     while True:
-        thinned = [_thinned(piece, tolerance_m, max(len(piece), 2)) for piece in pieces]
-        if sum(len(kept) for kept, _ in thinned) <= at_most:
-            return [kept for kept, _ in thinned], max((error for _, error in thinned), default=0.0)
+        numbers = [_fewest(off, tolerance_m) for _, off in steps]
+        chosen = [kept[:number] for (kept, _), number in zip(steps, numbers, strict=True)]
+        if None not in numbers and sum(map(len, chosen)) <= at_most:
+            thinned = [
+                [piece[index] for index in sorted(kept)]
+                for piece, kept in zip(pieces, chosen, strict=True)
+            ]
+            errors = (
+                off[max(len(kept) - 2, 0)] for (_, off), kept in zip(steps, chosen, strict=True)
+            )
+            return thinned, max(errors, default=0.0)
         tolerance_m *= 1.5
+
+
+def _fewest(off: Sequence[float], tolerance_m: float) -> int | None:
+    """Returns how many vertices draw a piece within a tolerance; None where more are needed."""
+    return next((nth for nth, each in enumerate(off, 2) if each <= tolerance_m), None)
 
 
 def _thinned(
     vertices: list[Vertex], tolerance_m: float, at_most: int
 ) -> tuple[list[Vertex], float]:
+    kept, off = _thinning(vertices, tolerance_m, max(at_most, 2))
+    return [vertices[index] for index in sorted(kept)], off[-1]
+
+
+def _thinning(
+    vertices: list[Vertex], tolerance_m: float, at_most: int
+) -> tuple[list[int], list[float]]:
     since = vertices[0][0] if vertices else 0
-    indices, error = simplify_to(
+    return simplifying(
         [vertex[1] for vertex in vertices],
         tolerance_m,
-        max(at_most, 2),
+        at_most,
         [unix_from_ns(vertex[0] - since) for vertex in vertices],
     )
-    return [vertices[index] for index in indices], error
