@@ -47,9 +47,9 @@ from ros2_memory.core.model import JsonValue, SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
+from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
-from ros2_memory.index.overlaps import overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here, odd_bags
 from ros2_memory.queries import data_time_range
@@ -317,15 +317,22 @@ def _is_repairable(path: Path, reader: BagReader) -> bool:
 
 def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
     """Checks that the recordings are one history, and that no file counts as active by mistake."""
-    pairs = overlapping_recordings(snapshot)
-    for pair in pairs[:MAX_NAMED]:
+    pairs = sorted(mixed_recordings(memory, Call()), key=lambda each: each.topic is None)
+    do = (
+        "give the bags of each robot or run a folder of their own, and a server each; or look at "
+        "one of them: --recording NAME, data.recording=NAME"
+    )
+    for pair, topic in pairs[:MAX_NAMED]:
         first, second = pair.names
         seen = (
             f"recordings {first} and {second} overlap from {iso_local(pair.start)} to "
             f"{iso_local(pair.end)}, and are answered together"
         )
-        do = "give the bags of each robot or run a folder of their own, and a server each"
+        if topic is not None:
+            seen += f"; each has messages of its own on {topic}: these are two robots"
         yield _warning("bags", seen, do)
+    for contradiction in contradicting_frames(memory, Call())[:MAX_NAMED]:
+        yield _warning("bags", str(contradiction), do)
     if len(pairs) > MAX_NAMED:
         seen = counted(len(pairs) - MAX_NAMED, "more pair overlaps", "more pairs overlap")
         yield _warning("bags", seen, "`ros2-memory info` lists them all")

@@ -1,31 +1,222 @@
-"""Notes on recordings that hold a topic at the same time, as of several robots.
+"""Recordings of several robots that are answered together, as one history.
 
-They are of one robot where a handover joins them, or where messages of one are in the other too.
+Recordings that hold a topic at the same time are of one robot where a handover joins them, or where
+messages of one are in the other too. At other times they are of several where a frame has one
+parent here and another one there.
 """
 
 from __future__ import annotations
 
-from itertools import islice
-from typing import TYPE_CHECKING, Final
+from itertools import combinations, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
+from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
 from ros2_memory.history.duplicates import COPY_HORIZON_NS, copy_key
+from ros2_memory.history.merged_stream import bag_span_of
 from ros2_memory.history.transforms import sessions_of
+from ros2_memory.history.view import View
+from ros2_memory.index.overlaps import Overlapping, overlapping_recordings
+from ros2_memory.index.recordings import recordings_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+    from collections.abc import Iterator, Mapping, Sequence
 
-    from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.view import View
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.history.context import Call, Memory, SnapshotSource
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.index.timeline import Timeline
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""
 _TRIED: Final = 3
 """How many messages are looked for in the other recording: a subscriber may miss one."""
+_MAX_PAIRS: Final = 20
+"""Pairs of recordings of which messages are compared."""
+_MAX_TOPICS: Final = 3
+"""Topics of a pair that are compared; robots share the rest (`/clock`, a map), if anything."""
+_MAX_TREES: Final = 32
+"""Recordings of which static transforms are compared, the newest."""
+_MAX_STATIC: Final = 50
+"""Messages of static transforms that are read of one recording."""
+_APART: Final[WeakKeyDictionary[SnapshotSource, dict[tuple[Path, Path], str | None]]] = (
+    WeakKeyDictionary()
+)
+"""Caches, for pairs of recordings, the topic on which they differ: the past does not change."""
+_PARENTS: Final[WeakKeyDictionary[SnapshotSource, dict[str, Mapping[str, str]]]] = (
+    WeakKeyDictionary()
+)
+"""Caches the parent of each static frame of a recording that is closed."""
+_MAKERS: Final[WeakKeyDictionary[Timeline, list[tuple[str, Sequence[BagFile]]]]] = (
+    WeakKeyDictionary()
+)
+"""Caches, for a timeline, the recordings of which frames are compared."""
+
+
+class Mixed(NamedTuple):
+    """Two recordings that overlap in time, and a topic on which each has messages of its own.
+
+    `topic` is None where they share none, or the messages of those that they share.
+    """
+
+    pair: Overlapping
+    topic: str | None
+
+
+class Contradiction(NamedTuple):
+    """Two recordings (paths) in which a frame has different parents."""
+
+    recordings: tuple[str, str]
+    frame: str
+    parents: tuple[str, str]
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names of the two recordings."""
+        one, other = self.recordings
+        return Overlapping(Path(one), Path(other), 0, 0).names
+
+    def __str__(self) -> str:
+        """Returns a sentence, without a full stop."""
+        one, other = self.names
+        return (
+            f"the frame {self.frame} is in {self.parents[0]} in the recording {one}, and in "
+            f"{self.parents[1]} in {other}, as of two robots"
+        )
+
+
+def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
+    """Returns the recordings that overlap in time, with a topic on which they differ.
+
+    Overlaps are known from the index. A few messages are read once of each of the first pairs.
+    """
+    view = View(memory, call)  # notes on what is read here are of no answer
+    known = _APART.setdefault(memory.index, {})
+    found: list[Mixed] = []
+    bags: Mapping[str, Sequence[BagFile]] | None = None
+    for pair in overlapping_recordings(view.snapshot):
+        key = (pair.first, pair.second)
+        if key not in known and len(found) < _MAX_PAIRS:
+            bags = bags or recordings_of(view.snapshot)
+            try:
+                known[key] = _differing_topic(view, pair, bags)
+            except QueryTimeoutError:
+                break
+        found.append(Mixed(pair, known.get(key)))
+    return tuple(found)
+
+
+def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...]:
+    """Returns frames that have one parent in one recording and another in another one.
+
+    By static transforms. Of this program's own recordings in one folder the newest is compared
+    alone: they are of one robot.
+    """
+    view = View(memory, call)
+    known = _PARENTS.setdefault(memory.index, {})
+    trees: dict[str, Mapping[str, str]] = {}
+    for path, bags in _of_different_makers(view):
+        try:
+            parents = known[path] if path in known else _static_parents(view, bags)
+        except QueryTimeoutError:
+            break
+        if not any(bag.state is BagState.ACTIVE for bag in bags):
+            known[path] = parents
+        trees[path] = parents
+    found: dict[str, Contradiction] = {}
+    for (one, parents), (other, others) in combinations(trees.items(), 2):
+        for frame in sorted(parents.keys() & others.keys()):
+            if parents[frame] != others[frame]:
+                both = (parents[frame], others[frame])
+                found.setdefault(frame, Contradiction((one, other), frame, both))
+    return tuple(found.values())
+
+
+def describe_mixed(memory: Memory, call: Call) -> Iterator[str]:
+    """Yields sentences where robots are plainly mixed into one history."""
+    mixed = [each for each in mixed_recordings(memory, call) if each.topic is not None]
+    if mixed:
+        names = sorted({name for each in mixed for name in each.pair.names})
+        first = mixed[0]
+        yield (
+            f"robots are mixed: {listed(names)} overlap in time (from "
+            f"{iso_local(first.pair.start)}), each with messages of its own on {first.topic}, and "
+            "are answered as one; data.recording narrows answers to one of them"
+        )
+    contradictions = contradicting_frames(memory, call)
+    if contradictions:
+        more = len(contradictions) - 1
+        yield f"robots are mixed: {contradictions[0]}{f' (and {more} more)' if more else ''}"
+
+
+def _differing_topic(
+    view: View, pair: Overlapping, recordings: Mapping[str, Sequence[BagFile]]
+) -> str | None:
+    both = TimeWindow(pair.start, pair.end + 1)
+    one, other = (
+        [bag for bag in recordings.get(str(path), ()) if both.overlaps(bag.start, bag.end)]
+        for path in (pair.first, pair.second)
+    )
+    shared = _topics_of(one) & _topics_of(other) - view.snapshot.timeline.transient_local
+    limits = view.memory.limits
+    first = [each for each in (limits.pose_topic, *limits.tf_topics) if each in shared]
+    for topic in islice([*first, *sorted(shared.difference(first))], _MAX_TOPICS):
+        if _differ_in(view, topic, (_spans(one, topic), _spans(other, topic)), both):
+            return topic
+    return None
+
+
+def _topics_of(bags: Sequence[BagFile]) -> set[str]:
+    return {topic for bag in bags for topic in bag.summary.schema.positions}
+
+
+def _spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
+    return [bag_span_of(bag, (topic,)) for bag in bags if topic in bag.summary.schema.positions]
+
+
+def _of_different_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
+    """Returns the newest recordings with static transforms, of this program's one in a folder."""
+    timeline = view.snapshot.timeline
+    known = _MAKERS.get(timeline)
+    if known is None:
+        known = _MAKERS[timeline] = _found_makers(view)
+    return known
+
+
+def _found_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
+    topics = view.memory.limits.tf_static_topics
+    root = f"{view.memory.index.bag_dir}/"
+    newest: dict[str, tuple[str, Sequence[BagFile]]] = {}
+    for path, bags in recordings_of(view.snapshot).items():
+        folder, _, name = path.rpartition("/")
+        holding = [bag for bag in bags if any(map(bag.summary.schema.positions.get, topics))]
+        if holding and not is_kept_apart(path.removeprefix(root)):
+            key = folder if has_own_name(name) else path
+            before = newest.get(key)
+            if before is None or before[1][0].start < holding[0].start:
+                newest[key] = (path, holding)
+    ordered = sorted(newest.values(), key=lambda each: each[1][0].start)
+    return ordered[-_MAX_TREES:] if len(ordered) > 1 else []
+
+
+def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
+    """Returns the parent of each static frame of a recording, as it was stated last."""
+    parents: dict[str, str] = {}
+    window = TimeWindow.everything()
+    for topic in view.memory.limits.tf_static_topics:
+        spans = _spans(bags, topic)
+        merged = view.stream.merged(spans, [topic], window, newest_first=False) if spans else ()
+        for each in islice(merged, _MAX_STATIC):
+            message = view.bags.decode(each)
+            if message is not None:
+                edges = view.memory.extractor.transforms(message, each.time, static=True)
+                parents.update({edge.child: edge.parent for edge in edges})
+    return parents
 
 
 def note_robots(view: View, topic: str, window: TimeWindow) -> None:
@@ -81,23 +272,32 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     """Whether two recordings hold messages in a window, and the other none of the one's."""
     if sessions_of(view).are_joined(*pair):
         return False
-    one, other = pair
+    wide = both.widened(COPY_HORIZON_NS)
+    bags = view.stream.overlapping_bags([topic], wide)
+    one, other = ([each for each in bags if each.bag.recording == path] for path in pair)
+    return _differ_in(view, topic, (one, other), both)
+
+
+def _differ_in(
+    view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
+) -> bool:
+    """Does as `_differ`, for the bags of each."""
+    one, other = bags
     if next(_messages(view, topic, other, both), None) is None:
         return False
     some = list(islice(_messages(view, topic, one, both), _TRIED))
     return bool(some) and not any(_has_duplicate(view, topic, other, each) for each in some)
 
 
-def _has_duplicate(view: View, topic: str, recording: Path, found: StoredMessage) -> bool:
-    """Whether a recording holds a duplicate of a message."""
+def _has_duplicate(view: View, topic: str, bags: Sequence[BagSpan], found: StoredMessage) -> bool:
+    """Whether some bags hold a duplicate of a message."""
     near = TimeWindow.around(found.time, COPY_HORIZON_NS)
     key = copy_key(found.record)
-    return any(copy_key(each.record) == key for each in _messages(view, topic, recording, near))
+    return any(copy_key(each.record) == key for each in _messages(view, topic, bags, near))
 
 
 def _messages(
-    view: View, topic: str, recording: Path, window: TimeWindow
+    view: View, topic: str, bags: Sequence[BagSpan], window: TimeWindow
 ) -> Iterator[StoredMessage]:
-    bags = view.stream.overlapping_bags([topic], window)
-    own = [each for each in bags if each.bag.recording == recording]
-    return view.stream.merged(own, [topic], window, newest_first=False)
+    inside = [each for each in bags if window.overlaps(each.first, each.last)]
+    return view.stream.merged(inside, [topic], window, newest_first=False)

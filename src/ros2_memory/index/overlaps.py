@@ -10,13 +10,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.index.recordings import folder_of, loose_bags
 
 if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.index.timeline import Timeline
 
 LONG_NS: Final[Ns] = 30 * NS_PER_S
 """No handover takes longer; a shorter overlap counts where it is half of a recording."""
@@ -28,7 +31,7 @@ _MAX_READ: Final = 200
 
 
 class Overlapping(NamedTuple):
-    """Two recordings, by their folders, and when (log times, inclusive) they overlap."""
+    """Two recordings, by their paths, and when (log times, inclusive) they overlap."""
 
     first: Path
     second: Path
@@ -37,7 +40,7 @@ class Overlapping(NamedTuple):
 
     @property
     def names(self) -> tuple[str, str]:
-        """The names of the two folders, with those of their parents where these are equal."""
+        """The names of the two, with those of their parents where these are equal."""
         depth = 1 if self.first.name != self.second.name else 2
         first, second = ("/".join(each.parts[-depth:]) for each in (self.first, self.second))
         return first, second
@@ -49,14 +52,24 @@ def overlapping_recordings(snapshot: Snapshot) -> tuple[Overlapping, ...]:
     Bags that a wrong clock dated are left out. Those in a saved moment count with the recording
     that they were saved from.
     """
+    known = _KNOWN.get(snapshot.timeline)
+    if known is None:
+        known = _KNOWN[snapshot.timeline] = _long_overlaps(snapshot)
+    return tuple(each for each in known if not _took_over(each))
+
+
+_KNOWN: Final[WeakKeyDictionary[Timeline, tuple[Overlapping, ...]]] = WeakKeyDictionary()
+"""Caches the pairs of a timeline, but for their handovers; a new bag makes a new timeline."""
+
+
+def _long_overlaps(snapshot: Snapshot) -> tuple[Overlapping, ...]:
     spans, pairs = _sweep(snapshot)
     found = []
     for (one, other), (start, end, shared) in pairs.items():
         shorter = min(spans[one], spans[other])
         if shared > LONG_NS or (shared > SHORT_NS and 2 * shared >= shorter):
             found.append(Overlapping(Path(one), Path(other), start, end))
-    asked = sorted(found, key=lambda each: each.start)[:_MAX_READ]
-    return tuple(each for each in asked if not _took_over(each))
+    return tuple(sorted(found, key=lambda each: each.start)[:_MAX_READ])
 
 
 def _sweep(
@@ -64,12 +77,13 @@ def _sweep(
 ) -> tuple[dict[str, Ns], dict[tuple[str, str], tuple[Ns, Ns, Ns]]]:
     """Returns how long each recording is, and when and for how long two have a bag at once."""
     left_out, spans = snapshot.dating.misdated, dict[str, Ns]()
+    loose = loose_bags(snapshot)
     pairs: dict[tuple[str, str], tuple[Ns, Ns, Ns]] = {}
     reach: dict[str, Ns] = {}
     for bag in snapshot.bags:
         if bag.file in left_out:
             continue
-        own, start, end = bag.file.rpartition("/")[0], bag.start, bag.end
+        own, start, end = loose.get(bag.file) or folder_of(bag.file), bag.start, bag.end
         if _IN_MOMENTS in own:
             own = _recorded_folder(own)
         before = reach.get(own)

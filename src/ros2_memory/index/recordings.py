@@ -40,13 +40,16 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     """Returns the recording of each bag that lies loose in a folder, by path of the bag.
 
     A folder with a metadata.yaml is one recording, and so is one whose bags are
-    named after it.
+    named after it, or with a number alone.
     """
     folders: dict[str, list[BagFile]] = {}
     whole = {*snapshot.metadata_folders}
     for bag in snapshot.bags:
         folder, _, name = bag.file.rpartition("/")
-        if folder not in whole and not name.startswith(f"{folder.rpartition('/')[2]}_"):
+        is_split = (
+            name.startswith(f"{folder.rpartition('/')[2]}_") or name.partition(".")[0].isdigit()
+        )
+        if not is_split and folder not in whole:
             folders.setdefault(folder, []).append(bag)
     found: dict[str, str] = {}
     for bags in folders.values():

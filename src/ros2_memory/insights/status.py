@@ -9,6 +9,7 @@ from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_lost
+from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.clock_steps import clock_steps
@@ -74,7 +75,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *lacking_in(view),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
-        notes=(*view.notes.sentences(), *filter(None, [held])),
+        notes=(*view.notes.sentences(), *filter(None, [held]), *describe_mixed(memory, call)),
     )
 
 

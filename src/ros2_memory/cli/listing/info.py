@@ -28,7 +28,7 @@ from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
-from ros2_memory.index.overlaps import overlapping_recordings
+from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.recordings import recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
@@ -123,12 +123,17 @@ def info(
     lists: dict[str, list[JsonValue]] = {
         "overlapping_recordings": [
             {
-                "recording": each.names[0],
-                "and": each.names[1],
-                "from": unix_from_ns(each.start),
-                "to": unix_from_ns(each.end),
+                "recording": pair.names[0],
+                "and": pair.names[1],
+                "from": unix_from_ns(pair.start),
+                "to": unix_from_ns(pair.end),
+                "robots_differ_on": topic,
             }
-            for each in overlapping_recordings(snapshot)
+            for pair, topic in mixed_recordings(memory, Call())
+        ],
+        "contradicting_frames": [
+            {"frame": each.frame, "in_recordings": [*each.names], "parents": [*each.parents]}
+            for each in contradicting_frames(memory, Call())
         ],
         "counted_as_active": [
             {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}

@@ -1,0 +1,103 @@
+"""Robots that were plainly mixed into one history are named, and one robot never is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.history.robots import contradicting_frames, mixed_recordings
+from ros2_memory.insights.status import memory_status
+from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
+from tests.support.memories import memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+T0 = 1_700_000_000 * NS_PER_S
+
+
+def drive(x: float, *, begin: int = 0, delay: int = 0) -> list[Msg]:
+    """A minute of poses; with a delay as another recorder received the same messages."""
+    stamps = [T0 + (begin + n) * NS_PER_S for n in range(61)]
+    return [odom(at, x, n / 10, log_time=at + delay) for n, at in enumerate(stamps)]
+
+
+def mounted(parent: str, at: int = T0) -> Msg:
+    return tf(at, transform(at, parent, "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
+
+
+def differing(memory: Memory) -> list[tuple[tuple[str, str], str | None]]:
+    return [(pair.names, topic) for pair, topic in mixed_recordings(memory, Call())]
+
+
+def warned(memory: Memory) -> list[str]:
+    return [note for note in memory_status(memory, Call()).notes if "robots are mixed" in note]
+
+
+@pytest.mark.parametrize("names", [("red/red_0", "blue/blue_0"), ("both/red", "both/blue")])
+def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    for number, name in enumerate(names):
+        write_mcap(tmp_path / f"{name}.mcap", drive(10.0 * number))
+    memory = memory_of(tmp_path)
+    assert differing(memory) == [(("blue", "red"), "/odom")]
+    (note,) = warned(memory)
+    assert "blue, red overlap in time" in note
+    assert "/odom" in note
+
+
+def test_two_recorders_of_one_robot_are_not(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
+    copies = [each for n, each in enumerate(drive(0.0, delay=3_000_000)) if n != 1]
+    write_mcap(tmp_path / "b" / "b_0.mcap", [*copies, text(T0, "only here")])
+    memory = memory_of(tmp_path)
+    assert differing(memory) == [(("a", "b"), None)]
+    assert warned(memory) == []
+
+
+def test_recordings_of_different_topics_are_not(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
+    words = [text(T0 + n * NS_PER_S, str(n)) for n in range(60)]
+    write_mcap(tmp_path / "b" / "b_0.mcap", words)
+    memory = memory_of(tmp_path)
+    assert differing(memory) == [(("a", "b"), None)]
+    assert warned(memory) == []
+
+
+def test_what_a_handover_joins_is_not(tmp_path: Path) -> None:
+    first, second = "rec_20231114T221320Z", "rec_20231114T221340Z"
+    write_mcap(tmp_path / first / f"{first}_0.mcap", drive(0.0))
+    write_mcap(tmp_path / second / f"{second}_0.mcap", drive(1.0, begin=20))
+    write_handover(tmp_path / first, Handover(next=second))
+    write_handover(tmp_path / second, Handover(previous=first))
+    assert differing(memory_of(tmp_path)) == []
+
+
+def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "red" / "red_0.mcap", [mounted("base_link")])
+    later = T0 + 3600 * NS_PER_S
+    write_mcap(tmp_path / "blue" / "blue_0.mcap", [mounted("torso", later)])
+    memory = memory_of(tmp_path)
+    (found,) = contradicting_frames(memory, Call())
+    assert (found.names, found.frame, found.parents) == (
+        ("red", "blue"),
+        "laser",
+        ("base_link", "torso"),
+    )
+    (note,) = warned(memory)
+    assert "laser is in base_link in the recording red, and in torso in blue" in note
+
+
+def test_a_frame_that_was_moved_within_one_deployment_is_not(tmp_path: Path) -> None:
+    for number, parent in enumerate(("base_link", "torso")):
+        name = f"rec_20231114T22132{number}Z"
+        at = T0 + number * 3600 * NS_PER_S
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [mounted(parent, at)])
+    assert contradicting_frames(memory_of(tmp_path), Call()) == ()
