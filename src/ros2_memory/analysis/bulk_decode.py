@@ -99,7 +99,7 @@ class BulkDecoder(Generic[T]):
             return rest
         among = [records[at] for at in matched]
         found.update(zip(matched, self._apply(template, decoded, among, rows), strict=True))
-        return deque(at for at in rest if at not in found)
+        return deque() if len(matched) == len(rest) else deque(at for at in rest if at not in found)
 
 
 class MotionSample(NamedTuple):

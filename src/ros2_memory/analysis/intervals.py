@@ -210,6 +210,8 @@ class IntervalBuilder:
             self._nth += 1  # as if an empty message came between
         self._nth += 1
         self._last = time
+        if not labels:
+            return
         for label, score in zip(labels, scores or repeat(None)):  # noqa: B905 - no scores
             best = _stored_score(score)
             known = self._open.get(label)

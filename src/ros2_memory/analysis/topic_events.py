@@ -217,6 +217,8 @@ class TopicEventsBuilder:
         if self._builder is None:
             self._builder = IntervalBuilder(MAX_SEEN)
         self._builder.add(time, state.labels, state.scores)
+        if state is EMPTY_STATE:  # as of most messages
+            return
         self._beyond = max(self._beyond, state.beyond)
         for path, value in state.flags:
             self._add_flag(KnownFlag(path, time, value, value))

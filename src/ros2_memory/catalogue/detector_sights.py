@@ -15,7 +15,7 @@ import numpy as np
 from ros2_memory.analysis.sights import SeenThing, SightsBuilder, encode_sights
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.messages.detections import Detection, detections_of
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.bag_frames import BagFrames, Times
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import BagReader, Record
 
 _NO_DETECTIONS: Final = frozenset(
@@ -106,7 +105,10 @@ class DetectorSights:
         except UndecodableError:
             return
         found = tuple(
-            each if each.frame_id else each._replace(frame_id=frame) for each in detections
+            [
+                each if each.frame_id else Detection(each.label, each.place, frame, each.score)
+                for each in detections
+            ]
         )
         self._left -= len(found)
         if self._left < 0:

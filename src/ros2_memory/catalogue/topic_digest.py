@@ -18,12 +18,13 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.field_ranges import FieldRange
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
+    from ros2_memory.analysis.state_changes import StateLevel
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector
@@ -195,29 +196,30 @@ class TopicCollector:
     def _decode_batch(self) -> None:
         """Decodes the waiting messages, and takes their poses and states in order."""
         batch, self._batch, self._batch_bytes = self._batch, [], 0
+        to, events = self._map, self._events
+        sights = None if to is None else to.sights
+        map_poses = to if self._map_poses else None
         for record, sample in zip(batch, self._decoder.decode(batch), strict=True):
             if isinstance(sample, UndecodableError):
                 self._zone_map.give_up()
                 self._fields.give_up()
                 self._pairs = self._poses = None
-                self._events.add_undecodable()
+                events.add_undecodable()
                 continue
-            self._events.add(record.log_time, sample.state)
+            time = record.log_time
+            events.add(time, sample.state)
             pose = sample.pose
-            if self._map is not None:
-                self._add_to_map(self._map, record, sample)
+            if sights is not None and self._wants_sights(record.channel.schema.name):
+                sights.add(record, sample.detections)
             if pose is None:
                 self._poses = None
-            elif self._poses is not None:
-                self._poses.add(record.log_time, pose, sample.speed_mps)
+                continue
+            if map_poses is not None:
+                map_poses.add_pose(time, pose)
+            if self._poses is not None:
+                self._poses.add(time, pose, sample.speed_mps)
                 if is_place(pose.position):
-                    self._standstills.add(record.log_time, pose.position, pose.orientation)
-
-    def _add_to_map(self, to: MapCollector, record: Record, sample: _Sample) -> None:
-        if self._map_poses and sample.pose is not None:
-            to.add_pose(record.log_time, sample.pose)
-        if to.sights is not None and self._wants_sights(record.channel.type):
-            to.sights.add(record, sample.detections)
+                    self._standstills.add(time, pose.position, pose.orientation)
 
     def _wants_sights(self, type_name: str) -> bool:
         if type_name not in self._sights:
@@ -264,16 +266,24 @@ class TopicCollector:
         self._fields.add_rows(template, rows)
         if self._map is not None and self._map_transforms:
             self._map.add_rows(template, records, rows)
+        is_varied = template.position is not None or template.velocity is not None
+        if not is_varied and not follow_numbers(template.type_name):
+            return repeat(_Sample(None, None, first.state), len(rows))
         return map(
             _Sample, template.poses(rows), template.speeds(rows), _states(template, first, rows)
         )
 
 
-def _states(template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterable[State]:
-    """Returns the state of each message: the first's, but for levels that follow numbers."""
+def _states(template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterator[State]:
+    """Yields the state of each message: the first's, but for levels that follow numbers."""
     if not follow_numbers(template.type_name):
-        return repeat(first.state)
+        yield from repeat(first.state, len(rows))
+        return
     columns = [template.column(rows, offset).tolist() for offset in template.numbers]
     numbers = zip(*columns, strict=True) if columns else repeat((), len(rows))
-    levels = levels_by_number(template.type_name, template.names, numbers)
-    return (first.state._replace(levels=each) for each in levels)
+    known: dict[tuple[StateLevel, ...], State] = {}
+    for levels in levels_by_number(template.type_name, template.names, numbers):
+        state = known.get(levels)
+        if state is None:
+            state = known[levels] = first.state._replace(levels=levels)
+        yield state
