@@ -8,7 +8,10 @@ decide which messages count is read, as without a catalogue: the answer is the s
 from __future__ import annotations
 
 import heapq
-from typing import TYPE_CHECKING, NamedTuple
+from collections import OrderedDict
+from threading import Lock
+from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.conditions import parse_condition, refusal_for
 from ros2_memory.analysis.field_ranges import field_named
@@ -29,10 +32,15 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
+
+_MOST_QUESTIONS: Final = 4
+_MOST_TRUTHS: Final = 65_536
+"""Messages of which it is known whether they met a condition: some 8 MB for each question."""
 
 
 def condition_of(
@@ -59,6 +67,33 @@ def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, .
     return (f"detections with a score below {least} do not count here, unless min_score is given",)
 
 
+class _Truths:
+    """Which messages met a condition, for the questions that were asked last. Thread-safe.
+
+    A message is known by its bytes and its type, as duplicates are, so that it is decoded once.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._known: WeakKeyDictionary[SchemaExtractor, OrderedDict[str, dict[int, bool]]] = (
+            WeakKeyDictionary()
+        )
+
+    def of(self, extractor: SchemaExtractor, condition: Condition) -> dict[int, bool]:
+        """Returns what is known of a condition, to be added to."""
+        with self._lock:
+            known = self._known.setdefault(extractor, OrderedDict())
+            question = repr(condition)  # 1 and True are equal, and not the same condition
+            known.setdefault(question, {})
+            known.move_to_end(question)
+            if len(known) > _MOST_QUESTIONS:
+                known.popitem(last=False)
+            return known[question]
+
+
+_TRUTHS: Final = _Truths()
+
+
 class ReverseSearch:
     """A search for one condition on the topics of a name or glob.
 
@@ -75,6 +110,7 @@ class ReverseSearch:
         self.topics = matching_topics(view, pattern)
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
+        self._truths = _TRUTHS.of(view.memory.extractor, condition)
 
     def candidates(self, until: Ns) -> CandidateBags:
         """Returns the bags that can contain a match before a moment."""
@@ -175,17 +211,25 @@ class ReverseSearch:
         """Whether a message meets the condition; None where it cannot be decoded."""
         channel = found.record.channel
         memory = self._view.memory
+        key = hash((found.record.payload, channel.schema, channel.encoding))
+        known = self._truths.get(key)
+        if known is not None:
+            self._has_decoded = True
+            return known
         with self._view.call.stages.timed("extract"):
             try:
                 message = memory.reader.decode(found.record)
                 value = memory.extractor.exact(message, channel.type)
                 self._has_decoded = True
-                return self._condition.matches(value)
+                met = self._condition.matches(value)
             except UndecodableError as error:
                 # A copy: the raised error keeps its traceback alive, and the message with it.
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
                 self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
                 return None
+        if len(self._truths) < _MOST_TRUTHS:
+            self._truths[key] = met
+        return met
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:
         """Notes which topics have messages from a moment on that could not be tested."""

@@ -108,6 +108,26 @@ def seconds(memory: Memory, value: str, topic: str, **given: object) -> list[tup
     return [((each.first - BEGIN) / S, (each.last - BEGIN) / S) for each in answer.sightings]
 
 
+def test_a_message_is_decoded_once_for_a_question(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = spoken(tmp_path, *[(at, "cup" if at % 3 else f"mug{at}") for at in range(30)])
+    exact, decoded = memory.extractor.exact, list[str]()
+
+    def counted(message: object, type_name: str) -> JsonValue:
+        decoded.append(type_name)
+        return exact(message, type_name)
+
+    monkeypatch.setattr(memory.extractor, "exact", counted)
+    first = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=100)
+    once = len(decoded)
+    again = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=100)
+    assert again == first
+    assert len(again.sightings) == 10
+    assert len(decoded) - once <= len(again.sightings)
+    assert len(find_matches(memory, Call(), OBJECTS, "contains", "mug", limit=100).sightings) == 10
+
+
 @each_way
 def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
     tmp_path: Path, recalls: bool
