@@ -21,7 +21,7 @@ import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
@@ -365,6 +365,26 @@ def test_options_that_this_ros2_knows_are_used(site: Site) -> None:
     assert f"ros2_memory_{daemon.recordings()[0].name}".encode() in argv
     assert b"recorded_by=ros2-memory" in argv
     assert b"--disable-keyboard-controls" not in argv
+    assert daemon.stop() == 0
+
+
+def test_what_newer_distributions_can_do_is_asked_for(site: Site) -> None:
+    site.env["STUB_OPTIONS"] = "--min-free-space --stats_max_publishing_rate"
+    daemon = site.run("retention.min_free_gb=0.002")
+    argv = Path(f"/proc/{daemon.child}/cmdline").read_bytes().split(b"\0")
+    assert argv[argv.index(b"--min-free-space") + 1] == b"1000000"
+    assert argv[argv.index(b"--stats_max_publishing_rate") + 1] == b"1"
+    closed = daemon.wait_for("split_closed")[0]
+    declared = McapReader().channels(daemon.bag_dir / closed["recording"] / closed["file"])
+    assert "/events/rosbag2_messages_lost" in {each.topic for each in declared}
+
+    def beat() -> Heartbeat | None:
+        found = read_heartbeat(daemon.bag_dir).heartbeat
+        return found if found is not None and found.bytes_written else None
+
+    # The recorder's own topic, which is silent as long as nothing is lost, is none of the robot's.
+    told = until(beat)
+    assert (told.subscribed, told.silent) == (("/odom", "/tf"), ())
     assert daemon.stop() == 0
 
 

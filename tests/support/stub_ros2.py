@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from io import BufferedWriter
 
 ENDED = False
+LOST = "/events/rosbag2_messages_lost"
+"""Its own topic, which it always offers; it loses nothing."""
 
 
 def install(program: Path) -> None:
@@ -81,7 +83,8 @@ class Split:
 def record(directory: Path, split_s: float, pattern: str) -> None:
     if directory.exists():
         sys.exit(f"[ERROR] [ros2bag]: Output folder '{directory}' already exists.")
-    topics = [topic for topic in ("/odom", "/tf", "/tf_static") if re.search(pattern, topic)]
+    offered = ("/odom", "/tf", "/tf_static", LOST)
+    topics = [topic for topic in offered if re.search(pattern, topic)]
     period = int(os.environ.get("STUB_PERIOD_MS", "10")) * 10**6
     silent = Path(os.environ.get("STUB_SILENT", "/nonexistent"))
     directory.mkdir(parents=True)
@@ -106,7 +109,7 @@ def record(directory: Path, split_s: float, pattern: str) -> None:
                 say("INFO", "Writing remaining messages from cache to the bag.", "rosbag2_cpp")
                 split.close()
                 split = following
-            for topic in topics:
+            for topic in (each for each in topics if each != LOST):
                 split.add(topic, time.time_ns(), published)
         done = max(done, tick)
         time.sleep(0.002)

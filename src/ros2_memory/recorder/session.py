@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.core.errors import BagError
+from ros2_memory.recorder.process.command import MESSAGES_LOST
 from ros2_memory.recorder.process.output import LineKind, parse_line
 from ros2_memory.storage.base import Closing
 
@@ -219,8 +220,10 @@ class RecordingSession:
             elif line.kind is LineKind.SUBSCRIBED and line.topic is not None:
                 # A child that subscribes records, in whatever words it reports its beginning.
                 self._records()
-                self.subscribed.add(line.topic)
-                lines.append(line)
+                # Its own topic says nothing of whether it hears the robot.
+                if line.topic != MESSAGES_LOST:
+                    self.subscribed.add(line.topic)
+                    lines.append(line)
             elif line.kind in _REPORTED and self._is_new(line):
                 if line.kind is LineKind.UNKNOWN_TYPE and line.topic is not None:
                     self.of_unknown_type.add(line.topic)
