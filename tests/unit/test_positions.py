@@ -18,6 +18,7 @@ from tests.support.bags import (
     point,
     quaternion,
     text,
+    tf,
     transform,
     write_mcap,
 )
@@ -259,6 +260,22 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     in_degrees = "(sensor_msgs/msg/NavSatFix): get_position_at answers them by topic"
     assert (in_degrees in detail) == (tool != "get_velocity_at")
     assert "no topic /odom is recorded" in detail
+
+
+@each_way
+@pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
+def test_where_there_are_transforms_alone_the_tool_for_them_is_named(
+    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+) -> None:
+    moved = [
+        tf(T0 + n * S, transform(T0 + n * S, "odom", "base_link", (n, 0.0, 0.0))) for n in range(3)
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", moved)
+    reply = ask(tmp_path, recalls, tool, **given)
+    assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
+    assert "transforms are on /tf: get_transform_at tells" in reply["detail"]
+    asked_for = {"parent": "odom", "child": "base_link", "timestamp": T0_S + 1}
+    assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
 
 
 def test_recap_names_the_topic_with_poses(tmp_path: Path) -> None:

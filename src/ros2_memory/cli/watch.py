@@ -128,7 +128,7 @@ class Observation:
     @property
     def not_live(self) -> str:
         """That rates are not assessed."""
-        return f"nothing comes in: {counted(len(self.rates), 'topic')} not judged"
+        return f"no new data; rates not checked for {counted(len(self.rates), 'topic')}"
 
 
 def watch(

@@ -182,7 +182,7 @@ class BinnedWindow:
         self.view.notes.complete = False
         self.view.notes.add(
             f"only what is after {unix_text(since)} is counted: "
-            f"{self.view.bags.backfill_progress() or 'the time was over; '}"
+            f"{self.view.bags.backfill_progress() or 'out of time; '}"
             "ask about a shorter window"
         )
 

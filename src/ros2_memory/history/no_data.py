@@ -57,7 +57,7 @@ def resolve_pose_topic(
 
     Raises:
         NoDataError: as for `resolve_topic`; where the configured topic is not recorded the sentence
-            names those that carry poses.
+            names those that carry poses, or else what the bags have in their place.
     """
     if name is not None:
         return resolve_topic(view, name)
@@ -83,9 +83,20 @@ def resolve_pose_topic(
                 ", nor another with poses in metres; latitude and longitude are on "
                 f"{listed(fixes)}: {advice}"
             )
+        elif what == "position" and (moving := _transform_topics(view)):
+            detail += (
+                f", nor another with poses; transforms are on {listed(moving)}: get_transform_at "
+                "tells where one frame was in another, and list_frames names the frames"
+            )
         else:
             raise
         raise NoDataError(error.reason, detail, error.notes) from error
+
+
+def _transform_topics(view: View) -> list[str]:
+    """Returns the recorded topics of transforms that move (`data.tf_topics`)."""
+    recorded = view.snapshot.timeline.topics()
+    return [topic for topic in view.memory.limits.tf_topics if topic in recorded]
 
 
 def topics_with(view: View, what: str) -> list[str]:

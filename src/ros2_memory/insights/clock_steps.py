@@ -64,8 +64,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     except QueryTimeoutError:
         view.notes.complete = False
         view.notes.add(
-            "the time was over before it was known whether the clock was set: durations are by "
-            "the clock"
+            "out of time before it was known whether the clock was set: durations are by the clock"
         )
         return Elapsed()
     for at, by in steps:

@@ -109,10 +109,10 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         note_robots(view, topic, window)
         standstills, drops = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
-        view.notes.add(f"nothing is known of the way: {error}")
+        view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed=elapsed)
     if path is None:
-        view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
+        view.notes.add(f"{topic} has no poses in this time: the path is unknown")
     else:
         path = replace(path, trajectory=across_steps(path, elapsed))
     return Drive(path, standstills, drops, elapsed)

@@ -35,7 +35,7 @@ TOPIC_EVENTS: Final = DigestKind(
     decode=decode_topic_events,
 )
 
-_UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
+_UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
 
 
 def toggled(topic: str, toggle: Toggle) -> str:

@@ -55,7 +55,7 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
     if joined.since is not None:
         view.notes.complete = False
         view.notes.add(
-            f"visits are known back to {unix_text(joined.since)}: the time was over before older "
+            f"visits are known back to {unix_text(joined.since)}: out of time before older "
             "bags without a digest were read"
         )
     if joined.left_out:

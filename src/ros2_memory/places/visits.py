@@ -266,7 +266,7 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
         return ()  # poses that cannot be read say nothing about resets
     except QueryTimeoutError:
         view.notes.complete = False
-        view.notes.add("the time was over before it was known whether odometry began anew since")
+        view.notes.add("there was no time to check whether odometry restarted since")
         return ()
     return () if path is None else path.trajectory.totals.resets
 
@@ -341,7 +341,7 @@ class _VisitSearch:
                 self._view.notes.complete = False
                 self._view.notes.add(
                     f"closest_m of the visit until {unix_text(visit.departed)} is not the least: "
-                    "the time was over before all of its poses were read"
+                    "there was no time to read all of its poses"
                 )
                 return min(approaches, default=bound)
             closest = min(approaches, default=None)

@@ -500,7 +500,7 @@ class MatchesArguments(ConditionArguments):
     start_s: _Time | None = Field(default=None, alias="start")
     end_s: _Time | None = Field(default=None, alias="end")
     oldest_first: Annotated[
-        bool, Field(strict=True, description="Counts all; the first are told.")
+        bool, Field(strict=True, description="Counts all, lists the first.")
     ] = False
     limit: _Limit = 5
     by: _By | None = None

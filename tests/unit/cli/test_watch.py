@@ -128,13 +128,13 @@ class TestOldData:
         assert cli.main(["watch", "--count", "1", "--bag-dir", str(old)]) == 0
         output = capsys.readouterr().out
         assert "as usual" not in output
-        assert "days old; nothing comes in: 1 topic not judged" in output
+        assert "days old; no new data; rates not checked for 1 topic" in output
 
     def test_is_as_old_as_the_tools_say(self, old: Path, capsys: Capture) -> None:
         words = ["watch", "--count", "1", "--bag-dir", str(old), "data.now=latest"]
         assert cli.main(words) == 0
         output = capsys.readouterr().out
-        assert "which is now (data.now=latest); nothing comes in" in output
+        assert "which is now (data.now=latest); no new data" in output
         assert "days old" not in output
 
 

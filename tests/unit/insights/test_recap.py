@@ -396,7 +396,7 @@ def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> No
         ("error: planner: giving up", 4.0),
     ]
     assert answer.distance_m is None
-    assert any("nothing is known of the way" in note for note in answer.notes)
+    assert any("the path is unknown" in note for note in answer.notes)
 
 
 def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
