@@ -67,6 +67,11 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
             1: "there are none, or stderr says what could not be read",
         },
     ),
+    "plot": CommandEntry(
+        "plot.commands.plot",
+        "pictures: path, signal, timeline, recap of a day",
+        {0: "the picture is written", 2: "it is not, and stderr says why"},
+    ),
     "watch": CommandEntry(
         "watch.watch",
         "what is being recorded just now",

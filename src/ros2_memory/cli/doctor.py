@@ -62,6 +62,10 @@ _RECENT_NS: Final[Ns] = 3600 * NS_PER_S
 """A topic without a message in the newest data of this length is not being recorded."""
 _HEALTH_TIMEOUT_S: Final = 5.0
 _MAX_HEALTH_BYTES: Final = 1 << 20
+_COMMANDS_OF_EXTRAS: Final = (
+    ("export --parquet", "pyarrow", "parquet"),
+    ("plot", "matplotlib", "plot"),
+)
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
 _NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
 _NOT_REPAIRED: Final = "copy them anew from where they were recorded, or delete them"
@@ -470,9 +474,13 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
         seen = "server.metrics=true with server.transport=stdio, which has no /metrics"
         do = "choose server.transport=sse, or set server.metrics to false"
         yield _error("extras", seen, do)
-    otherwise = "is not installed: pip install 'ros2-memory[parquet]' adds it"
-    state = "is installed" if _is_installed("pyarrow") else otherwise
-    yield _ok("extras", f"export --parquet {state}")
+    states = [
+        f"{what} is installed"
+        if _is_installed(module)
+        else f"{what} is not installed: pip install 'ros2-memory[{extra}]' adds it"
+        for what, module, extra in _COMMANDS_OF_EXTRAS
+    ]
+    yield _ok("extras", "; ".join(states))
 
 
 def _is_installed(module: str) -> bool:

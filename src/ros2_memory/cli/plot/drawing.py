@@ -1,0 +1,258 @@
+"""Draws with matplotlib: a path, lanes of a timeline, signals. Times are Unix seconds.
+
+Nothing here knows bags or a memory. No window is opened, and nothing is written but the picture and
+matplotlib's list of fonts (see `cache_folder`).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import textwrap
+import warnings
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory import PACKAGE
+
+
+def cache_folder() -> str:
+    """Returns where matplotlib keeps its list of fonts: the cache folder, or a temporary one."""
+    given = os.environ.get("XDG_CACHE_HOME")
+    with suppress(OSError, RuntimeError):
+        folder = Path(given) if given else Path.home() / ".cache"
+        folder = folder / PACKAGE / "matplotlib"
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return str(folder)
+    return mkdtemp(prefix="ros2-memory-")
+
+
+os.environ.setdefault("MPLCONFIGDIR", cache_folder())
+logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of fonts, and of its own limits
+
+from matplotlib import rc_context  # noqa: E402 - it makes its folder when it is imported
+from matplotlib.collections import LineCollection  # noqa: E402
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.patches import Circle as RoundPatch  # noqa: E402
+from matplotlib.patches import Polygon as PolygonPatch  # noqa: E402
+
+from ros2_memory.core.regions import Circle, Polygon  # noqa: E402
+from ros2_memory.core.text import shortened  # noqa: E402
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+
+    from ros2_memory.cli.plot.scene import Lane, Signal, Stop, Way
+    from ros2_memory.core.regions import Place
+
+_STYLE: Final = {
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "figure.facecolor": "white",
+    "font.size": 9,
+    "svg.hashsalt": "ros2-memory",
+    "text.parse_math": False,  # or a dollar sign in a name would begin a formula
+}
+_GRID: Final = {"color": "#e5e7eb", "linewidth": 0.8}
+_PALETTE: Final = ("#2563eb", "#d97706", "#059669", "#7c3aed", "#db2777", "#0891b2")
+_DAY_S: Final = 86_400
+_LEAST_SHARE: Final = 0.002
+"""Of the width of a timeline: what is shorter is drawn as long."""
+_LONGEST_NAME: Final = 34
+_LEAST_SIDE: Final = 0.4
+"""Of the longer side of a plane: the shorter one is no less."""
+_DPI: Final = 130
+
+
+class Picture:
+    """A figure that is saved once.
+
+    Args:
+        title: of the whole; `subtitle` has the details.
+        size: width and height in inches.
+    """
+
+    def __init__(self, title: str, subtitle: str, size: tuple[float, float]) -> None:
+        with rc_context(_STYLE):
+            self.figure = Figure(figsize=size, layout="constrained")
+            shown = f"{title}\n{subtitle}" if subtitle else title
+            self.figure.suptitle(shown, x=0.01, ha="left", fontsize=11)
+
+    def save(self, path: Path) -> None:
+        """Writes the picture in the format that the suffix names.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        metadata = {"Date": None} if path.suffix.lower() == ".svg" else None
+        with rc_context(_STYLE), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # on letters that no font here has
+            self.figure.savefig(path, dpi=_DPI, metadata=metadata)
+
+
+def draw_way(picture: Picture, way: Way, places: Sequence[Place], stops: Sequence[Stop]) -> None:
+    """Draws a path on a plane that fills the picture."""
+    with rc_context(_STYLE):
+        draw_plane(picture.figure.add_subplot(), way, places, stops)
+
+
+def draw_plane(
+    axes: Axes, way: Way, places: Sequence[Place] = (), stops: Sequence[Stop] = ()
+) -> None:
+    """Draws a path, coloured by time, with named places and standstills of the same frame."""
+    for place in places:
+        _draw_place(axes, place)
+    points = np.column_stack([way.xs, way.ys])
+    pieces = np.stack([points[:-1], points[1:]], axis=1)
+    driven = ~np.array(way.jumps[1:], dtype=bool)
+    times = np.array(way.times)
+    lines = LineCollection(
+        [*pieces[driven]], array=(times[:-1] / _DAY_S)[driven], cmap="viridis", linewidths=2.0
+    )
+    axes.add_collection(lines)
+    jumped = LineCollection([*pieces[~driven]], colors="#9ca3af", linestyles="dotted")
+    axes.add_collection(jumped)
+    handles = [
+        axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start"),
+        axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end"),
+    ]
+    if stops:
+        sizes = [30 + min(each.length, 3600) / 12 for each in stops]
+        xs, ys = [each.x for each in stops], [each.y for each in stops]
+        handles.append(
+            axes.scatter(
+                xs, ys, s=sizes, color="#f59e0b", alpha=0.55, linewidths=0, zorder=2, label="stood"
+            )
+        )
+    _fit(axes, [*way.xs], [*way.ys])
+    axes.grid(visible=True, **_GRID)
+    axes.set_axisbelow(True)
+    axes.set_xlabel(f"x (m, {way.frame})")
+    axes.set_ylabel("y (m)")
+    axes.legend(handles=handles, loc="best", framealpha=0.85, fontsize=8)
+    if way.times[-1] > way.times[0] and axes.figure is not None:
+        is_wide = np.ptp(axes.get_xlim()) > 1.4 * np.ptp(axes.get_ylim())
+        side = "bottom" if is_wide else "right"
+        bar = axes.figure.colorbar(lines, ax=axes, location=side, shrink=0.8, pad=0.02)
+        _format_times(bar.ax, way.times[0], way.times[-1], of_colors=side)
+
+
+def _fit(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
+    """Shows all points at one scale, with some room, and neither side much shorter."""
+    width, height = max(xs) - min(xs), max(ys) - min(ys)
+    least = max(width, height, 0.5) * _LEAST_SIDE
+    for middle, size, limit in (
+        ((max(xs) + min(xs)) / 2, max(width, least), axes.set_xlim),
+        ((max(ys) + min(ys)) / 2, max(height, least), axes.set_ylim),
+    ):
+        limit(middle - size * 0.58, middle + size * 0.58)
+    axes.set_aspect("equal", adjustable="box")
+
+
+def _draw_place(axes: Axes, place: Place) -> None:
+    region, shade = place.region, {"facecolor": "#f3f4f6", "edgecolor": "#9ca3af"}
+    left, right, low, high = region.bounds
+    if isinstance(region, Circle):
+        axes.add_patch(RoundPatch((region.x, region.y), region.radius_m, **shade))
+    elif isinstance(region, Polygon):
+        axes.add_patch(PolygonPatch([*region.corners], **shade))
+    else:
+        corners = [(left, low), (right, low), (right, high), (left, high)]
+        axes.add_patch(PolygonPatch(corners, **shade))
+    middle = ((left + right) / 2, (low + high) / 2)
+    axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
+
+
+def draw_timeline(picture: Picture, lanes: Sequence[Lane], span: tuple[float, float]) -> None:
+    """Draws lanes on a timeline that fills the picture, the first one on top."""
+    with rc_context(_STYLE):
+        draw_lanes(picture.figure.add_subplot(), lanes, span)
+
+
+def draw_lanes(axes: Axes, lanes: Sequence[Lane], span: tuple[float, float]) -> None:
+    """Draws lanes, the first one on top."""
+    start, end = span
+    least = max((end - start) * _LEAST_SHARE, 1e-6)
+    for row, lane in enumerate(reversed(lanes)):
+        bars = [
+            (first / _DAY_S, max(last - first, least) / _DAY_S) for first, last in lane.stretches
+        ]
+        axes.broken_barh(bars, (row - 0.34, 0.68), facecolors=lane.color, linewidth=0)
+    names = [shortened(lane.name, _LONGEST_NAME) for lane in lanes]
+    axes.set_yticks(range(len(lanes)), [*reversed(names)])
+    axes.set_ylim(-0.6, len(lanes) - 0.4)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=True, axis="x", **_GRID)
+    axes.set_axisbelow(True)
+    _format_times(axes, start, end + least)
+
+
+def draw_signals(picture: Picture, signals: Sequence[Signal], span: tuple[float, float]) -> None:
+    """Draws each signal in a row of its own, over one axis of time."""
+    with rc_context(_STYLE):
+        rows = picture.figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+        for number, (axes, signal) in enumerate(zip(rows, signals, strict=True)):
+            times = np.array(signal.times) / _DAY_S
+            marker = "." if len(times) < 60 else ""
+            color = _PALETTE[number % len(_PALETTE)]
+            axes.plot(times, signal.values, color=color, linewidth=1.1, marker=marker)
+            axes.set_title(signal.name)
+            axes.grid(visible=True, **_GRID)
+            axes.ticklabel_format(axis="y", useOffset=False)
+        _format_times(rows[-1], *span)
+
+
+def draw_recap(
+    picture: Picture,
+    way: tuple[Way, Sequence[Place], Sequence[Stop]] | str,
+    lanes: Sequence[Lane],
+    span: tuple[float, float],
+    lines: Sequence[str],
+) -> None:
+    """Draws a path, or why there is none, beside lines of text, and a timeline below."""
+    with rc_context(_STYLE):
+        height = 0.35 + 0.3 * len(lanes)
+        grid = picture.figure.add_gridspec(
+            2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
+        )
+        plane = picture.figure.add_subplot(grid[0, 0])
+        if isinstance(way, str):
+            plane.set_axis_off()
+            shown = textwrap.fill(way, 50)
+            plane.text(0.5, 0.5, shown, ha="center", va="center", color="#6b7280")
+        else:
+            draw_plane(plane, *way)
+            plane.set_adjustable("datalim")  # it fills its part of the picture
+        beside = picture.figure.add_subplot(grid[0, 1])
+        beside.set_axis_off()
+        wrapped = "\n".join(
+            textwrap.fill(each, 62, subsequent_indent="            ") for each in lines
+        )
+        beside.text(0, 1, wrapped, ha="left", va="top", fontsize=8.5, linespacing=1.5)
+        draw_lanes(picture.figure.add_subplot(grid[1, :]), lanes, span)
+
+
+def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") -> None:
+    """Labels an axis of time in this machine's zone, as it is in the middle.
+
+    `of_colors` is the side on which a bar of colours is.
+    """
+    zone = datetime.fromtimestamp((start + end) / 2, tz=UTC).astimezone().tzinfo
+    axis = axes.yaxis if of_colors == "right" else axes.xaxis
+    locator = AutoDateLocator(tz=zone, maxticks=8)
+    axis.set_major_locator(locator)
+    # The title has the date; beside the colours there is no room for it.
+    axis.set_major_formatter(ConciseDateFormatter(locator, tz=zone, show_offset=not of_colors))
+    if not of_colors and end > start:
+        axes.set_xlim(start / _DAY_S, end / _DAY_S)

@@ -1,0 +1,395 @@
+"""What pictures show: asked as the tools ask it, as plain numbers. Times are Unix seconds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import datetime, time, timedelta
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.cli.options import parse_time, present
+from ros2_memory.cli.output import format_duration
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import listed
+from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
+from ros2_memory.history.context import Call
+from ros2_memory.history.coverage import recording_gaps
+from ros2_memory.history.no_data import require_bags
+from ros2_memory.history.view import TimeRange, View
+from ros2_memory.insights.recap import recap
+from ros2_memory.queries import trajectory_summary
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.regions import Place
+    from ros2_memory.history.context import Memory
+    from ros2_memory.results import Event, Recap
+
+_MOST_WAYPOINTS: Final = 4000
+_MOST_SAMPLES: Final = 20_000
+"""Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
+_MOST_SIGNALS: Final = 6
+MOST_TOPICS: Final = 30
+_PERIODS: Final = 5
+"""A signal has a gap, and its line is broken, after so many of its usual periods, and a second."""
+_COLORS: Final = {
+    "recorded": "#3b82a0",
+    "gap": "#dc2626",
+    "clock step": "#111827",
+    "silence": "#f97316",
+    "error": "#dc2626",
+    "failed goal": "#be123c",
+    "stop": "#f59e0b",
+    "flip": "#0891b2",
+    "drop": "#db2777",
+    "goal": "#059669",
+    "thing": "#7c3aed",
+}
+_LANES: Final = {
+    "gap": "gaps",
+    "clock step": "clock steps",
+    "silence": "silences",
+    "stop": "stood",
+    "goal": "goals",
+    "failed goal": "failed goals",
+    "error": "errors",
+    "drop": "speed drops",
+    "flip": "flips",
+    "thing": "things in view",
+}
+"""The kinds of events in a recap, and the lane of each, the first one on top."""
+_TOPIC: Final = "#94a3b8"
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A driven path in a frame: where (m) and when, and which points the robot jumped to."""
+
+    frame: str
+    times: tuple[float, ...]
+    xs: tuple[float, ...]
+    ys: tuple[float, ...]
+    jumps: tuple[bool, ...]
+
+    def at(self, time: float) -> tuple[float, float]:
+        """Returns where the robot was, between two points on the line between them."""
+        return (
+            float(np.interp(time, self.times, self.xs)),
+            float(np.interp(time, self.times, self.ys)),
+        )
+
+
+class Lane(NamedTuple):
+    """A row of a timeline: stretches from one time to another; equal ones are a moment."""
+
+    name: str
+    stretches: Sequence[tuple[float, float]]
+    color: str
+
+
+class Signal(NamedTuple):
+    """The values of a field, NaN where it has none."""
+
+    name: str
+    times: Sequence[float]
+    values: Sequence[float]
+
+
+class Stop(NamedTuple):
+    """A place where the robot stood, and for how long (s)."""
+
+    x: float
+    y: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What all pictures are asked for: a memory, a window in it, and its bounds in Unix seconds."""
+
+    memory: Memory
+    view: View
+    window: TimeWindow
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The bounds (inclusive) of the window."""
+        return unix_from_ns(self.window.start), unix_from_ns(self.window.stop - 1)
+
+    @property
+    def range(self) -> TimeRange:
+        """The window as queries take it; they want some length."""
+        start, end = self.span
+        return TimeRange(start, max(end, start + 0.001))
+
+    @property
+    def title(self) -> str:
+        """The bounds of the window, for people: `2026-11-21 08:00:00 - 18:30:00 CET`."""
+        start, end = (datetime.fromtimestamp(each).astimezone() for each in self.span)
+        until = f"{end:%H:%M:%S}" if end.date() == start.date() else f"{end:%Y-%m-%d %H:%M:%S}"
+        return f"{start:%Y-%m-%d %H:%M:%S} - {until} {end:%Z}"
+
+
+def opened(memory: Memory, window: TimeWindow) -> Scene:
+    """Returns what is asked for, as far as the memory spans it.
+
+    Raises:
+        NoDataError: the memory holds nothing, or nothing of that time.
+    """
+    view = View(memory, Call())
+    require_bags(view)
+    earliest, latest = view.snapshot.dating.earliest, view.snapshot.dating.latest
+    if earliest is None or latest is None:
+        earliest, latest = view.snapshot.bags[0].start, view.snapshot.bags[-1].end
+    within = window.intersect(TimeWindow(earliest, latest + 1))
+    if within.empty:
+        raise NoDataError(
+            NoDataReason.OUTSIDE_RANGE,
+            "nothing was recorded in this time: ros2-memory info says what there is",
+        )
+    return Scene(memory, view, within)
+
+
+def day_of(memory: Memory, day: str | None) -> TimeWindow:
+    """Returns a day of this machine's calendar, from midnight to midnight."""
+    newest = memory.index.snapshot().dating.latest
+    now = present(memory) if day is not None or newest is None else newest
+    at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
+    date = datetime.fromtimestamp(at).astimezone().date()
+    begin, end = (
+        datetime.combine(each, time.min).timestamp() for each in (date, date + timedelta(days=1))
+    )
+    return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
+
+
+def recap_in(asked: Scene) -> Recap | None:
+    """Returns what happened; None where the window has no length."""
+    try:
+        return recap(asked.memory, Call(), asked.range)
+    except InvalidArgumentsError:
+        return None
+
+
+def way_in(asked: Scene, topic: str | None, frame: str | None) -> tuple[Way, str, Sequence[str]]:
+    """Returns the path, a line on it, and notes; in the map where transforms lead there.
+
+    Raises:
+        InvalidArgumentsError: the topic has no poses, or nothing places them in the frame.
+        NoDataError: there is none in this time.
+    """
+    map_frame = asked.memory.limits.map_frame
+    for each in (frame,) if frame is not None else (map_frame, None):
+        try:
+            found = trajectory_summary(
+                asked.memory,
+                Call(),
+                asked.range,
+                topic=topic,
+                frame_id=each,
+                max_waypoints=_MOST_WAYPOINTS,
+            )
+            break
+        except InvalidArgumentsError:
+            if each is None or each == frame:
+                raise
+    points = found.trajectory.waypoints
+    if not points:
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {found.topic} has a place")
+    totals = found.trajectory.totals
+    way = Way(
+        found.frame_id,
+        tuple(unix_from_ns(each.time) for each in points),
+        tuple(each.position[0] for each in points),
+        tuple(each.position[1] for each in points),
+        tuple(each.jump for each in points),
+    )
+    line = (
+        f"{totals.distance_m:.1f} m in {format_duration(unix_from_ns(found.end - found.start))}, "
+        f"at most {found.trajectory.max_speed:.2f} m/s; by {found.topic}"
+    )
+    return way, line, found.notes
+
+
+def places_in(memory: Memory, frame: str) -> list[Place]:
+    """Returns the named places of a frame."""
+    return [each for each in memory.limits.places if each.frame_id == frame]
+
+
+def stops_on(told: Recap | None, way: Way) -> list[Stop]:
+    """Returns where the robot stood, by the path at that time."""
+    stops: list[Stop] = []
+    for each in () if told is None else told.events:
+        if each.kind == "stop" and each.end is not None:
+            x, y = way.at(unix_from_ns((each.start + each.end) // 2))
+            stops.append(Stop(x, y, unix_from_ns(each.end - each.start)))
+    return stops
+
+
+def signals_of(
+    asked: Scene, topic: str, fields: Sequence[str]
+) -> tuple[int, list[Signal], list[str]]:
+    """Returns how many messages there are, numeric fields of them, and notes.
+
+    Raises:
+        InvalidArgumentsError: there is no such field, or it holds no number.
+        NoDataError: there is no message in this time, or none can be decoded.
+    """
+    view, extractor = asked.view, asked.memory.extractor
+    total, messages = view.pick(topic, asked.window, _MOST_SAMPLES)
+    decoded = [(each, view.bags.decode(each)) for each in messages]
+    readable = [(each, message) for each, message in decoded if message is not None]
+    if not readable:
+        what = "can be decoded" if messages else "lies in this time"
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} {what}")
+    first, message = readable[0]
+    type_name = first.record.channel.type
+    extractor.shown(message, type_name, fields)  # refuses fields that there are not
+    notes = [*view.notes.sentences()]
+    if not fields:
+        varying = _varying([extractor.exact(each, type_name) for _, each in readable])
+        fields = varying[:_MOST_SIGNALS]
+        if len(varying) > len(fields):
+            notes.append(f"not drawn: {listed(varying[_MOST_SIGNALS:])}; name them with --field")
+    if total > len(messages):
+        notes.append(f"{len(messages)} of {total} messages are drawn, evenly spaced")
+    signals: list[Signal] = []
+    for name in fields:
+        points = [
+            (each.time, _number(extractor.exact_at(message, each.record.channel.type, name)))
+            for each, message in readable
+        ]
+        if all(math.isnan(value) for _, value in points):
+            raise InvalidArgumentsError(f"{name} of {topic} holds no number")
+        broken = [*_with_breaks(points)]
+        times, values = zip(*broken, strict=True)
+        signals.append(Signal(name, [unix_from_ns(each) for each in times], values))
+    if not signals:
+        raise InvalidArgumentsError(f"{topic} ({type_name}) has no numeric field")
+    return total, signals, notes
+
+
+def _varying(values: Sequence[JsonValue]) -> list[str]:
+    """Returns the numeric fields that change; all of the first value where none does."""
+    first = dict(_numbers(values[0]))
+    changing = {
+        name
+        for value in values
+        for name, number in _numbers(value)
+        if name in first and number != first[name] and not math.isnan(number)
+    }
+    known = [name for name, number in first.items() if not math.isnan(number)]
+    return [name for name in first if name in changing] or known
+
+
+def _numbers(value: JsonValue, name: str = "") -> Iterator[tuple[str, float]]:
+    """Yields the numeric fields of a value, with dot-paths."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _numbers(each, f"{name}.{key}" if name else key)
+    elif isinstance(value, bool | int | float):
+        yield name, float(value)
+
+
+def _number(value: JsonValue) -> float:
+    return float(value) if isinstance(value, bool | int | float) else math.nan
+
+
+def _with_breaks(points: Sequence[tuple[Ns, float]]) -> Iterator[tuple[Ns, float]]:
+    """Yields points, and NaN where there was none for much longer than usual."""
+    steps = sorted(after - before for (before, _), (after, _) in pairwise(points))
+    usual = steps[len(steps) // 2] if steps else 0
+    longest = max(_PERIODS * usual, ns_from_unix(1.0))
+    before: Ns | None = None
+    for at, value in points:
+        if before is not None and at - before > longest:
+            yield before + 1, math.nan
+        yield at, value
+        before = at
+
+
+def event_lanes(asked: Scene, told: Recap | None) -> list[Lane]:
+    """Returns a lane of what was recorded, and one for each kind of events that there are."""
+    start, end = asked.span
+    gaps = [
+        (unix_from_ns(first), unix_from_ns(last))
+        for first, last in recording_gaps(asked.view, asked.window)
+    ]
+    lanes = [Lane("recorded", [*_between(start, end, gaps)], _COLORS["recorded"])]
+    events: dict[str, list[Event]] = {}
+    for each in () if told is None else told.events:
+        events.setdefault(each.kind, []).append(each)
+    for kind, name in _LANES.items():
+        if kind in events:
+            stretches = [
+                (unix_from_ns(each.start), unix_from_ns(_until(each))) for each in events[kind]
+            ]
+            lanes.append(Lane(name, stretches, _COLORS[kind]))
+    return lanes
+
+
+def _until(event: Event) -> Ns:
+    """Returns when an event was over; what a flip led to is not a part of it."""
+    return event.start if event.end is None or event.kind == "flip" else event.end
+
+
+def _between(
+    start: float, end: float, gaps: Iterable[tuple[float, float]]
+) -> Iterator[tuple[float, float]]:
+    """Yields what is left of a time without gaps in it, which come in order."""
+    for first, last in gaps:
+        if first > start:
+            yield start, min(first, end)
+        start = max(start, last)
+    if start < end:
+        yield start, end
+
+
+def topic_lanes(asked: Scene) -> Iterator[Lane]:
+    """Yields when each topic was recorded, of the topics with the most messages, by name."""
+    timeline = asked.view.snapshot.timeline
+    messages = {
+        topic: sum(each.messages for each in timeline.totals(topic).values())
+        for topic in timeline.topics()
+    }
+    busiest = sorted(messages, key=lambda topic: -messages[topic])[:MOST_TOPICS]
+    joined = ns_from_unix(2 * asked.memory.limits.split_duration_s)
+    for topic in sorted(busiest):
+        stretches: list[tuple[Ns, Ns]] = []
+        for _, first, last in timeline.extents(topic, asked.window):
+            if stretches and first - stretches[-1][1] <= joined:
+                stretches[-1] = (stretches[-1][0], max(last, stretches[-1][1]))
+            else:
+                stretches.append((first, last))
+        spans = [(unix_from_ns(first), unix_from_ns(last)) for first, last in stretches]
+        yield Lane(topic, spans, _TOPIC)
+
+
+def figures_of(told: Recap | None) -> str:
+    """Returns distance, speed and time of standing in a line, as far as they are known."""
+    parts: list[str] = []
+    if told is not None and told.distance_m is not None and told.max_speed is not None:
+        parts = [f"{told.distance_m:.1f} m driven", f"at most {told.max_speed:.2f} m/s"]
+    if told is not None and told.stood is not None:
+        parts.append(f"stood {format_duration(unix_from_ns(told.stood))}")
+    if told is not None:
+        parts += [f"{count} {name}" for name, count in told.counts]
+    return ", ".join(parts)
+
+
+def told_lines(told: Recap | None) -> Iterator[str]:
+    """Yields each event in a line, with the time of day, and how long it took."""
+    if told is None or not told.events:
+        yield "nothing happened that a recap tells of"
+        return
+    for each in told.events:
+        at = datetime.fromtimestamp(unix_from_ns(each.start)).astimezone()
+        length = unix_from_ns(_until(each) - each.start)
+        took = f" ({format_duration(length)})" if length >= 1 else ""
+        where = f", in {each.place}" if each.place else ""
+        yield f"{at:%H:%M:%S}  {each.text}{where}{took}"

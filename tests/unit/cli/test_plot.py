@@ -1,0 +1,164 @@
+"""`ros2-memory plot`: pictures of bags, and what is said where there can be none."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from ros2_memory import cli
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import battery, boolean, odom, text, write_mcap
+from tests.support.memories import memory_of
+
+pytest.importorskip("matplotlib", reason="needs the extra plot")
+
+from ros2_memory.cli.plot import scene
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+S = NS_PER_S
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot that drives 10 m, stands for 20 s and drives on; two bags, half a minute apart."""
+    folder = tmp_path_factory.mktemp("bags")
+    first = [odom(T0 + n * S // 5, min(n / 5, 10.0), 0.0) for n in range(150)]
+    first += [battery(T0 + n * S, 80.0 - n) for n in range(30)]
+    first += [
+        boolean(T0 + 5 * S, data=False),
+        boolean(T0 + 12 * S, data=True),
+        text(T0, "a $word$"),
+    ]
+    write_mcap(folder / "rec" / "rec_0.mcap", sorted(first, key=lambda each: each.log_time))
+    begin = T0 + 60 * S
+    second = [odom(begin + n * S // 5, 10.0, n / 5) for n in range(50)]
+    write_mcap(folder / "rec" / "rec_1.mcap", second)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MEMORY_DEPLOYMENT", raising=False)
+    monkeypatch.delenv("MEMORY_BAG_DIR", raising=False)
+
+
+def scene_of(bags: Path) -> scene.Scene:
+    return scene.opened(memory_of(bags), TimeWindow.everything())
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["path"], ["signal", "/battery_state"], ["timeline"], ["recap"]],
+    ids=lambda words: words[0],
+)
+def test_each_is_a_picture_of_the_asked_kind(
+    bags: Path, tmp_path: Path, capsys: Capture, words: list[str]
+) -> None:
+    kind, *topic = words
+    drawn = tmp_path / f"{kind}.svg"
+    assert cli.main(["plot", kind, *topic, str(bags), "--out", str(drawn), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["path"] == str(drawn)
+    assert ET.parse(drawn).getroot().tag.endswith("svg")  # noqa: S314 - written just now
+
+
+def test_a_png_begins_as_one_and_no_home_is_written_to(
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    drawn = tmp_path / "path.png"
+    assert cli.main(["plot", "path", str(bags), "-o", str(drawn), "--last", "5"]) == 0
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    assert [*home.iterdir()] == []
+
+
+def test_the_path_is_that_of_the_poses(bags: Path) -> None:
+    way, line, _ = scene.way_in(scene_of(bags), None, None)
+    assert (way.frame, way.xs[0], way.ys[0]) == ("odom", 0.0, 0.0)
+    assert (way.xs[-1], way.ys[-1]) == (10.0, 9.8)
+    assert way.at(1_700_000_005.0) == pytest.approx((5.0, 0.0), abs=0.06)
+    assert line.startswith("19.8 m in 69.8 s")
+
+
+def test_standstills_are_on_the_path(bags: Path) -> None:
+    asked = scene_of(bags)
+    way, _, _ = scene.way_in(asked, None, None)
+    (stop, *_) = scene.stops_on(scene.recap_in(asked), way)
+    assert (stop.x, stop.y) == pytest.approx((10.0, 0.0), abs=0.1)
+    assert stop.length > 15
+
+
+def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
+    total, (charge,), _ = scene.signals_of(scene_of(bags), "/battery_state", ["percentage"])
+    assert (total, charge.values[0], charge.values[-1]) == (30, 80.0, 51.0)
+    _, (x, y), notes = scene.signals_of(scene_of(bags), "/odom", [])
+    assert (x.name, y.name) == ("position.x", "position.y")  # nothing else changes
+    assert sum(math.isnan(value) for value in x.values) == 1
+    assert notes == []
+
+
+def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
+    asked = scene_of(bags)
+    lanes = {lane.name: lane.stretches for lane in scene.event_lanes(asked, scene.recap_in(asked))}
+    start = 1_700_000_000.0
+    assert lanes["recorded"] == [(start, start + 29.8), (start + 60, start + 69.8)]
+    assert lanes["gaps"] == [(start + 29.8, start + 60)]
+    assert "stood" in lanes
+    topics = {lane.name: lane.stretches for lane in scene.topic_lanes(asked)}
+    assert topics["/battery_state"] == [(start, start + 29)]
+    assert len(topics["/odom"]) == 2
+
+
+def test_a_day_is_one_of_this_machines_calendar(bags: Path) -> None:
+    memory = memory_of(bags)
+    window = scene.day_of(memory, None)
+    assert window.start <= T0 < window.stop
+    assert 23 * 3600 * S <= window.stop - window.start <= 25 * 3600 * S
+    assert scene.day_of(memory, "2023-11-15T12:00").start == window.stop
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["path", "--out", "path.jpeg"], "must end in .svg, .png, .pdf"),
+        (["path", "--out", "path.svg", "--topic", "/chatter"], "/chatter"),
+        (["signal", "/chatter", "--out", "a.svg", "--field", "data"], "holds no number"),
+        (["signal", "/odom", "--out", "a.svg", "--field", "pose.no"], "has no field"),
+        (["timeline", "--out", "a.svg", "--end", "2001-01-01"], "nothing was recorded in this"),
+        (["recap", "--out", "a.svg", "--day", "today", "--last", "5"], "not both"),
+    ],
+)
+def test_where_there_can_be_no_picture_it_says_why(
+    bags: Path, tmp_path: Path, capsys: Capture, words: list[str], reason: str
+) -> None:
+    words = [str(tmp_path / each) if re.search(r"\.(svg|jpeg)$", each) else each for each in words]
+    assert cli.main(["plot", *words, f"recording.bag_dir={bags}"]) == 2
+    assert reason in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_without_the_extra_it_names_the_command_that_installs_it(
+    bags: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.cli.plot.commands.find_spec", lambda name: None)
+    assert cli.main(["plot", "path", str(bags), "--out", str(tmp_path / "a.svg")]) == 2
+    assert "pip install 'ros2-memory[plot]'" in capsys.readouterr().err
+
+
+def test_a_recap_without_poses_has_the_rest(tmp_path: Path) -> None:
+    words = [text(T0 + n * S, f"word {n}") for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", words)
+    drawn = tmp_path / "recap.svg"
+    assert cli.main(["plot", "recap", str(tmp_path / "rec"), "--out", str(drawn)]) == 0
+    assert drawn.stat().st_size > 1000
