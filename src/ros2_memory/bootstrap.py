@@ -22,6 +22,7 @@ from hydra.utils import instantiate
 from ros2_memory import PACKAGE, package_version
 from ros2_memory.config import (
     NullRecorderNode,
+    load_exclusions,
     load_labels,
     load_message_schemas,
     load_places,
@@ -38,9 +39,10 @@ from ros2_memory.storage.base import BagReader
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
-    from ros2_memory.config import AdapterNode, PlaceShape, Settings
+    from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.telemetry import Observer
@@ -51,10 +53,15 @@ if TYPE_CHECKING:
     from ros2_memory.serving.backfill import Backfill, Progress
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.triggers.exclusion import ExclusionRule
     from ros2_memory.triggers.rules import Rule
+    from ros2_memory.triggers.screening import Screening
     from ros2_memory.triggers.watch import Triggers
 
 _Port = TypeVar("_Port")
+
+_MOST_SPLITS = 5000
+"""The splits of one recording that `bag_dir.screened_file` takes."""
 
 
 def build_reader(settings: Settings, *, cache_mb: int | None = None) -> BagReader:
@@ -137,6 +144,7 @@ def build_housekeeper(
             moments_bytes=moments_bytes,
             rule_bytes={each.name: each.max_bytes for each in rules},
             watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
+            screening=_screening_of(settings, bag_dir, reader),
             static_topics=settings.data.tf_static_topics,
             grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
         )
@@ -174,7 +182,6 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
     Raises:
         ConfigError: their file is missing, a rule is refused, or they may take too much together.
     """
-    from ros2_memory.analysis.conditions import parse_condition
     from ros2_memory.bag_dir.moment_file import fault_of_label
     from ros2_memory.triggers.rules import Rule, RuleKind
 
@@ -186,17 +193,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
             raise ConfigError(f"{path}: the rule {name!r}: its label {fault}")
         condition = None
         if given.condition_type is not None:
-            value: JsonValue = dict(given.value) if isinstance(given.value, dict) else given.value
-            try:
-                condition = parse_condition(
-                    given.condition_type,
-                    value,
-                    settings.data.position_tolerance_m,
-                    given.field,
-                    settings.data.min_score if given.min_score is None else given.min_score,
-                )
-            except InvalidArgumentsError as error:
-                raise ConfigError(f"{path}: the rule {name!r}: {error}") from error
+            condition = _condition_of(settings, given, f"{path}: the rule {name!r}")
         rules.append(
             Rule(
                 name=name,
@@ -219,6 +216,81 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
             "retention.max_total_gb): lower one, or raise the other"
         )
     return tuple(rules)
+
+
+def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Screening | None:
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.mcap.writer import McapWriter
+    from ros2_memory.triggers.screening import Screening
+
+    rules = exclusions_of(settings)
+    if not rules:
+        return None
+    return Screening(
+        bag_dir,
+        rules,
+        reader,
+        SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length),
+        McapWriter(settings.reader.max_chunk_mb),
+        split_duration_s=settings.recording.split_duration_s,
+    )
+
+
+def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
+    """Returns the rules of `recording.exclude_when`.
+
+    Raises:
+        ConfigError: their file is missing, a rule is refused, its topic is not recorded, or
+            recordings have too many splits for it.
+    """
+    from ros2_memory.recorder.process.topics import load_topics
+    from ros2_memory.triggers.exclusion import ExclusionRule
+
+    recording = settings.recording
+    path, given = recording.exclude_when, load_exclusions(settings)
+    if given and recording.session_duration_s > _MOST_SPLITS * recording.split_duration_s:
+        raise ConfigError(
+            f"{path}: a recording may have {_MOST_SPLITS} splits at most where a rule excludes "
+            "something: lower recording.session_duration_s"
+        )
+    rules: list[ExclusionRule] = []
+    for name, each in given.items():
+        if not load_topics(recording.topics_file).matches(each.topic):
+            raise ConfigError(
+                f"{path}: the rule {name!r}: {each.topic} is not recorded, so nothing would be "
+                f"known of it: list it in {recording.topics_file}"
+            )
+        condition = _condition_of(settings, each, f"{path}: the rule {name!r}")
+        rules.append(
+            ExclusionRule(
+                name=name,
+                topic=each.topic,
+                condition=condition,
+                margin=ns_from_unix(each.margin_s),
+                stale=ns_from_unix(each.stale_s),
+                excludes_unknown=each.on_unknown == "exclude",
+            )
+        )
+    return tuple(rules)
+
+
+def _condition_of(settings: Settings, given: KeepRule | ExcludeRule, where: str) -> Condition:
+    """Returns the condition of a rule that has one.
+
+    Raises:
+        ConfigError: it is refused.
+    """
+    from ros2_memory.analysis.conditions import parse_condition
+
+    value: JsonValue = dict(given.value) if isinstance(given.value, dict) else given.value
+    data = settings.data
+    min_score = data.min_score if given.min_score is None else given.min_score
+    try:
+        return parse_condition(
+            given.condition_type or "", value, data.position_tolerance_m, given.field, min_score
+        )
+    except InvalidArgumentsError as error:
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def build_repairer() -> Repairer:

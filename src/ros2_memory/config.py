@@ -89,6 +89,12 @@ def _message_type(name: str) -> str:
     return name
 
 
+def _one_topic(name: str) -> str:
+    if any(mark in name for mark in "*?["):
+        raise ValueError("must name one topic; make a rule for each")
+    return name
+
+
 def _dot_path(path: str) -> str:
     if not re.fullmatch(r"\w+(\.\w+)*", path):
         raise ValueError("must be a dot-path such as pose.pose.position")
@@ -137,7 +143,8 @@ class RecordingSettings:
     """What is recorded, and where to.
 
     `split_duration_s` is an integer because `ros2 bag record` takes whole seconds. `keep_when` is
-    the file of rules that keep what was recorded around an event.
+    the file of rules that keep what was recorded around an event, `exclude_when` that of rules by
+    which nothing recorded stays.
     """
 
     bag_dir: AnyPath
@@ -148,6 +155,7 @@ class RecordingSettings:
     clear_on_startup: Flag
     topics_file: ConfigFile
     keep_when: ConfigFile
+    exclude_when: ConfigFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -404,6 +412,32 @@ class TriggersFile:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class ExcludeRule:
+    """When nothing recorded stays, nor what was within `margin_s` of it.
+
+    `topic`, `condition_type`, `value`, `field` and `min_score` as in `find_matches`, of one topic.
+    A message of it holds until the next one, for `stale_s` at most where the topic is not latched.
+    `on_unknown`: what becomes of a time in which it is not known whether the condition holds.
+    """
+
+    topic: Annotated[Text, AfterValidator(_one_topic)]
+    condition_type: Text
+    value: bool | int | float | str | dict[str, float]
+    field: Text | None = None
+    min_score: Tolerance | None = None
+    margin_s: Span = 1.0
+    stale_s: Annotated[float, Field(strict=True, gt=0, le=3600)] = 10.0
+    on_unknown: Literal["exclude", "keep"] = "exclude"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class ExclusionsFile:
+    """The rules, by name."""
+
+    rules: dict[Text, ExcludeRule]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class Settings:
     """The whole configuration, validated."""
 
@@ -530,6 +564,16 @@ def load_rules(settings: Settings) -> Mapping[str, KeepRule]:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
     return _load_file(TriggersFile, "recording.keep_when", settings.recording.keep_when).rules
+
+
+def load_exclusions(settings: Settings) -> Mapping[str, ExcludeRule]:
+    """Returns the rules of `recording.exclude_when`, by name.
+
+    Raises:
+        ConfigError: the file is missing, is not YAML, or its content is refused.
+    """
+    path = settings.recording.exclude_when
+    return _load_file(ExclusionsFile, "recording.exclude_when", path).rules
 
 
 def _load_file(model: type[_T], key: str, path: Path) -> _T:

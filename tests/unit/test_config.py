@@ -34,6 +34,7 @@ class TestDefaults:
                 "clear_on_startup": False,
                 "topics_file": ROOT / "config/topics.yaml",
                 "keep_when": ROOT / "config/triggers.yaml",
+                "exclude_when": ROOT / "config/exclusions.yaml",
             },
             "data": {
                 "recording": None,

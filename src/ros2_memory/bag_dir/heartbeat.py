@@ -71,6 +71,8 @@ class Heartbeat:
         lost: how many messages of each topic are known to be missing of the last hour; topics
             without a counter, or a regular header stamp, are not in it.
         cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.
+        held_back: which splits are not served since `recording.exclude_when` could not be applied,
+            and why, as a sentence; else None.
         waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
     """
 
@@ -91,6 +93,7 @@ class Heartbeat:
     lost: dict[str, Count] = field(default_factory=dict)
     cut_short: tuple[str, ...] = ()
     waiting_for: str | None = None
+    held_back: str | None = None
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.

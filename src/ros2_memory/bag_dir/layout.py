@@ -21,6 +21,7 @@
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
       .episodic/triggers.json      what rules found so far (see `trigger_file`)
       .episodic/erasing.json       messages that are being taken out of bags (see `erasure_file`)
+      .episodic/screened.json      what `recording.exclude_when` holds back (see `screened_file`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
@@ -58,6 +59,7 @@ LOST_FILE: Final = f"{OWN_FOLDER}/lost.jsonl"
 LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
 ERASING_FILE: Final = f"{OWN_FOLDER}/erasing.json"
 TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
+SCREENED_FILE: Final = f"{OWN_FOLDER}/screened.json"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""

@@ -13,6 +13,7 @@ The first few of each kind are named, and the others counted:
 - bags that a crash left open, up to the last time that their files were written to;
 - closed bags of which parts could not be read, or that contradict themselves;
 - messages that the recorder found to be missing (`bag_dir.lost_file`);
+- stretches that `recording.exclude_when` excluded;
 - bags that a wrong clock dated, except where the answer is that there is nothing.
 """
 
@@ -23,12 +24,14 @@ from typing import TYPE_CHECKING
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.bag_dir.lost_file import read_losses
+from ros2_memory.bag_dir.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
     DOUBTS,
     MESSAGES_MISSING,
     READ_WITHOUT_INDEXES,
 )
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -37,6 +40,7 @@ from ros2_memory.core.timebase import (
     unix_rounded_up,
 )
 from ros2_memory.history.context import short_name
+from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:
@@ -67,7 +71,8 @@ def note_unread(
         # No remark says that a crash left a bag open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
-    for sentence in describe_lost(view.memory.index.bag_dir, window):
+    bag_dir = view.memory.index.bag_dir
+    for sentence in (*describe_lost(bag_dir, window), *describe_excluded(bag_dir, window)):
         view.notes.add(sentence)
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
@@ -91,6 +96,17 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             most = sorted(topics, key=lambda topic: (-topics[topic], topic))
             named = listed([f"{topic} ({topics[topic]})" for topic in most])
             yield f"{counted(sum(topics.values()), 'message')} {what}: {named}"
+
+
+def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence on the stretches of a window of which nothing was to be recorded."""
+    found = united(
+        (each.start, each.stop) for each in excluded_between(bag_dir, window.start, window.stop)
+    )
+    if found:
+        spans = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in found[-MAX_NAMED:]]
+        excluded = "excluded by privacy (recording.exclude_when), so nothing of it is recorded"
+        yield f"{excluded}: {listed(spans, len(found))}"
 
 
 def note_edges(view: View, window: TimeWindow) -> None:
@@ -123,7 +139,8 @@ def not_covered(view: View, window: TimeWindow) -> tuple[str, ...]:
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     whole = all(map(_is_whole, view.snapshot.timeline.faulty(window)))
-    if view.notes.complete and whole and not lost:
+    excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
+    if view.notes.complete and whole and not lost and not excluded:
         return ()
     note_unread(view, window, nothing=True)
     return view.notes.sentences()
@@ -161,7 +178,11 @@ def unread_spans(
         ]
         files = counted(len(lost), "bag file")
         yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
-    if active := being_written(snapshot, window):
+    active = being_written(snapshot, window)
+    held = [short_name(each.path) for each in active if each.reason == HELD_BACK]
+    if held:
+        yield f"{HELD_BACK}: {listed(held)}"
+    if len(held) < len(active):
         yield _describe_active(snapshot, active, window)
     faults = [
         fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
@@ -213,7 +234,9 @@ def _describe_active(snapshot: Snapshot, active: Sequence[SetAside], window: Tim
     latest = snapshot.latest
     if latest is not None and window.stop - 1 - AT_OR_BEFORE_SLACK_NS > latest:
         return _nothing_after(snapshot.active, latest)
-    excluded = [short_name(each.path) for each in active if not each.answers]
+    excluded = [
+        short_name(each.path) for each in active if not each.answers and each.reason != HELD_BACK
+    ]
     if excluded:
         return f"still being written and not included: {listed(excluded)}"
     names = [short_name(each.path) for each in active]

@@ -8,10 +8,10 @@ is a duplicate, however alike two messages are.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.core.spans import lies_inside, united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -85,22 +85,6 @@ def overlap_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
     return united(spans)
 
 
-def united(spans: Iterable[tuple[Ns, Ns]]) -> list[tuple[Ns, Ns]]:
-    """Returns half-open spans, sorted; those that touch are merged."""
-    united: list[tuple[Ns, Ns]] = []
-    for start, stop in sorted(spans):
-        if united and start <= united[-1][1]:
-            united[-1] = (united[-1][0], max(united[-1][1], stop))
-        else:
-            united.append((start, stop))
-    return united
-
-
-def _inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
-    index = bisect_right(spans, (moment, MAX_NS)) - 1
-    return index >= 0 and moment < spans[index][1]
-
-
 def deduplicate_forward(
     found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
 ) -> Iterator[StoredMessage]:
@@ -111,7 +95,7 @@ def deduplicate_forward(
     recent: deque[tuple[Ns, Copy]] = deque()
     counts: dict[Copy, dict[Path, int]] = {}
     for each in found:
-        if not _inside(spans, each.time):
+        if not lies_inside(spans, each.time):
             yield each
             continue
         while recent and recent[0][0] < each.time - COPY_HORIZON_NS:
@@ -140,7 +124,7 @@ def deduplicate_backward(
     for each in found:
         while held and (held[0][1] is None or held[0][1].is_over(each.time)):
             yield from _released(*held.popleft(), rows)
-        if not _inside(spans, each.time):
+        if not lies_inside(spans, each.time):
             held.append((each, None))
             continue
         key = copy_key(each.record)

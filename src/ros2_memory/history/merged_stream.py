@@ -15,6 +15,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S
 from ros2_memory.history.duplicates import (
     COPY_HORIZON_NS,
@@ -26,7 +27,6 @@ from ros2_memory.history.duplicates import (
     deduplicate_backward,
     deduplicate_forward,
     overlap_spans,
-    united,
 )
 
 if TYPE_CHECKING:

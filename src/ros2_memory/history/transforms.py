@@ -24,6 +24,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import alike
 from ros2_memory.core.model import StampedTransform, TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -34,7 +35,6 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import united
 from ros2_memory.history.no_data import (
     between,
     beyond,

@@ -141,7 +141,9 @@ class BagTable:
                 silent.update(each.silent)
         return Snapshot(
             timeline=timeline,
-            active=_by_path(aside.get(FileState.ACTIVE, ())),
+            active=_by_path(
+                [*aside.get(FileState.ACTIVE, ()), *aside.get(FileState.HELD_BACK, ())]
+            ),
             damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *scanned.damaged]),
             unread=_by_path([*aside.get(FileState.UNREAD, ()), *scanned.links]),
             empty=empty,

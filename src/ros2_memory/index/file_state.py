@@ -22,6 +22,9 @@ grew within the last three splits is active unless the `metadata.yaml` beside it
 writes last, lists it, or a live heartbeat names other recordings only. A `.zstd` is written after
 the bag in it was closed; it is open until its last frame is complete.
 
+What the recorder holds back until it was screened (`bag_dir.screened_file`) counts as active,
+whatever it is, and never answers.
+
 Where a scan includes active files an active `.mcap` is a bag as well as set aside: its complete
 chunks answer, since bytes of such a file never change once they are there. Those of a `.db3` do: it
 is read as a file that nobody writes, and read meanwhile its pages would contradict each other.
@@ -36,6 +39,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
+from ros2_memory.bag_dir.screened_file import read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -43,6 +47,7 @@ from ros2_memory.index.scan import YOUNG_NS, settled
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
+    from ros2_memory.bag_dir.screened_file import Gate
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader
@@ -53,6 +58,7 @@ RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
 """The same where it certainly was the machine's: a failed disk, or too many open files."""
 
 _ACTIVE = "still being written"
+HELD_BACK: Final = "not served until it was searched for what recording.exclude_when excludes"
 _ANSWERS = "still being written: its complete chunks answer"
 _NO_MESSAGE = (
     "it ends before its first message: its recorder was killed before any reached the disk"
@@ -68,6 +74,10 @@ class FileState(IntEnum):
     INCOMPLETE = 3
     EMPTY = 4
     CLOSED = 5
+    HELD_BACK = 6
+
+
+_WATCHED: Final = frozenset({FileState.ACTIVE, FileState.DAMAGED, FileState.HELD_BACK})
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +114,16 @@ class ScanContext:
     include_active: bool = False
     trusts_mtime: bool = True
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
+    _gate: list[Gate] = field(default_factory=list)
+
+    def holds_back(self, path: Path) -> bool:
+        """Returns whether the recorder has not released a file yet.
+
+        That is looked up after the directory was listed: what was found there is known by then.
+        """
+        if not self._gate:
+            self._gate.append(read_gate(self.root))
+        return self._gate[0].holds(path.parent.name, path.name)
 
     def may_be_recorded(self, path: Path) -> bool:
         """Returns whether no live heartbeat shows that this file's recording is over."""
@@ -194,7 +214,7 @@ class FileNotes:
             return False
         return (
             not self.trusted
-            or classification.state in {FileState.ACTIVE, FileState.DAMAGED}
+            or classification.state in _WATCHED
             or self.closing is Closing.OPEN
             or (self.kind == ".db3" and context.now - self.stamp.mtime_ns <= context.three_splits)
         )
@@ -217,6 +237,8 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
     """
     if not reader.reads(notes.path):
         return _set_aside(FileState.UNREAD, notes, _not_read(notes))
+    if context.holds_back(notes.path):
+        return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
         if notes.closing is None and notes.fault is None:
             # An open MCAP is 0 bytes until its first chunk is full.

@@ -42,8 +42,8 @@ class Snapshot:
 
     Attributes:
         timeline: the bags that answer queries, in time order, and what they hold.
-        active: files that are still being written, with the reason, by path; those that answer as
-            far as they are complete are among `bags` too.
+        active: files that are still being written, or held back, with the reason, by path; those
+            that answer as far as they are complete are among `bags` too.
         damaged: files and directories that cannot be read at all, likewise.
         unread: files of a kind that another adapter reads, and symbolic links, likewise.
         empty: number of closed bags without a message.

@@ -8,7 +8,7 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.coverage import describe_lost
+from ros2_memory.history.coverage import describe_excluded, describe_lost
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
@@ -75,7 +75,12 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *lacking_in(view),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
-        notes=(*view.notes.sentences(), *filter(None, [held]), *describe_mixed(memory, call)),
+        notes=(
+            *view.notes.sentences(),
+            *filter(None, [held]),
+            *describe_mixed(memory, call),
+            *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
+        ),
     )
 
 
@@ -100,6 +105,8 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}"
     elif heartbeat.state is RecorderState.WAITING:
         yield f"the recorder waits: {heartbeat.waiting_for or 'it does not say for what'}"
+    if heartbeat.held_back is not None and heartbeat.is_live(wall):
+        yield heartbeat.held_back
 
 
 def lacking_in(view: View) -> Iterator[str]:

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
 
 class Recorder(ABC):
@@ -121,6 +121,34 @@ class Housekeeper:
 
     def note_restart(self) -> None:
         """Takes up that a recording ended unasked, and another one begins."""
+
+    def announce(self, recording: str) -> None:
+        """Takes up that a recording is about to be begun; nothing of it exists yet.
+
+        Raises:
+            RecorderError: it must not begin, since what is to be excluded of it could be served.
+        """
+
+    def screen(self, live: Collection[str]) -> None:
+        """Cuts out of closed splits what is to be excluded, and releases them.
+
+        Called about every two seconds, from the thread that begins recordings; `live` are those
+        that are being written.
+        """
+        for step in self.screening(live):
+            step()
+
+    def screening(self, live: Collection[str]) -> Sequence[Callable[[], None]]:
+        """Returns what `screen` does, to be done at any time, also when `live` has changed."""
+        del live
+        return ()
+
+    def finish(self) -> None:
+        """Releases what can be, now that nothing is recorded any more. May take some seconds."""
+
+    def held_back(self) -> str | None:
+        """Describes the splits that are not served for a fault, or None."""
+        return None
 
     def age_held(self) -> str | None:
         """Describes the bags that are kept although their dates make them too old, or None."""

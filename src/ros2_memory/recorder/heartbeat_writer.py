@@ -28,6 +28,7 @@ class HeartbeatWriter:
         clock: the wall clock.
         events: where a heartbeat that cannot be written is reported.
         age_held: describes bags that are kept though their dates make them too old, or None.
+        held_back: describes splits that are not served for a fault, or None.
         expected: gives the topics that are to be recorded by name.
         reception: knows what was lost.
     """
@@ -42,7 +43,9 @@ class HeartbeatWriter:
         age_held: Callable[[], str | None],
         expected: Callable[[], Sequence[str]],
         reception: Reception,
+        held_back: Callable[[], str | None] = lambda: None,
     ) -> None:
+        self._held_back = held_back
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
@@ -98,6 +101,7 @@ class HeartbeatWriter:
             lost=self._reception.lost_in_last_hour(now),
             waiting_for=sessions.waiting_for if state is RecorderState.WAITING else None,
             cut_short=tuple(sorted(self._reception.cut_short)),
+            held_back=self._held_back(),
         )
 
     def _missing(self, sessions: RecordingSessions) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
+from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
@@ -37,7 +38,7 @@ from ros2_memory.retention.repair import Repairer, open_files
 from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
     from ros2_memory.storage.base import BagReader, BagWriter
+    from ros2_memory.triggers.screening import Screening
     from ros2_memory.triggers.watch import Triggers
 
 REFRESH_S: Final = 60.0
@@ -52,6 +54,7 @@ MOST_REPAIRED_BYTES: Final = 1 << 30
 """A larger file would delay recording by minutes; `ros2-memory recover` repairs it."""
 
 _MCAP: Final = ".mcap"
+_LAST_STEPS: Final = 2
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
@@ -71,6 +74,7 @@ class Housekeeping(Housekeeper):
         moments_bytes: how much of the budget saved moments may take.
         rule_bytes: how much of that each rule may take.
         watch: makes the rules' watch over what is recorded; None where there are no rules.
+        screening: excludes messages before splits are served; None where nothing is excluded.
         static_topics: topics that are latched whatever their publishers declare.
         grace_s: for how long a query may work on an older snapshot of the bags.
         measure_free: measures what the disk has left, in bytes.
@@ -91,6 +95,7 @@ class Housekeeping(Housekeeper):
         moments_bytes: int = 0,
         rule_bytes: Mapping[str, int] = MappingProxyType({}),
         watch: Callable[[MomentKeeper], Triggers] | None = None,
+        screening: Screening | None = None,
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
@@ -123,6 +128,7 @@ class Housekeeping(Housekeeper):
         )
         self._moments = MomentKeeper(bag_dir, moments_bytes, clock, rule_bytes)
         self._triggers = None if watch is None else watch(self._moments)
+        self._screening = screening
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
         self._clock = clock
@@ -204,6 +210,28 @@ class Housekeeping(Housekeeper):
         if self._triggers is not None:
             now = self._clock.now()
             self._triggers.note_restart(now, now)
+
+    def announce(self, recording: str) -> None:
+        """Holds a recording back until it is screened, where something is to be excluded.
+
+        Raises:
+            RecorderError: that cannot be written down.
+        """
+        if self._screening is not None:
+            self._screening.announce(recording)
+
+    def screening(self, live: Collection[str]) -> Sequence[Callable[[], None]]:
+        """Returns what screens closed splits; nothing where nothing is to be excluded."""
+        return () if self._screening is None else (self._screening.plan(live),)
+
+    def finish(self) -> None:
+        """Screens what is left, some splits of each recording."""
+        for _ in range(_LAST_STEPS):
+            self.screen(())
+
+    def held_back(self) -> str | None:
+        """Describes the splits that are not served for a fault, or None."""
+        return None if self._screening is None else self._screening.problem()
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
@@ -299,6 +327,7 @@ class Housekeeping(Housekeeper):
         """Repairs files that the index found unfinished and nothing writes; returns how many."""
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
+        paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
         candidates = [path for path in paths if path.suffix == _MCAP and self._may_repair(path)]
         if not candidates:
             return 0
@@ -422,6 +451,33 @@ class BackgroundHousekeeper(Housekeeper):
     def note_restart(self) -> None:
         """Takes up that a recording ended unasked, and another one begins."""
         self._housekeeper.note_restart()
+
+    def announce(self, recording: str) -> None:
+        """Takes up at once that a recording is about to be begun."""
+        self._housekeeper.announce(recording)
+
+    def screen(self, live: Collection[str]) -> None:
+        """Begins to screen closed splits, unless that is still under way."""
+        if self._is_under_way("screen"):
+            return
+        # What is live is known now, and not when the thread begins.
+        try:
+            steps = self._housekeeper.screening(live)
+        except (EpisodicError, OSError) as error:
+            self._faults["screen"] = str(error)
+            return
+        for step in steps:
+            self._begin("screen", step)
+
+    def finish(self) -> None:
+        """Screens what is left, after what is under way."""
+        if "screen" in self._threads:
+            self._threads["screen"].join()
+        self._run("screen", self._housekeeper.finish)
+
+    def held_back(self) -> str | None:
+        """Describes the splits that are not served for a fault, or None."""
+        return self._housekeeper.held_back()
 
     def age_held(self) -> str | None:
         """Describes the bags that are kept though their dates make them too old, or None."""

@@ -41,6 +41,8 @@ OBSERVE_S: Final = 0.5
 SPACE_S: Final = 1.0
 MOMENTS_S: Final = 1.0
 """How often requests to save a moment are looked for: their callers wait for the reply."""
+SCREENING_S: Final = 2.0
+"""How often closed splits are looked for that are to be screened."""
 FAULT_S: Final = 60.0
 """How often a failing task, which every tick tries again, is reported."""
 SETTLE_S: Final = 5.0
@@ -104,6 +106,7 @@ class Supervisor:
             clock,
             self._events,
             age_held=housekeeper.age_held,
+            held_back=housekeeper.held_back,
             expected=expected,
             reception=self._reception,
         )
@@ -182,6 +185,8 @@ class Supervisor:
         self._sessions.stop(self._now())
         self._reception.flush()
         self._paused = False
+        if not self._disk.away:
+            self._housekeeper.finish()
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
@@ -199,6 +204,7 @@ class Supervisor:
             "recorded": self._note_recorded,
             "house": self._apply_retention,
             "moments": self._keep_moments,
+            "screen": self._screen,
         }
         for name, task in tasks.items():
             try:
@@ -386,8 +392,17 @@ class Supervisor:
         if not self._disk.away and self._is_due("moments", MOMENTS_S, now):
             self._housekeeper.keep_moments()
 
+    def _screen(self, now: ClockReading) -> None:
+        if not self._disk.away and self._is_due("screening", SCREENING_S, now):
+            self._housekeeper.screen([each.name for each in self._sessions.running])
+
     def _announce(self, name: str) -> None:
-        """Names a recording in the heartbeat before anything of it exists."""
+        """Names a recording before anything of it exists.
+
+        Raises:
+            RecorderError: it must not begin.
+        """
+        self._housekeeper.announce(name)
         if not self._disk.away:
             self._heartbeat.write(self._state, self._sessions, announced=name)
 

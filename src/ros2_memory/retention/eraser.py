@@ -37,7 +37,7 @@ from ros2_memory.bag_dir.layout import (
     is_kept_apart,
 )
 from ros2_memory.bag_dir.lost_file import Loss, append_losses, read_losses
-from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
+from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
@@ -45,6 +45,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.delete import repair_name
 from ros2_memory.retention.repair import open_files
+from ros2_memory.retention.rewriting import Identity, left_in, replace_file, rewritten
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, BagWriter
 
 NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
-Identity = tuple[int, int]
 Ids = dict[str, set[str]]
 
 
@@ -299,16 +299,8 @@ class Eraser:
     def _left_by_recording(self, survey: Survey) -> dict[Path, dict[str, Counter[str]]]:
         """Returns what is left of each file of the recordings that change, by topic."""
         gone = {path: each.counts for each in survey.holders for path in each.paths}
-        left: dict[Path, dict[str, Counter[str]]] = {}
-        for recording in {each.paths[0].parent for each in survey.holders}:
-            files = left[recording] = {}
-            for path in filter(lambda each: bag_kind(each.name), recording.iterdir()):
-                with suppress(BagError):
-                    counts = Counter[str]()
-                    for topic in self._reader.summarize(path).topics:
-                        counts[topic.topic] += topic.count
-                    files[bare_name(path.name)] = counts - gone.get(path, Counter())
-        return left
+        recordings = {each.paths[0].parent for each in survey.holders}
+        return {each: left_in(each, self._reader, gone) for each in recordings}
 
     def _with_files(self, erasure: Erasure, survey: Survey) -> Erasure:
         counts = Counter[tuple[str, int, int]]()
@@ -341,26 +333,17 @@ class Eraser:
             before = os.fstat(old.fileno())
             if (before.st_dev, before.st_ino) != holder.inode:
                 raise BagError(str(path), "it is another file now; forget again")
-            with directories.opened(self._bag_dir, path.parent) as folder:
-                here = Path(f"/proc/self/fd/{folder}", path.name)
-                beside = here.with_name(repair_name(path.name))
-                beside.unlink(missing_ok=True)
-                try:
-                    taken = self._writer.cut(
-                        here, beside, erasure.takes, lambda text: recounted(text, left_of)
-                    )
-                    if taken != holder.counts:
-                        raise BagError(str(path), "it does not hold what it held just now")
-                    beside.chmod(stat.S_IMODE(before.st_mode))
-                    with suppress(OSError):
-                        os.chown(beside, before.st_uid, before.st_gid)
-                    # A nanosecond later: nobody may take the new file for the old one.
-                    os.utime(beside, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-                    for other in holder.paths[1:]:
-                        self._link(beside, other, holder.inode)
-                    _replace(beside, here, holder.inode)
-                finally:
-                    beside.unlink(missing_ok=True)
+            with rewritten(
+                self._bag_dir,
+                path,
+                before,
+                self._writer,
+                takes=erasure.takes,
+                expected=holder.counts,
+                left_of=left_of,
+            ) as new:
+                for other in holder.paths[1:]:
+                    self._link(new, other, holder.inode)
             if os.fstat(old.fileno()).st_nlink:
                 # A recorder may have kept the old file in a moment meanwhile.
                 for late in filter(self._may_change, self._files().get(holder.inode, ())):
@@ -381,7 +364,7 @@ class Eraser:
             beside.unlink(missing_ok=True)
             os.link(new, beside, follow_symlinks=False)
             try:
-                _replace(beside, here, inode)
+                replace_file(beside, here, inode)
             finally:
                 beside.unlink(missing_ok=True)
 
@@ -457,19 +440,6 @@ def _may_take(erasure: Erasure, summary: BagSummary, topic: str) -> bool:
         for each in summary.of(topic)
         for start, stop in erasure.windows
     )
-
-
-def _replace(new: Path, path: Path, inode: Identity) -> None:
-    """Gives a file the name of another, which must still be the one that was read.
-
-    Raises:
-        OSError: it is not, or has gone.
-    """
-    status = path.lstat()
-    if (status.st_dev, status.st_ino) != inode:
-        raise OSError(f"{path.name} is not the file that was read")
-    new.replace(path)
-    flush(path.parent)
 
 
 def _without(listed: MessageList, file: str, ids: Ids) -> MessageList:

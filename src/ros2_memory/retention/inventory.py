@@ -66,6 +66,8 @@ _BY_STATE: Final = {
     FileState.INCOMPLETE: Deletable.IF_UNNAMED,
     FileState.DAMAGED: Deletable.DAMAGED,
     FileState.UNREAD: Deletable.UNREAD,
+    # Else a disk too full for its cuts would stay full.
+    FileState.HELD_BACK: Deletable.IF_UNNAMED,
 }
 
 

@@ -6,6 +6,9 @@ they are closed: a message is the same by topic, publish time and payload, and c
 the recording that holds it most often. The sidecars then list the messages for which the cut is not
 the answer; mostly there are none.
 
+What `recording.exclude_when` holds back counts as still being written: what is excluded of it must
+not be listed.
+
 The cut alone decides where messages have no publish time of their own (it is 0, or the log time),
 and not at all on latched channels, whose repeats are recognised in queries.
 """
@@ -26,6 +29,7 @@ from ros2_memory.bag_dir.handover_file import (
     message_id,
     write_handovers,
 )
+from ros2_memory.bag_dir.screened_file import OPEN_GATE, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -98,6 +102,8 @@ def compare_recordings(
     if after.compared is not False or after.previous != old.name:
         return True
     ends_first = new if after.state is Counting.VOID else old
+    gate = read_gate(old.parent)
+    running = {*running, *(each.name for each in (old, new) if gate.holds_some(each.name))}
     if after.state is Counting.PENDING or ends_first.name in running:
         return False
     try:
@@ -267,14 +273,19 @@ def bags_of(
 ) -> list[tuple[str, BagSummary]]:
     """Returns name and summary of each bag file that can be read and is not empty.
 
+    With `only_closed`, of those that are closed and not held back.
+
     Raises:
         OSError: the recording cannot be listed.
         BagUnreachableError: the disk fails.
     """
     found: list[tuple[str, BagSummary]] = []
+    gate = read_gate(recording.parent) if only_closed else OPEN_GATE
     for path in bag_files(recording, reader):
         try:
-            if only_closed and reader.closing(path) is not Closing.CLOSED:
+            if only_closed and (
+                gate.holds(recording.name, path.name) or reader.closing(path) is not Closing.CLOSED
+            ):
                 continue
             summary = reader.summarize(path)
         except BagUnreachableError:

@@ -1,0 +1,97 @@
+"""Writes a bag anew without some of its messages, in place of the old file, and durably."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections import Counter
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ros2_memory.bag_dir.durable_write import flush
+from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.metadata_yaml import bare_name, recounted
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError
+from ros2_memory.retention.delete import repair_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import BagReader, BagWriter
+
+Identity = tuple[int, int]
+
+
+@contextmanager
+def rewritten(
+    bag_dir: Path,
+    path: Path,
+    before: os.stat_result,
+    writer: BagWriter,
+    *,
+    takes: Callable[[str, Ns, Ns], bool],
+    expected: Counter[str],
+    left_of: Mapping[str, Counter[str]],
+) -> Iterator[Path]:
+    """Yields the new file, beside the old one; it takes the name of the old one after the block.
+
+    Args:
+        bag_dir: the bag directory, behind no link in which the file must lie.
+        path: the old file.
+        before: its status; the file must still be the same at the end.
+        writer: writes it anew.
+        takes: whether a message goes, by topic, log time and publish time.
+        expected: how many messages go, by topic.
+        left_of: what every file of the recording holds afterwards, see `recounted`.
+
+    Raises:
+        EpisodicError: it cannot be written anew, and nothing is changed.
+        OSError: likewise, or it is another file now.
+    """
+    with directories.opened(bag_dir, path.parent) as folder:
+        here = Path(f"/proc/self/fd/{folder}", path.name)
+        beside = here.with_name(repair_name(path.name))
+        beside.unlink(missing_ok=True)
+        try:
+            taken = writer.cut(here, beside, takes, lambda text: recounted(text, left_of))
+            if taken != expected:
+                raise BagError(str(path), "it does not hold what it held just now")
+            beside.chmod(stat.S_IMODE(before.st_mode))
+            with suppress(OSError):
+                os.chown(beside, before.st_uid, before.st_gid)
+            # A nanosecond later: nobody may take the new file for the old one.
+            os.utime(beside, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+            yield beside
+            replace_file(beside, here, (before.st_dev, before.st_ino))
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+def replace_file(new: Path, path: Path, inode: Identity) -> None:
+    """Gives a file the name of another, which must still be the one that was read.
+
+    Raises:
+        OSError: it is not, or has gone.
+    """
+    status = path.lstat()
+    if (status.st_dev, status.st_ino) != inode:
+        raise OSError(f"{path.name} is not the file that was read")
+    new.replace(path)
+    flush(path.parent)
+
+
+def left_in(
+    recording: Path, reader: BagReader, gone: Mapping[Path, Counter[str]]
+) -> dict[str, Counter[str]]:
+    """Returns how many messages of each topic are left in each file that can be read, by name."""
+    files: dict[str, Counter[str]] = {}
+    for path in filter(lambda each: bag_kind(each.name), recording.iterdir()):
+        with suppress(BagError):
+            counts = Counter[str]()
+            for topic in reader.summarize(path).topics:
+                counts[topic.topic] += topic.count
+            files[bare_name(path.name)] = counts - gone.get(path, Counter())
+    return files

@@ -1,0 +1,244 @@
+"""When nothing recorded may stay: from what a topic showed, recording by recording. Pure.
+
+What a message says holds from its log time on: on a latched topic until the next one, on any other
+for `stale` after the last one. It holds no longer than its recording, which hears the topic anew,
+but for this: where the condition holds at the end, it goes on in the recordings that follow until
+one of them hears the topic, for `stale` at most; and where another recording has taken over by
+then, what was known holds for `stale` more, until that one must have heard it.
+
+Everything else is unknown, and so is what lies in a span in which the clock was set back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+from ros2_memory.bag_dir.screened_file import Excluded, Heard
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
+from ros2_memory.core.spans import lies_inside, united, without
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Sequence
+
+    from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.core.spans import Spans
+    from ros2_memory.core.timebase import Ns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExclusionRule:
+    """When nothing recorded may stay.
+
+    Attributes:
+        name: unique among the rules.
+        topic: whose messages show it.
+        condition: what they must meet.
+        margin: for how long before and after nothing stays either.
+        stale: for how long a message holds where its topic is not latched.
+        excludes_unknown: nothing stays either while it is not known whether the condition holds.
+    """
+
+    name: str
+    topic: str
+    condition: Condition
+    margin: Ns
+    stale: Ns
+    excludes_unknown: bool = True
+
+
+class HeardRecording(NamedTuple):
+    """What one recording heard of a topic, in the order in which it was written.
+
+    `end` is None while it is being written.
+    """
+
+    start: Ns
+    end: Ns | None
+    heard: Sequence[Heard]
+    unclear: Sequence[tuple[Ns, Ns]] = ()
+
+    @property
+    def stop(self) -> Ns:
+        """The end, excluded."""
+        return MAX_NS if self.end is None else self.end + 1
+
+
+def hear(heard: list[Heard], time: Ns, holds: bool | None, *, latched: bool, stale: Ns) -> None:
+    """Takes the next message; `holds` is None where it cannot be read.
+
+    A message that lies before the last one was logged out of order, and changes nothing unless the
+    condition holds.
+    """
+    last = heard[-1] if heard else None
+    if last is not None and time < last.last:
+        if holds is False:
+            return
+        if holds is None:
+            time = last.last
+        elif last.holds and last.lasts == latched:
+            last.first = min(last.first, time)
+            return
+    if (
+        last is not None
+        and (last.holds, last.lasts) == (holds, latched)
+        and (latched or time - last.last <= stale)
+    ):
+        last.last = time
+    else:
+        heard.append(Heard(time, time, holds, latched))
+
+
+def excluded_stretches(rule: ExclusionRule, recordings: Sequence[HeardRecording]) -> list[Excluded]:
+    """Returns of which stretches nothing stays, with the margin, in order of time.
+
+    Those in which the condition held, and those in which it was not known, are apart, and may
+    overlap. Recordings come in the order in which they began; one that begins before the one before
+    it follows a clock that was set back, and is told nothing by it but that the condition held.
+    """
+    held: Spans = []
+    free: list[Spans] = []
+    for at, each in enumerate(recordings):
+        known: Spans = []
+        for run, following in pairwise([*each.heard, None]):
+            if run is None:  # `pairwise` ends before it
+                continue
+            stop = _valid_until(run, following, each, rule.stale)
+            if following is None and stop >= each.stop < MAX_NS:
+                stop = each.stop
+                if run.holds:
+                    held += _carried(each, recordings[at + 1 :], rule.stale)
+                elif _is_taken_over(each, recordings[at + 1 :]):
+                    stop = (each.stop if run.lasts else run.last) + rule.stale
+            if run.holds is True:
+                held.append((run.first, stop))
+            elif run.holds is False:
+                known.append((run.first, stop))
+        free.append(known)
+    unknown = [span for each in recordings for span in each.unclear]
+    if rule.excludes_unknown:
+        unknown += _unknown(recordings, held, free)
+    return [
+        *(Excluded(*span, held=True) for span in _widened(held, rule.margin)),
+        *(Excluded(*span, held=False) for span in _widened(unknown, rule.margin)),
+    ]
+
+
+def _unknown(
+    recordings: Sequence[HeardRecording], held: Spans, free: Sequence[Spans]
+) -> Iterator[tuple[Ns, Ns]]:
+    """Yields where recordings did not know, by themselves or by others, whether it holds."""
+    for at, each in enumerate(recordings):
+        # Not across a clock that was set back.
+        before = (
+            spans
+            for spans, one in zip(free[:at], recordings, strict=False)
+            if one.start <= each.start
+        )
+        after = (
+            spans
+            for spans, one in zip(free[at:], recordings[at:], strict=True)
+            if one.start >= each.start
+        )
+        known = chain(held, *before, *after)
+        yield from without([(each.start, each.stop)], united(known))
+
+
+def _valid_until(run: Heard, following: Heard | None, recording: HeardRecording, stale: Ns) -> Ns:
+    """Returns until when a recording itself knows what it heard."""
+    stop = recording.stop
+    if following is not None and following.first >= run.last:
+        stop = following.first
+    elif following is not None and not run.holds:
+        # The clock was set back: nothing is sure but that the condition may hold.
+        return run.last + 1
+    return stop if run.lasts else min(stop, run.last + stale)
+
+
+def _is_taken_over(ended: HeardRecording, others: Iterable[HeardRecording]) -> bool:
+    """Returns whether another recording ran when one ended."""
+    return any(ended.start <= each.start < ended.stop < each.stop for each in others)
+
+
+def _carried(ended: HeardRecording, others: Iterable[HeardRecording], stale: Ns) -> Spans:
+    """Returns where a condition that held at the end of a recording goes on after it."""
+    spans: Spans = []
+    until: Ns | None = None
+    for each in others:
+        if each.start < ended.start:  # the clock was set back
+            until = each.start + stale
+        elif until is None:
+            until = max(each.start, ended.stop) + stale
+        heard = each.heard[0].first if each.heard else MAX_NS
+        spans.append((each.start, min(until, heard)))
+        if each.heard:
+            break
+    return spans
+
+
+class Cut:
+    """Which messages of one bag go.
+
+    A message goes by when it was received. One on a latched topic, which each recording receives
+    again, goes by when it was published: in a stretch in which the condition held, or in one in
+    which that was not known as long as it was received in a stretch, too.
+
+    Args:
+        stretches: those of the bag's own time.
+        before: those that were excluded before, in which latched messages may have been published.
+        latched: the latched topics.
+    """
+
+    def __init__(
+        self, stretches: Sequence[Excluded], before: Sequence[Excluded], latched: Collection[str]
+    ) -> None:
+        self._latched = frozenset(latched)
+        self._all = united((each.start, each.stop) for each in stretches)
+        known = (*before, *stretches)
+        self._known = united((each.start, each.stop) for each in known)
+        self._held = united((each.start, each.stop) for each in known if each.held)
+
+    def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
+        """Returns whether a message goes."""
+        if topic not in self._latched:
+            return lies_inside(self._all, log_time)
+        published = publish_time if 0 < publish_time < log_time else log_time
+        return lies_inside(self._held, published) or (
+            lies_inside(self._known, published) and lies_inside(self._all, log_time)
+        )
+
+    def touches(self, topic: str, first: Ns, last: Ns) -> bool:
+        """Returns whether messages of a topic between two log times may go."""
+        if topic in self._latched:
+            return bool(self._known)
+        return any(start <= last and first < stop for start, stop in self._all)
+
+
+def add_excluded(
+    known: Sequence[Excluded], stretches: Iterable[Excluded], start: Ns, end: Ns
+) -> list[Excluded]:
+    """Returns what is known with the parts of stretches that touch a file from `start` to `end`.
+
+    What lies between two files, less than messages are out of order, counts with both.
+    """
+    low, high = start - OUT_OF_ORDER_NS, end + OUT_OF_ORDER_NS + 1
+    parts = [
+        Excluded(max(each.start, low), min(each.stop, high), each.held)
+        for each in stretches
+        if each.start <= end and start < each.stop
+    ]
+    joined: list[Excluded] = []
+    for held in (True, False):
+        spans = [(each.start, each.stop) for each in (*known, *parts) if each.held is held]
+        joined += (Excluded(*span, held=held) for span in united(spans))
+    return sorted(joined, key=lambda each: (each.start, each.stop))
+
+
+def _widened(spans: Iterable[tuple[Ns, Ns]], margin: Ns) -> Spans:
+    return united(
+        (max(start - margin, MIN_NS), min(stop + margin, MAX_NS))
+        for start, stop in spans
+        if start < stop
+    )

@@ -1,0 +1,448 @@
+"""Screens closed splits before they are served: cuts out what `recording.exclude_when` excludes.
+
+Each split is read once for what the rules' topics show in it. It is released once nothing that
+comes can reach into it any more, with its margin: mostly when the next split was read. Before that
+what falls into an excluded stretch is cut out of it.
+
+What was learned is written before the first cut, since a cut takes the messages that showed it. A
+kill in between does no harm: what is not released yet is cut again, to the same result.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from copy import deepcopy
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import structlog
+
+from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
+from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE, bag_kind, named_start
+from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.bag_dir.screened_file import (
+    FileStep,
+    Heard,
+    RecordingScreen,
+    ScreenState,
+    read_screen_state,
+    write_screen_state,
+)
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
+from ros2_memory.core.errors import (
+    BagError,
+    BagUnreachableError,
+    EpisodicError,
+    RecorderError,
+    UndecodableError,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
+from ros2_memory.index.split_order import split_of
+from ros2_memory.retention.rewriting import left_in, rewritten
+from ros2_memory.storage.base import Closing
+from ros2_memory.triggers.exclusion import (
+    Cut,
+    HeardRecording,
+    add_excluded,
+    excluded_stretches,
+    hear,
+)
+from ros2_memory.triggers.splits import LEAST_NEAR_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Sequence
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.screened_file import Excluded
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import BagReader, BagWriter
+    from ros2_memory.triggers.exclusion import ExclusionRule
+
+MOST_AT_ONCE: Final = 16
+"""So many splits are released in one step, which is then written down."""
+DONE_KEPT: Final = 2
+"""Recordings that are done and still tell those after them something."""
+MOST_EXCLUDED: Final = 1000
+"""Stretches that are remembered, the newest ones."""
+RETRY_S: Final = 30.0
+"""How long until a split that could not be cut is tried again."""
+_SPLITS_NEAR: Final = 3
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+class _Ready(NamedTuple):
+    """A split that can be released: where it is, and what it holds."""
+
+    recording: str
+    path: Path
+    summary: BagSummary
+
+
+class Screening:
+    """Screens the recordings of one bag directory.
+
+    `announce` and `plan` are for the thread that begins recordings, the step that `plan` returns
+    for any one other.
+
+    Args:
+        bag_dir: the bag directory.
+        rules: what is excluded, by unique names; with none nothing is announced.
+        reader: reads files as they are, also what does not count in answers.
+        extractor: gives the values that conditions are tested on.
+        writer: writes splits anew.
+        split_duration_s: how long one split is.
+        monotonic: a clock that never steps, in seconds.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        rules: Sequence[ExclusionRule],
+        reader: BagReader,
+        extractor: SchemaExtractor,
+        writer: BagWriter,
+        *,
+        split_duration_s: float,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._monotonic = monotonic
+        self._retry_s: dict[Path, float] = {}
+        self._bag_dir = bag_dir
+        self._rules = tuple(rules)
+        self._reader = reader
+        self._extractor = extractor
+        self._writer = writer
+        self._near = max(LEAST_NEAR_NS, _SPLITS_NEAR * ns_from_unix(split_duration_s))
+        self._margin = max((each.margin for each in rules), default=0)
+        self._lock = threading.Lock()
+        self._state: ScreenState | None = None
+        self._problems: dict[str, str] = {}
+        self._refusals: dict[str, str] = {}
+
+    def announce(self, recording: str) -> None:
+        """Holds back a recording of which nothing exists yet.
+
+        Raises:
+            RecorderError: that cannot be written down, and the recording must not begin.
+        """
+        try:
+            with self._lock:
+                state = self._loaded()
+                self._write({**state.recordings, recording: RecordingScreen()}, state.excluded)
+        except OSError as error:
+            target = self._bag_dir / SCREENED_FILE
+            raise RecorderError(f"{target}: {error.strerror or error}") from error
+
+    def plan(self, live: Collection[str]) -> Callable[[], None]:
+        """Returns the next step, which may take some seconds; `live` are being written now.
+
+        Raises:
+            EpisodicError: what is known cannot be read.
+            OSError: likewise.
+        """
+        with self._lock:
+            names = [name for name, each in self._loaded().recordings.items() if not each.done]
+        written = frozenset(live)
+        return lambda: self._step(names, written)
+
+    def problem(self) -> str | None:
+        """Describes the splits that are held back for a fault, or a rule in vain, or None."""
+        known = [*self._problems.items()]
+        if not known:
+            refused = "; ".join([*self._refusals.values()])
+            return f"recording.exclude_when knows nothing: {refused}" if refused else None
+        name, reason = known[-1]
+        held = counted(len(known), "split is", "splits are")
+        return (
+            f"{held} not served, since recording.exclude_when could not be applied: "
+            f"{name}: {reason}"
+        )
+
+    def _step(self, names: Sequence[str], live: Collection[str]) -> None:
+        """Reads what was closed, and releases what can be.
+
+        Raises:
+            BagUnreachableError: the disk fails; the next step tries again.
+            OSError: likewise, or the state cannot be written, and nothing more is released.
+        """
+        with self._lock:
+            before = self._loaded()
+            state = deepcopy(before)
+        closed = {name: self._read(name, state.recordings[name], live) for name in names}
+        self._commit(before, state, names)
+        cleared: list[tuple[_Ready, list[Excluded]]] = []
+        now_s = self._monotonic()
+        ready = [
+            each
+            for each in self._ready(state, closed, live)
+            if self._retry_s.get(each.path, now_s) <= now_s
+        ]
+        for each in ready[:MOST_AT_ONCE]:
+            try:
+                cleared.append((each, self._cut(each, state, live)))
+            except (EpisodicError, OSError) as error:
+                self._report(each.path, error)
+                self._retry_s[each.path] = now_s + RETRY_S
+        before = deepcopy(state)
+        for split, stretches in cleared:
+            summary, screen = split.summary, state.recordings[split.recording]
+            screen.files[split.path.name] = FileStep.RELEASED
+            if not summary.empty:
+                state.excluded = add_excluded(
+                    state.excluded, stretches, summary.start, summary.end
+                )[-MOST_EXCLUDED:]
+            self._problems.pop(f"{split.recording}/{split.path.name}", None)
+            self._retry_s.pop(split.path, None)
+        for name in names:
+            if name not in live:
+                self._end(name, state)
+        self._commit(before, state, names)
+
+    def _read(
+        self, name: str, screen: RecordingScreen, live: Collection[str]
+    ) -> list[tuple[Path, BagSummary]]:
+        """Reads the closed files of a recording that were not; returns those not released yet."""
+        paths = self._files(name)
+        present = {each.name for each in paths}
+        screen.files = {file: step for file, step in screen.files.items() if file in present}
+        found: list[tuple[Path, BagSummary]] = []
+        for path in paths:
+            step = screen.files.get(path.name)
+            if step in {FileStep.RELEASED, FileStep.UNREADABLE}:
+                continue
+            try:
+                if step is None and self._reader.closing(path) is not Closing.CLOSED:
+                    if name in live:
+                        break
+                    # A crash left it open; it is read once it was repaired.
+                    continue
+                summary = self._reader.summarize(path)
+                if step is None:
+                    self._hear(path, summary, screen)
+                found.append((path, summary))
+                screen.files[path.name] = FileStep.READ
+            except BagUnreachableError:
+                raise
+            except BagError as error:
+                # What it said of a topic is not known: nor is then what holds after it.
+                for heard in screen.heard.values():
+                    if heard and not heard[-1].holds:
+                        at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)
+                        heard.append(Heard(at, at, None))
+                screen.files[path.name] = FileStep.UNREADABLE
+                self._report(path, error)
+        return found
+
+    def _files(self, name: str) -> list[Path]:
+        """Returns the bags of a recording in the order in which they were written."""
+        try:
+            paths = [each for each in (self._bag_dir / name).iterdir() if bag_kind(each.name)]
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+        return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
+
+    def _hear(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
+        """Takes up what a file shows.
+
+        Raises:
+            BagError: it cannot be read, or not be written anew.
+        """
+        if path.suffix != ".mcap" or not summary.complete:
+            raise BagError(str(path), "it is no whole MCAP file")
+        if summary.empty:
+            return
+        for rule in self._rules:
+            heard = screen.heard.setdefault(rule.name, [])
+            for record in self._reader.records(path, (rule.topic,), TimeWindow.everything()):
+                holds: bool | None = None
+                with suppress(UndecodableError):
+                    value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+                    holds = self._test(rule, value)
+                latched = record.channel.latched
+                hear(heard, record.log_time, holds, latched=latched, stale=rule.stale)
+        # Latched messages may be written again with the times that they had.
+        start = min((each.first for each in summary.topics if not each.latched), default=MAX_NS)
+        is_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
+        if is_back or summary.schema.set_back:
+            screen.unclear.append((summary.start, summary.end + 1))
+        screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)
+        screen.end = summary.end if screen.end is None else max(screen.end, summary.end)
+
+    def _test(self, rule: ExclusionRule, value: JsonValue) -> bool | None:
+        """Returns whether a rule's condition holds; None where it cannot, of such a value."""
+        condition = rule.condition
+        if condition.matches(value):
+            return True
+        refusal = refusal_for(condition, value) if condition.can_be_refused else None
+        if refusal is None and isinstance(condition.test, Equals):
+            is_number = any(isinstance(leaf, bool | int | float) for leaf in leaves(value))
+            if isinstance(condition.test.value, bool) and not is_number:
+                refusal = "the values hold no boolean"
+        if refusal is not None:
+            self._refusals[rule.name] = f"the rule {rule.name}: {rule.topic}: {refusal}"
+            return None
+        return False
+
+    def _ready(
+        self,
+        state: ScreenState,
+        closed: dict[str, list[tuple[Path, BagSummary]]],
+        live: Collection[str],
+    ) -> list[_Ready]:
+        """Returns the splits that nothing which is still to come can reach into."""
+        known: dict[str, Ns] = {}
+        for name in live:
+            screen = state.recordings.get(name)
+            end = None if screen is None else screen.end
+            begun = named_start(name) if end is None else end
+            if begun is not None:
+                known[name] = begun - OUT_OF_ORDER_NS
+        ready: list[_Ready] = []
+        for name, files in closed.items():
+            end = state.recordings[name].end or 0
+            horizon = min(
+                (
+                    each
+                    for other, each in known.items()
+                    if other == name or abs(each - end) <= self._near
+                ),
+                default=MAX_NS,
+            )
+            ready += (
+                _Ready(name, path, summary)
+                for path, summary in files
+                if summary.empty or summary.end + self._margin < horizon
+            )
+        return ready
+
+    def _stretches(self, state: ScreenState, live: Collection[str]) -> list[Excluded]:
+        """Returns what is excluded of the time of recordings that are not done, or were last."""
+        found: list[Excluded] = []
+        for rule in self._rules:
+            recordings = [
+                HeardRecording(
+                    each.start,
+                    None if name in live else each.end,
+                    each.heard.get(rule.name, ()),
+                    each.unclear,
+                )
+                for name, each in state.recordings.items()
+                if each.start is not None
+            ]
+            found += excluded_stretches(rule, recordings)
+        return found
+
+    def _cut(self, ready: _Ready, state: ScreenState, live: Collection[str]) -> list[Excluded]:
+        """Cuts out of a split what is excluded; returns the stretches by which that was decided.
+
+        Raises:
+            EpisodicError: it cannot be written anew.
+            OSError: likewise, or it has gone.
+        """
+        path, summary = ready.path, ready.summary
+        stretches = self._stretches(state, live)
+        latched = {each.topic for each in summary.topics if each.latched}
+        cut = Cut(stretches, state.excluded, latched)
+        topics = {
+            each.topic for each in summary.topics if cut.touches(each.topic, each.first, each.last)
+        }
+        gone = Counter(
+            each.channel.topic
+            for each in self._reader.records(path, sorted(topics), TimeWindow.everything())
+            if cut.takes(each.channel.topic, each.log_time, each.publish_time)
+        )
+        if gone:
+            with path.open("rb") as old:
+                left = left_in(path.parent, self._reader, {path: gone})
+                with rewritten(
+                    self._bag_dir,
+                    path,
+                    os.fstat(old.fileno()),
+                    self._writer,
+                    takes=cut.takes,
+                    expected=gone,
+                    left_of=left,
+                ):
+                    pass
+            _log.info(
+                "messages_excluded",
+                recording=ready.recording,
+                file=path.name,
+                messages=gone.total(),
+            )
+        return stretches
+
+    def _end(self, name: str, state: ScreenState) -> None:
+        """Marks an ended recording as done once nothing of it is held back."""
+        screen, files = state.recordings[name], [each.name for each in self._files(name)]
+        if any(screen.files.get(each) is not FileStep.RELEASED for each in files):
+            return
+        if state.excluded and (self._bag_dir / name / METADATA_FILE).exists():
+            try:
+                correct(self._bag_dir / name, self._reader)
+            except (BagError, OSError, ValueError) as error:
+                _log.warning(
+                    "metadata_not_corrected",
+                    recording=name,
+                    reason=f"metadata.yaml may still count what was excluded: {error}",
+                )
+        screen.done = True
+        screen.files, screen.unclear = {}, []
+
+    def _loaded(self) -> ScreenState:
+        """Returns the state; call it with the lock held.
+
+        Raises:
+            RecorderError: it is damaged.
+            OSError: it cannot be read.
+        """
+        if self._state is None:
+            try:
+                self._state = read_screen_state(self._bag_dir) or ScreenState()
+            except ValueError as error:
+                raise RecorderError(
+                    f"{self._bag_dir / SCREENED_FILE}: {error}; what was not screened yet is not "
+                    "known any more: delete the newest recordings, or let them be served, by "
+                    "deleting this file"
+                ) from error
+        return self._state
+
+    def _commit(self, before: ScreenState, state: ScreenState, names: Sequence[str]) -> None:
+        """Writes what a step changed, if anything, beside what was announced meanwhile.
+
+        Raises:
+            OSError: it cannot be written; the state that is known stays as it was.
+        """
+        if state == before:
+            return
+        with self._lock:
+            recordings = dict(self._loaded().recordings)
+            recordings.update({name: deepcopy(state.recordings[name]) for name in names})
+            done = [name for name, each in recordings.items() if each.done]
+            telling = [name for name in done if recordings[name].start is not None][-DONE_KEPT:]
+            for name in {*done} - {*telling}:
+                del recordings[name]
+            self._write(recordings, list(state.excluded))
+
+    def _write(self, recordings: dict[str, RecordingScreen], excluded: list[Excluded]) -> None:
+        state = ScreenState(recordings, excluded)
+        write_screen_state(self._bag_dir, state)
+        self._state = state
+
+    def _report(self, path: Path, error: Exception) -> None:
+        """Notes why a split is held back, and logs it once."""
+        name = f"{path.parent.name}/{path.name}"
+        reason = error.reason if isinstance(error, BagError) else str(error)
+        if isinstance(error, OSError):
+            reason = error.strerror or str(error)
+        if self._problems.get(name) != reason:
+            _log.error("split_held_back", file=name, reason=reason)
+        self._problems[name] = reason

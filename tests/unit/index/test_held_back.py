@@ -1,0 +1,114 @@
+"""Files that the recorder holds back: no index serves them, whatever they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.layout import SCREENED_FILE
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.coverage import describe_excluded, unread_spans
+from ros2_memory.index.file_state import HELD_BACK
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import McapLayout
+from tests.support.clocks import SettableClock
+from tests.support.screened_bags import T0, S, ScreenedBags, mode, words
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.index.snapshot import Snapshot
+
+OPEN = McapLayout(latched=frozenset({"/privacy_mode"}), finish=False, chunk_size=256)
+
+
+def index_of(bags: ScreenedBags, *, include_active: bool = False) -> IndexManager:
+    return IndexManager(
+        bags.bag_dir,
+        McapReader(),
+        SettableClock(T0 + 3600 * S),
+        refresh_s=0.0,
+        split_duration_s=10.0,
+        include_active=include_active,
+    )
+
+
+def names(snapshot: Snapshot) -> list[str]:
+    return [each.path.name for each in snapshot.bags]
+
+
+@pytest.mark.parametrize("include_active", [False, True])
+def test_a_split_is_found_once_it_is_released(tmp_path: Path, include_active: bool) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    index = index_of(bags, include_active=include_active)
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), *words(0, 10)])
+    growing = bags.split(name, words(10, 20), OPEN)
+    assert names(index.snapshot()) == []
+    assert [(each.path.name, each.reason, each.answers) for each in index.snapshot().active] == [
+        (f"{name}_{n}.mcap", HELD_BACK, False) for n in range(2)
+    ]
+    growing.unlink()
+    bags.split(name, words(20, 30))
+    bags.step()
+    assert names(index.snapshot()) == [f"{name}_0.mcap"]
+    # What a crash left open is not served either: only the recorder repairs it.
+    bags.split(name, words(30, 40), OPEN)
+    bags.end()
+    assert names(index.snapshot()) == [f"{name}_{n}.mcap" for n in (0, 2)]
+
+
+def test_what_is_announced_while_a_directory_is_read_is_held_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    index = index_of(bags, include_active=True)
+    context = index._context
+
+    def slow() -> object:
+        made = context()
+        bags.split(bags.begin(0), words(0, 10))
+        return made
+
+    monkeypatch.setattr(index, "_context", slow)
+    assert names(index.snapshot()) == []
+
+
+def test_a_link_in_a_moment_is_held_back_too(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    name = bags.begin(0)
+    split = bags.split(name, [mode(-2, value=False), *words(0, 10)])
+    link = bags.bag_dir / "moments" / "m" / name / split.name
+    link.parent.mkdir(parents=True)
+    link.hardlink_to(split)
+    assert names(index_of(bags).snapshot()) == []
+
+
+def test_without_a_readable_state_no_recording_is_served(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    bags.split(bags.begin(0), [mode(-2, value=False), *words(0, 10)])
+    bags.end()
+    index = index_of(bags)
+    assert len(names(index.snapshot())) == 1
+    (bags.bag_dir / SCREENED_FILE).write_text("{")
+    assert names(index_of(bags).snapshot()) == []
+
+
+def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
+    bags.split(name, words(10, 20))
+    bags.step()
+    window = TimeWindow(T0, T0 + 30 * S)
+    [excluded] = describe_excluded(bags.bag_dir, window)
+    assert excluded == (
+        "excluded by privacy (recording.exclude_when), so nothing of it is recorded: "
+        f"{T0 // S + 4}.000000 to {T0 // S + 10}.500001"
+    )
+    assert [*describe_excluded(bags.bag_dir, TimeWindow(T0, T0 + 3 * S))] == []
+    assert f"{HELD_BACK}: {name}/{name}_1.mcap" in [
+        *unread_spans(index_of(bags).snapshot(), window)
+    ]

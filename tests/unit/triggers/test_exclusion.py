@@ -1,0 +1,186 @@
+"""When nothing recorded may stay, over what recordings heard alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.bag_dir.screened_file import Excluded, Heard
+from ros2_memory.core.spans import lies_inside, united, without
+from ros2_memory.triggers.exclusion import (
+    Cut,
+    ExclusionRule,
+    HeardRecording,
+    add_excluded,
+    excluded_stretches,
+    hear,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+LAST = 40
+STALE = 3
+
+
+class Past(NamedTuple):
+    """A recording with its messages; `end` is that of its last message."""
+
+    start: int
+    end: int
+    said: tuple[tuple[int, bool | None], ...]
+    live: bool = False
+
+
+def rule(*, margin: int = 0, excludes_unknown: bool = True) -> ExclusionRule:
+    return ExclusionRule(
+        name="privacy",
+        topic="/privacy_mode",
+        condition=parse_condition("equals", True, 0.5),
+        margin=margin,
+        stale=STALE,
+        excludes_unknown=excludes_unknown,
+    )
+
+
+def heard_by(past: Past, *, latched: bool) -> HeardRecording:
+    heard: list[Heard] = []
+    for time, holds in past.said:
+        hear(heard, time, holds, latched=latched, stale=STALE)
+    return HeardRecording(past.start, None if past.live else past.end, heard)
+
+
+def knows(past: Past, time: int, *, latched: bool) -> bool | None:
+    """What a recording itself knows at a time."""
+    said = [each for each in past.said if each[0] <= time]
+    if not said or not (latched or time - said[-1][0] < STALE):
+        return None
+    return said[-1][1]
+
+
+def is_held(pasts: Sequence[Past], time: int, *, latched: bool) -> bool:
+    for at, past in enumerate(pasts):
+        if past.start <= time <= past.end and knows(past, time, latched=latched):
+            return True
+        if past.live or not knows(past, past.end, latched=latched):
+            continue
+        later = pasts[at + 1 :]
+        until = max(later[0].start, past.end + 1) + STALE if later else 0
+        for each in later:
+            if each.start <= time < until and not any(when <= time for when, _ in each.said):
+                return True
+            if each.said:
+                break
+    return False
+
+
+def is_free(pasts: Sequence[Past], time: int, *, latched: bool) -> bool:
+    for at, past in enumerate(pasts):
+        if past.start <= time <= past.end and knows(past, time, latched=latched) is False:
+            return True
+        if past.live or knows(past, past.end, latched=latched) is not False or time <= past.end:
+            continue
+        taken = any(each.start <= past.end < each.end for each in pasts[at + 1 :])
+        since = past.end + 1 if latched else past.said[-1][0]
+        if taken and time < since + STALE:
+            return True
+    return False
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> list[Past]:
+    """Recordings, one after the other or overlapping, the last one perhaps being written."""
+    pasts: list[Past] = []
+    start = draw(st.integers(0, 3))
+    for _ in range(draw(st.integers(1, 3))):
+        end = start + draw(st.integers(1, 12))
+        times = draw(st.lists(st.integers(start, end), max_size=6, unique=True).map(sorted))
+        said = tuple((time, draw(st.sampled_from([True, False, False, None]))) for time in times)
+        pasts.append(Past(start, end, said))
+        start = draw(st.integers(start, end + 6))
+    if draw(st.booleans()):
+        pasts[-1] = pasts[-1]._replace(live=True, end=LAST)
+    return pasts
+
+
+@given(histories(), st.booleans(), st.booleans(), st.integers(0, 2))
+def test_nothing_stays_while_it_holds_or_is_not_known(
+    pasts: list[Past], latched: bool, unknown: bool, margin: int
+) -> None:
+    stretches = excluded_stretches(
+        rule(margin=margin, excludes_unknown=unknown),
+        [heard_by(past, latched=latched) for past in pasts],
+    )
+    wrong = {
+        time
+        for time in range(-margin, LAST + margin + 1)
+        if any(past.start <= time <= past.end for past in pasts)
+        and (
+            is_held(pasts, time, latched=latched)
+            or (unknown and not is_free(pasts, time, latched=latched))
+        )
+    }
+    goes = {time + by for time in wrong for by in range(-margin, margin + 1)}
+    for time in range(LAST + 1):
+        if any(past.start <= time <= past.end for past in pasts):
+            found = any(each.start <= time < each.stop for each in stretches)
+            assert found == (time in goes), time
+
+
+def test_a_value_out_of_order_only_adds() -> None:
+    heard: list[Heard] = []
+    for time, holds in ((1, False), (5, False), (4, True), (6, False), (5, False)):
+        hear(heard, time, holds, latched=True, stale=STALE)
+    recording = HeardRecording(0, 9, heard)
+    assert excluded_stretches(rule(), [recording]) == [Excluded(4, 6, True), Excluded(0, 1, False)]
+
+
+def test_nothing_is_known_across_a_clock_that_was_set_back() -> None:
+    before = Past(20, 30, ((20, False),))
+    after = Past(10, 28, ())
+    found = excluded_stretches(rule(), [heard_by(each, latched=True) for each in (before, after)])
+    assert Excluded(10, 29, False) in found
+    unclear = HeardRecording(0, 9, [Heard(0, 9, False, True)], [(3, 5)])
+    assert excluded_stretches(rule(excludes_unknown=False), [unclear]) == [Excluded(3, 5, False)]
+
+
+def test_latched_messages_go_by_when_they_were_published() -> None:
+    held, unknown, older = Excluded(10, 20), Excluded(30, 40, False), Excluded(1, 3)
+    cut = Cut([held, unknown], [older, Excluded(5, 7, False)], {"/map"})
+    plain = [time for time in range(50) if cut.takes("/odom", time, 0)]
+    assert plain == [*range(10, 20), *range(30, 40)]
+    # Received again, in a stretch and after it, by when it was published.
+    expected = {2: (True, True), 6: (True, False), 8: (False, False), 15: (True, True)}
+    for published, goes in expected.items():
+        assert tuple(cut.takes("/map", at, published) for at in (18, 45)) == goes, published
+    assert [cut.takes("/map", 35, at) for at in (35, 0, 25)] == [True, True, False]
+    assert [cut.takes("/map", 45, at) for at in (35, 0)] == [False, False]
+
+
+SPANS = st.lists(
+    st.tuples(st.integers(0, 30), st.integers(1, 8)).map(lambda each: (each[0], sum(each)))
+)
+
+
+@given(SPANS, SPANS)
+def test_spans_are_sets_of_moments(
+    spans: list[tuple[int, int]], others: list[tuple[int, int]]
+) -> None:
+    def moments(of: Sequence[tuple[int, int]]) -> set[int]:
+        return {at for start, stop in of for at in range(start, stop)}
+
+    one, other = united(spans), united(others)
+    assert moments(one) == moments(spans) == {at for at in range(50) if lies_inside(one, at)}
+    assert moments(without(one, other)) == moments(spans) - moments(others)
+
+
+def test_what_was_excluded_is_joined_over_splits() -> None:
+    s = 10**9
+    held = Excluded(3 * s, 30 * s)
+    known = add_excluded([], [held], 0, 10 * s)
+    assert known == [Excluded(3 * s, 11 * s + 1)]
+    known = add_excluded(known, [held, Excluded(28 * s, 35 * s, False)], 11 * s, 40 * s)
+    assert known == [held, Excluded(28 * s, 35 * s, False)]

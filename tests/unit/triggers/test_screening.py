@@ -1,0 +1,375 @@
+"""Splits that are screened before they are served, with real files."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
+from ros2_memory.bag_dir.screened_file import excluded_between, read_gate, read_screen_state
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.retention import rewriting
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.triggers import screening
+from tests.support.bags import McapLayout
+from tests.support.mcap_surgery import spoil_chunk
+from tests.support.screened_bags import (
+    LATCHED,
+    T0,
+    S,
+    ScreenedBags,
+    mode,
+    privacy,
+    word,
+    words,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+VOLATILE = McapLayout(latched=frozenset())
+
+
+def halves(begin: int, stop: int) -> list[float]:
+    return [n + 0.5 for n in range(begin, stop)]
+
+
+class TestServing:
+    def test_a_split_is_served_when_the_next_one_was_read(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(0, value=False), *words(0, 10)])
+        bags.step()
+        assert bags.served() == []
+        bags.split(name, words(10, 20))
+        bags.step()
+        assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
+        bags.end()
+        assert bags.seconds() == halves(0, 20)
+        assert not read_gate(bags.bag_dir).holds_some(name)
+
+    def test_what_it_excludes_is_cut_with_its_margin(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(-3, value=False), *words(0, 10)])
+        bags.split(name, [mode(10.2, value=True), *words(10, 20)])
+        bags.split(name, words(20, 30))
+        bags.split(name, [mode(35, value=False), *words(30, 40)])
+        bags.end()
+        assert bags.seconds() == [*halves(0, 9), *halves(36, 40)]
+        assert bags.seconds("/privacy_mode") == [-3.0]
+        [found] = [each for each in excluded_between(bags.bag_dir, T0, MAX_NS) if each.held]
+        assert ((found.start - T0) / S, (found.stop - T0) / S) == (9.2, 36.0)
+
+    def test_a_recording_from_before_is_left_alone(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        (bags.bag_dir / SCREENED_FILE).unlink()
+        bags.screening = bags.new()
+        bags.split(name, [mode(0, value=True), *words(0, 10)])
+        bags.step()
+        assert bags.seconds() == halves(0, 10)
+
+    @pytest.mark.parametrize("keeps", [False, True])
+    def test_a_topic_that_is_never_heard(self, tmp_path: Path, keeps: bool) -> None:
+        bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=not keeps))
+        bags.split(bags.begin(0), words(0, 10))
+        bags.end()
+        assert bags.seconds() == (halves(0, 10) if keeps else [])
+        assert len(bags.served()) == 1
+
+    def test_a_topic_that_falls_silent(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        said = [mode(n, value=False) for n in range(5)]
+        bags.split(bags.begin(0), [*said, *words(0, 10)], VOLATILE)
+        bags.end()
+        assert bags.seconds() == halves(0, 6)
+
+    def test_a_message_that_cannot_show_it_is_unknown_and_reported(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        bags.split(bags.begin(0), [word(0, "/privacy_mode"), *words(0, 10)])
+        bags.end()
+        assert bags.seconds() == []
+        assert "/privacy_mode: the values hold no boolean" in (bags.screening.problem() or "")
+
+
+class TestRotations:
+    def test_the_state_carries_over_them(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        old = bags.begin(0)
+        bags.split(old, [mode(0, value=False), mode(5, value=True), *words(0, 10)])
+        new = bags.begin(9)
+        bags.split(old, words(10, 13))
+        again = mode(11, value=True, published=5)
+        bags.split(new, [again, mode(15, value=False), *words(11, 20)])
+        bags.step()
+        bags.end(old)
+        bags.split(new, words(20, 30))
+        bags.end()
+        assert bags.seconds() == [*halves(0, 4), *halves(16, 30)]
+
+    def test_what_holds_at_the_end_holds_after_a_restart(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=False))
+        bags.split(bags.begin(0), [mode(2, value=True), *words(0, 10)])
+        bags.end()
+        bags.screening = bags.new()
+        new = bags.begin(30)
+        bags.split(new, [mode(32, value=False), *words(30, 40)])
+        bags.end()
+        assert bags.seconds() == [0.5, *halves(33, 40)]
+
+    def test_a_publisher_that_does_not_come_back_is_unknown(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        old = bags.begin(0)
+        bags.split(old, [mode(-2, value=False), *words(0, 10)])
+        new = bags.begin(8)
+        bags.split(new, words(8, 20))
+        bags.split(new, words(20, 30))
+        bags.end(old)
+        bags.end()
+        assert bags.seconds() == sorted([*halves(0, 10), 8.5, 9.5, 10.5, 11.5])
+
+    def test_latched_messages_from_before_stay(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        old = bags.begin(0)
+        map_then = mode(0, value=False)
+        first = [word(1, "/map"), map_then, mode(5, value=True), word(6, "/map"), *words(0, 10)]
+        bags.split(old, first)
+        new = bags.begin(10)
+        bags.end(old)
+        again = [
+            type(each)(each.topic, each.type, T0 + 11 * S, each.body, each.log_time)
+            for each in (word(1, "/map"), word(6, "/map"))
+        ]
+        bags.split(new, [*again, mode(11, value=True, published=5), *words(11, 20)])
+        bags.end()
+        # Before the first second nothing was known.
+        assert bags.seconds("/map") == [1.0, 11.0]
+
+
+class TestFaults:
+    def test_a_full_disk_holds_splits_back(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(McapWriter, "cut", full)
+            bags.end()
+            assert bags.served() == []
+            problem = bags.screening.problem() or ""
+            assert "1 split is not served" in problem
+            assert f"{name}/{split.name}: No space left on device" in problem
+            assert [each.name for each in split.parent.iterdir()] == [split.name]
+        bags.end()
+        assert (bags.seconds(), bags.screening.problem()) == (halves(0, 4), None)
+
+    def test_a_split_that_cannot_be_read_stays_held_back(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        spoil_chunk(bags.split(name, [mode(12, value=True), *words(10, 20)]), 0)
+        bags.split(name, words(20, 30))
+        bags.end()
+        # Since it may have said that the condition holds, the next one is unknown.
+        assert bags.seconds() == halves(0, 9)
+        assert f"{name}_1.mcap" in (bags.screening.problem() or "")
+        assert read_gate(bags.bag_dir).holds(name, f"{name}_1.mcap")
+
+    def test_a_state_that_cannot_be_written_changes_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
+        before = split.read_bytes()
+
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(screening, "write_screen_state", full)
+            with pytest.raises(OSError, match="No space"):
+                bags.end()
+            with pytest.raises(RecorderError, match=r"screened\.json: No space"):
+                bags.begin(20)
+        assert (split.read_bytes(), bags.served()) == (before, [])
+        bags.end()
+        assert bags.seconds() == halves(0, 4)
+
+    def test_a_damaged_state_serves_nothing_and_begins_nothing(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        bags.end()
+        (bags.bag_dir / SCREENED_FILE).write_text("{")
+        assert bags.served() == []
+        bags.screening = bags.new()
+        with pytest.raises(RecorderError, match="deleting this file"):
+            bags.begin(20)
+
+    def test_a_clock_that_is_set_back_leaves_nothing_sure(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 30)])
+        bags.split(name, [mode(12, value=True), *words(10, 20)])
+        bags.split(name, words(15, 25))
+        bags.split(name, words(40, 50))
+        bags.end()
+        # It held from 12 s on by one of the two clocks, and is not known to have ended.
+        assert bags.seconds() == halves(0, 9)
+
+    def test_a_recording_that_never_began_is_forgotten(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        failed, name = bags.begin(0), bags.begin(1)
+        bags.split(name, [mode(1, value=False), *words(2, 10)])
+        bags.live.discard(failed)
+        bags.split(name, words(10, 20))
+        bags.step()
+        assert len(bags.served()) == 1
+        state = read_screen_state(bags.bag_dir)
+        assert state is not None
+        assert [*state.recordings] == [name]
+
+
+STEPS = st.lists(st.tuples(st.integers(1, 4), st.sampled_from([None, True, False])), max_size=6)
+
+
+class _Killed(BaseException):
+    """The end of the process, at a point that the test chooses."""
+
+
+def interrupted_at(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kills the process at the nth of the points at which the disk shows a difference."""
+    left = itertools.count(count, -1)
+
+    def dying(real: Callable[..., object], *, after: bool) -> Callable[..., object]:
+        def call(*args: object, **given: object) -> object:
+            if not after and not next(left):
+                raise _Killed
+            found = real(*args, **given)
+            if after and not next(left):
+                raise _Killed
+            return found
+
+        return call
+
+    for module, name in ((screening, "write_screen_state"), (rewriting, "replace_file")):
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, dying(dying(real, after=True), after=False))
+    monkeypatch.setattr(McapWriter, "cut", dying(McapWriter.cut, after=True))
+
+
+def record_a_day(bags: ScreenedBags, step: Callable[[], None]) -> None:
+    """Two recordings with a rotation while it holds, screened now and then."""
+    old = bags.begin(0)
+    bags.split(old, [mode(-2, value=False), word(1, "/map"), *words(0, 4)])
+    step()
+    bags.split(old, [mode(5, value=True), *words(4, 8)])
+    step()
+    new = bags.begin(7)
+    bags.split(old, words(8, 10))
+    bags.live.discard(old)
+    bags.split(new, [mode(8.2, value=True, published=5), word(8.4, "/map"), *words(8, 12)])
+    step()
+    bags.split(new, [mode(13, value=False), *words(12, 20)])
+    step()
+    step()
+    bags.split(new, [word(21, "/map"), *words(20, 24)])
+    bags.live.discard(new)
+    for _ in range(4):
+        step()
+
+
+EXPECTED = [*halves(0, 4), *halves(14, 24)]
+
+
+@pytest.mark.parametrize("moment", range(24))
+def test_a_kill_at_any_point_serves_nothing_unscreened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
+) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    killed = 0
+
+    def step() -> None:
+        nonlocal killed
+        try:
+            bags.step()
+        except _Killed:
+            killed += 1
+            bags.screening = bags.new()
+        assert {*bags.seconds()} <= {*EXPECTED}
+
+    begin = bags.begin
+
+    def beginning(second: float) -> str:
+        try:
+            return begin(second)
+        except _Killed:
+            bags.screening = bags.new()
+            return begin(second)
+
+    monkeypatch.setattr(bags, "begin", beginning)
+    with monkeypatch.context() as patched:
+        interrupted_at(moment, patched)
+        record_a_day(bags, step)
+    bags.end()
+    assert bags.seconds() == EXPECTED
+    assert bags.seconds("/map") == [1.0, 21.0]
+    assert list(bags.bag_dir.rglob(".*.mcap*")) == []
+    assert killed <= 1
+
+
+@given(STEPS, st.integers(0, 2**24))
+def test_however_a_recording_is_cut_into_splits(
+    tmp_path_factory: pytest.TempPathFactory, said: list[tuple[int, bool | None]], seed: int
+) -> None:
+    """And whenever it is looked at: what stays is what its messages say, one by one."""
+    times = list(itertools.accumulate(by for by, _ in said))
+    modes = [
+        mode(time + 0.25, value=value)
+        for time, (_, value) in zip(times, said, strict=True)
+        if value is not None
+    ]
+    messages = sorted([word(0), *words(0, 20), *modes], key=lambda each: each.log_time)
+    bags = ScreenedBags(tmp_path_factory.mktemp("bags") / "bags")
+    name = bags.begin(0)
+    cuts = [at for at in range(1, len(messages)) if (seed >> (at % 24)) & 7 == 1]
+    for start, stop in itertools.pairwise([0, *cuts, len(messages)]):
+        bags.split(name, messages[start:stop])
+        if seed & (1 << (start % 24)):
+            bags.step()
+    bags.end()
+
+    def state(at: float) -> bool | None:
+        before = [each for each in modes if each.log_time <= T0 + at * S]
+        return None if not before else before[-1].body.data  # type: ignore[attr-defined]
+
+    def stays(at: float) -> bool:
+        return all(
+            state(at + by / 100) is False for by in range(-100, 101, 5) if at + by / 100 >= 0
+        )
+
+    assert bags.seconds() == [at for at in [0.0, *halves(0, 20)] if stays(at)]
+
+
+def test_metadata_counts_what_is_left(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)], LATCHED)
+    metadata = bags.bag_dir / name / METADATA_FILE
+    metadata.write_text("")
+    bags.end()
+    assert "message_count: 5" in metadata.read_text()
