@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.storage.base import BagReader, BagWriter
+    from ros2_memory.triggers.screening import Screening
 
 PLENTY = 10**15
 HOUR = 3600 * NS_PER_S
@@ -53,6 +54,7 @@ def keeper_of(
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
     is_synchronised: Callable[[], bool] = lambda: True,
     keeps_foreign: bool = False,
+    screening: Screening | None = None,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
 
@@ -67,6 +69,7 @@ def keeper_of(
         is_synchronised=is_synchronised,
         split_duration_s=10.0,
         moments_bytes=moments_bytes,
+        screening=screening,
         static_topics=("/tf_static",),
         grace_s=grace_s,
         monotonic=monotonic,

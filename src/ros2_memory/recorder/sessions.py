@@ -160,7 +160,7 @@ class RecordingSessions:
             if changes.gone and session.state is not SessionState.ENDING:
                 self._handle_vanished(session)
         if closed:
-            self._settle_handovers()
+            self.settle_handovers()
         self._check_waiting(now)
         return closed
 
@@ -238,7 +238,7 @@ class RecordingSessions:
         for session in ended:
             self._finalize(session, now)
         if ended:
-            self._settle_handovers()
+            self.settle_handovers()
 
     def end_all(self, now: ClockReading) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
@@ -344,9 +344,9 @@ class RecordingSessions:
         if handover is not None:
             self.current = handover.new
             self._unsettled.append(handover.directories)
-            self._settle_handovers()
+            self.settle_handovers()
 
-    def _settle_handovers(self) -> None:
+    def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
 
         What fails is tried again when the next split is closed.

@@ -187,6 +187,8 @@ class Supervisor:
         self._paused = False
         if not self._disk.away:
             self._housekeeper.finish()
+            # What was held back could not be compared before.
+            self._sessions.settle_handovers()
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:

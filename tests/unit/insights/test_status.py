@@ -9,6 +9,7 @@ from mcap.writer import Writer
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.lost_file import Loss, append_losses
+from ros2_memory.bag_dir.screened_file import Excluded, ScreenState, write_screen_state
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index.listed_splits import absent_splits
@@ -123,6 +124,18 @@ def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -
     assert told["trust"] == "nothing is known to be missing"
     beating(tmp_path, RecorderState.STOPPED, -100, age_held="72 bags stay")
     assert "notes" not in shown(memory, tmp_path)
+
+
+def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    beating(tmp_path, RecorderState.RECORDING, 59, held_back="1 split is not served")
+    write_screen_state(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
+    told = shown(memory, tmp_path)
+    assert told["trust"] == "1 split is not served"
+    assert told["notes"] == [
+        "excluded by privacy (recording.exclude_when), so nothing of it is recorded: 0.000000 to "
+        "1.000000"
+    ]
 
 
 @pytest.mark.parametrize(

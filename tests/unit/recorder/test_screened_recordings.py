@@ -1,0 +1,168 @@
+"""A recorder that screens what it records before it is served: sessions, handovers, the house."""
+
+from __future__ import annotations
+
+import errno
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.layout import SCREENED_FILE
+from ros2_memory.bag_dir.screened_file import read_gate
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.triggers import screening
+from ros2_memory.triggers.screening import Screening
+from tests.support.bags import McapLayout
+from tests.support.housekeepers import keeper_of, recording_now
+from tests.support.memories import shipped_extractor
+from tests.support.screened_bags import T0, S, ScreenedBags, mode, privacy, words
+from tests.support.simulated_recorders import World, assert_each_counts_once
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.triggers.exclusion import ExclusionRule
+
+pytestmark = pytest.mark.usefixtures("no_flushing")
+
+OPEN = McapLayout(latched=frozenset({"/privacy_mode"}), finish=False, chunk_size=400)
+
+
+def screening_of(bag_dir: Path, rule: ExclusionRule) -> Screening:
+    return Screening(
+        bag_dir,
+        [rule],
+        BagDirReader(McapReader(), bag_dir, every_message=True),
+        shipped_extractor(),
+        McapWriter(),
+        split_duration_s=5.0,
+    )
+
+
+class TestSessions:
+    @pytest.mark.parametrize("unknown", [False, True])
+    def test_over_rotations_what_is_not_excluded_counts_once(
+        self, tmp_path: Path, unknown: bool
+    ) -> None:
+        house = keeper_of(
+            tmp_path, screening=screening_of(tmp_path, privacy(excludes_unknown=unknown))
+        )
+        world = World(tmp_path, housekeeper=house, session_duration_s=20)
+        world.supervisor.start()
+        for _ in range(12):
+            world.run(5)
+            gate = read_gate(tmp_path)
+            newest = world.heartbeat()["recordings"][-1]
+            assert gate.holds(newest, f"{newest}_0.mcap") or (tmp_path / newest).exists()
+        world.supervisor.stop()
+        if unknown:
+            assert not world.published(counting=False)
+        else:
+            assert_each_counts_once(world)
+        names = [each.name for each in tmp_path.glob("rec_*")]
+        assert len(names) > 2
+        assert not any(read_gate(tmp_path).holds_some(each) for each in names)
+        # Compared when they were released, and not before.
+        assert [read_handover(tmp_path / each).handover.compared for each in sorted(names)[1:]] == [
+            True
+        ] * (len(names) - 1)
+
+    def test_a_recording_that_cannot_be_held_back_does_not_begin(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        house = keeper_of(tmp_path, screening=screening_of(tmp_path, privacy()))
+        world = World(tmp_path, housekeeper=house, session_duration_s=20)
+        world.supervisor.start()
+        world.run(15)
+        with monkeypatch.context() as patched:
+            patched.setattr(screening, "write_screen_state", full)
+            world.run(15)
+            assert len(world.recorders) == 1
+            assert "screened.json: No space left" in world.heartbeat()["last_error"]
+        world.run(80)
+        assert len(world.recorders) > 1
+        world.supervisor.stop()
+
+    def test_without_rules_there_is_no_state(self, tmp_path: Path) -> None:
+        world = World(tmp_path, housekeeper=keeper_of(tmp_path))
+        world.supervisor.start()
+        world.run(10)
+        world.supervisor.stop()
+        assert not (tmp_path / SCREENED_FILE).exists()
+
+
+class TestTheHouse:
+    def test_what_a_crash_left_open_is_repaired_and_then_screened(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        house = keeper_of(bags.bag_dir, screening=bags.screening)
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        bags.split(name, words(10, 20), OPEN)
+        bags.end()
+        assert len(bags.served()) == 1
+        assert bags.screening.problem() is None
+        house.apply()
+        bags.step()
+        assert [path.name for path in bags.served()] == [f"{name}_{n}.mcap" for n in range(2)]
+
+    def test_the_budget_may_delete_what_is_held_back_in_a_recording_that_ended(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(*_: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(McapWriter, "cut", full)
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        held = bags.split(name, [mode(0, value=True), *words(0, 10)])
+        bags.split(name, [mode(13, value=False), *words(10, 30)])
+        bags.end()
+        recording_now(bags.bag_dir, name)
+        keeper_of(bags.bag_dir, max_bytes=1).apply()
+        assert held.exists()
+        recording_now(bags.bag_dir)
+        keeper_of(bags.bag_dir, max_bytes=1).apply()
+        assert not held.exists()
+
+    def test_no_moment_is_kept_of_what_is_held_back(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        held = bags.split(name, [mode(12, value=True), *words(10, 20)])
+        bags.step()
+        keeper = keeper_of(bags.bag_dir)
+        recording_now(bags.bag_dir, name)
+        keeper.apply()
+        snapshot = keeper._index.snapshot()
+        assert [each.path.name for each in snapshot.timeline.overlapping(window())] == [
+            f"{name}_0.mcap"
+        ]
+        assert [each.path for each in snapshot.active] == [held]
+
+    def test_a_step_runs_in_the_background_and_its_fault_is_reported(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        house = BackgroundHousekeeper(keeper_of(bags.bag_dir, screening=bags.screening))
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        house.screen(())
+        house.wait()
+        assert len(bags.served()) == 1
+        (bags.bag_dir / SCREENED_FILE).write_text("{")
+        damaged = keeper_of(bags.bag_dir, screening=bags.new())
+        house = BackgroundHousekeeper(damaged)
+        house.screen(())
+        assert "screened.json" in house.faults()["screen"]
+        house.finish()
+        assert "screened.json" in house.faults()["screen"]
+
+
+def window() -> TimeWindow:
+    return TimeWindow(T0 - 10 * S, T0 + 60 * S)

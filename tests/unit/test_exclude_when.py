@@ -1,0 +1,79 @@
+"""The rules of `recording.exclude_when`, as they are configured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from ros2_memory.bootstrap import build_housekeeper, build_reader, exclusions_of
+from ros2_memory.config import load_settings
+from ros2_memory.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ros2_memory.triggers.exclusion import ExclusionRule
+
+S: Final = 10**9
+ROOT: Final = Path(__file__).resolve().parents[2]
+PRIVACY: Final = "topic: /privacy_mode, condition_type: equals, value: true"
+
+
+def rules(tmp_path: Path, text: str, *overrides: str) -> tuple[ExclusionRule, ...]:
+    path, topics = tmp_path / "exclusions.yaml", tmp_path / "topics.yaml"
+    path.write_text(text)
+    topics.write_text("topics: [/odom, /privacy_mode, /mission_zone]")
+    given = [f"recording.exclude_when={path}", f"recording.topics_file={topics}", *overrides]
+    return exclusions_of(load_settings(given))
+
+
+def test_the_ready_rules_are_valid_and_none_is_on(tmp_path: Path) -> None:
+    shipped = (ROOT / "config" / "exclusions.yaml").read_text(encoding="utf-8")
+    assert rules(tmp_path, shipped) == ()
+    commented = shipped[shipped.index("# rules:") :].splitlines()
+    ready = rules(tmp_path, "\n".join(line.removeprefix("# ") for line in commented))
+    assert [(each.name, each.margin) for each in ready] == [
+        ("privacy mode", S),
+        ("in the bathroom", 3 * S),
+    ]
+
+
+def test_a_rule_has_what_its_file_says(tmp_path: Path) -> None:
+    [rule] = rules(tmp_path, f"rules: {{a: {{{PRIVACY}, margin_s: 2.5, stale_s: 4}}}}")
+    assert (rule.margin, rule.stale, rule.excludes_unknown) == (2 * S + S // 2, 4 * S, True)
+    assert rule.condition.matches({"value": True})
+    [rule] = rules(tmp_path, f"rules: {{a: {{{PRIVACY}, on_unknown: keep}}}}")
+    assert not rule.excludes_unknown
+
+
+@pytest.mark.parametrize(
+    ("rule", "reason"),
+    [
+        ("topic: /privacy_mode", "condition_type"),
+        ("topic: /p*, condition_type: equals, value: true", "must name one topic"),
+        ("topic: /unheard, condition_type: equals, value: true", "/unheard is not recorded"),
+        ("topic: /odom, condition_type: like, value: x", "'like' is not one of"),
+        (f"{PRIVACY}, margin_s: -1", "margin_s"),
+        (f"{PRIVACY}, stale_s: 0", "stale_s"),
+        (f"{PRIVACY}, on_unknown: ignore", "on_unknown"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_reason(tmp_path: Path, rule: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match=reason) as refused:
+        rules(tmp_path, f"rules: {{a: {{{rule}}}}}")
+    assert "exclusions.yaml" in str(refused.value)
+
+
+def test_a_recording_of_too_many_splits_is_refused(tmp_path: Path) -> None:
+    text = f"rules: {{a: {{{PRIVACY}}}}}"
+    assert rules(tmp_path, text, "recording.session_duration_s=50000")
+    with pytest.raises(ConfigError, match="5000 splits at most"):
+        rules(tmp_path, text, "recording.session_duration_s=50001")
+
+
+def test_without_rules_nothing_is_announced(tmp_path: Path) -> None:
+    settings = load_settings([f"recording.bag_dir={tmp_path}"])
+    house = build_housekeeper(settings, tmp_path, build_reader(settings))
+    house.announce("rec_20261120T080000Z")
+    house.finish()
+    assert (house.screening(()), [*tmp_path.iterdir()]) == ((), [])
