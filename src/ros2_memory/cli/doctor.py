@@ -383,6 +383,9 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.age_held:
         do = "have the clock synchronised: timedatectl set-ntp true, or chrony; the budget holds"
         yield _warning("recorder", heartbeat.age_held, do)
+    if heartbeat.held_back:
+        do = "free the disk, or correct the rule; docs/how-to/forget.md has what each key means"
+        yield _warning("recorder", heartbeat.held_back, do)
     if heartbeat.last_error:
         seen = f"its last error: {heartbeat.last_error}"
         if heartbeat.restarts:

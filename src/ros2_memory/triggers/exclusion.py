@@ -135,7 +135,7 @@ def _unknown(
         before = (
             spans
             for spans, one in zip(free[:at], recordings, strict=False)
-            if one.start <= each.start
+            if one.start <= each.start and not one.unclear
         )
         after = (
             spans

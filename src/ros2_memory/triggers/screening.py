@@ -14,7 +14,6 @@ import os
 import threading
 import time
 from collections import Counter
-from contextlib import suppress
 from copy import deepcopy
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -60,9 +59,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.screened_file import Excluded
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.storage.base import BagReader, BagWriter
+    from ros2_memory.storage.base import BagReader, BagWriter, Record
     from ros2_memory.triggers.exclusion import ExclusionRule
 
 MOST_AT_ONCE: Final = 16
@@ -262,10 +260,7 @@ class Screening:
         for rule in self._rules:
             heard = screen.heard.setdefault(rule.name, [])
             for record in self._reader.records(path, (rule.topic,), TimeWindow.everything()):
-                holds: bool | None = None
-                with suppress(UndecodableError):
-                    value = self._extractor.exact(self._reader.decode(record), record.channel.type)
-                    holds = self._test(rule, value)
+                holds = self._test(rule, record)
                 latched = record.channel.latched
                 hear(heard, record.log_time, holds, latched=latched, stale=rule.stale)
         # Latched messages may be written again with the times that they had.
@@ -276,9 +271,14 @@ class Screening:
         screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)
         screen.end = summary.end if screen.end is None else max(screen.end, summary.end)
 
-    def _test(self, rule: ExclusionRule, value: JsonValue) -> bool | None:
-        """Returns whether a rule's condition holds; None where it cannot, of such a value."""
+    def _test(self, rule: ExclusionRule, record: Record) -> bool | None:
+        """Returns whether a rule's condition holds; None where a message cannot show it."""
         condition = rule.condition
+        try:
+            value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+        except UndecodableError as error:
+            self._refusals[rule.name] = f"the rule {rule.name}: {error}"
+            return None
         if condition.matches(value):
             return True
         refusal = refusal_for(condition, value) if condition.can_be_refused else None
@@ -289,6 +289,7 @@ class Screening:
         if refusal is not None:
             self._refusals[rule.name] = f"the rule {rule.name}: {rule.topic}: {refusal}"
             return None
+        self._refusals.pop(rule.name, None)
         return False
 
     def _ready(
@@ -395,7 +396,7 @@ class Screening:
                     reason=f"metadata.yaml may still count what was excluded: {error}",
                 )
         screen.done = True
-        screen.files, screen.unclear = {}, []
+        screen.files = {}
 
     def _loaded(self) -> ScreenState:
         """Returns the state; call it with the lock held.

@@ -143,6 +143,10 @@ def test_nothing_is_known_across_a_clock_that_was_set_back() -> None:
     after = Past(10, 28, ())
     found = excluded_stretches(rule(), [heard_by(each, latched=True) for each in (before, after)])
     assert Excluded(10, 29, False) in found
+    # What a recording knew whose clock was set back tells another one nothing.
+    jumped = HeardRecording(5, 30, [Heard(5, 30, False, True)], [(5, 8)])
+    found = excluded_stretches(rule(), [jumped, HeardRecording(6, 20, [])])
+    assert found == [Excluded(5, 21, False)]
     unclear = HeardRecording(0, 9, [Heard(0, 9, False, True)], [(3, 5)])
     assert excluded_stretches(rule(excludes_unknown=False), [unclear]) == [Excluded(3, 5, False)]
 
