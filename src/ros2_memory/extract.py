@@ -242,6 +242,10 @@ class SchemaExtractor:
         above = math.nan if altitude is None else altitude
         return Geodetic(latitude, longitude, above, _text(_FRAME.of(message)))
 
+    def is_mapped(self, type_name: str) -> bool:
+        """Returns whether the schema map lists a type; what any other carries its messages show."""
+        return self._plan(type_name) is not _UNMAPPED
+
     def kinds_of(self, type_name: str) -> frozenset[str]:
         """Returns what messages of a mapped type have: `position`, `velocity`, `geodetic`."""
         plan = self._plan(type_name)

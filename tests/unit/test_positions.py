@@ -264,6 +264,18 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
 
 @each_way
 @pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
+def test_a_topic_of_an_unlisted_type_is_named_where_its_messages_have_poses(
+    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "up"), local(T0 + S, 1.0, 2.0)])
+    detail = ask(tmp_path, recalls, tool, **given)["detail"]
+    assert "poses are on /fmu/out/vehicle_local_position" in detail
+    assert "set data.pose_topic=/fmu/out/vehicle_local_position" in detail
+    assert "/chatter" not in detail
+
+
+@each_way
+@pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
 def test_where_there_are_transforms_alone_the_tool_for_them_is_named(
     tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
+MOST_TRIED: Final = 20
+"""Topics of unknown content that are looked into for poses."""
 ON_DISK_S: Final = 3
 """A message that the recorder received longer ago is on disk, as small as its chunks are."""
 
@@ -69,6 +72,8 @@ def resolve_pose_topic(
             raise
         detail = f"no topic {configured} is recorded, which data.pose_topic names"
         topics = topics_with(view, what)
+        if not topics and what == "position":
+            topics = _topics_that_show_poses(view)
         if topics:
             those = {"position": "poses", "velocity": "velocities"}[what]
             which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
@@ -91,6 +96,30 @@ def resolve_pose_topic(
         else:
             raise
         raise NoDataError(error.reason, detail, error.notes) from error
+
+
+def _topics_that_show_poses(view: View) -> list[str]:
+    """Returns topics of types outside the schema map whose newest message has a pose.
+
+    Each with its type behind it, of at most `MOST_TRIED` topics: for an error alone.
+    """
+    extractor, timeline = view.memory.extractor, view.snapshot.timeline
+    unmapped = [
+        topic
+        for topic in timeline.topics()
+        if not any(extractor.is_mapped(each) for each in timeline.types_of(topic))
+    ]
+    shown = []
+    for topic in unmapped[:MOST_TRIED]:
+        newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
+        if newest is None:
+            continue
+        type_name = newest.record.channel.type
+        with suppress(NoDataError):
+            pose = extractor.pose(decode(view, newest), type_name)
+            if pose is not None and pose.orientation is not None:
+                shown.append(f"{topic} ({type_name})")
+    return shown
 
 
 def _transform_topics(view: View) -> list[str]:
