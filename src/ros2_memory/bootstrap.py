@@ -523,6 +523,7 @@ def build_dispatcher(
         readable=readable_tools(memory.limits),
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
+        most_questions=server.keep_questions,
     )
 
 

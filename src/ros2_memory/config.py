@@ -228,7 +228,8 @@ class ServerSettings:
     """How the query server is reached, and what it offers. Port 0 is any free port.
 
     `tools`: all, or those of the specification; `write_tools`: also those that write. `metrics` and
-    `traces` need the extra `observability`.
+    `traces` need the extra `observability`. `keep_questions`: how many of the latest calls are kept
+    in memory, with their replies, for the page; 0 for none.
     """
 
     name: Text
@@ -239,6 +240,7 @@ class ServerSettings:
     max_reply_chars: Annotated[int, Field(strict=True, ge=1000)]
     tools: Literal["all", "spec"]
     write_tools: Flag
+    keep_questions: Annotated[int, Field(strict=True, ge=0, le=1000)]
     metrics: Flag
     traces: Flag
 

@@ -356,7 +356,8 @@ class Event:
 
     With `goes_on`, `end` is only as far as is known. `before`: what changed before, nearest first.
     `place`: the named place that the robot was in. `score`: the best one of a thing in view.
-    `skipped`: how much of its time the clock skipped.
+    `skipped`: how much of its time the clock skipped. `point`: where it happened (m), in the frame
+    of the recap, where that is known of the robot itself.
     """
 
     kind: str
@@ -368,6 +369,7 @@ class Event:
     place: str | None = None
     score: float | None = None
     skipped: Ns = 0
+    point: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

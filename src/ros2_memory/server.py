@@ -37,6 +37,7 @@ from ros2_memory.serving.connection_limits import (
 )
 from ros2_memory.serving.health import Health, keep_fresh
 from ros2_memory.serving.listen import BACKLOG, CannotListenError, bound, resolved
+from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.serving.web_app import STREAM_PATH, web_app
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ def _run(overrides: Sequence[str]) -> None:
                 background=background,
                 api_token=token.get_secret_value() if token else None,
                 metrics=telemetry.metrics,
+                page=page_routes(server.dispatcher, backfill.progress),
             )
             _serve_http(server, app, address)
     except SystemExit:

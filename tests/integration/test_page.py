@@ -6,13 +6,14 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import httpx2
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
 from tests.integration.test_server_process import serving
 from tests.support.bags import boolean, detections, odom, text, write_mcap
-from tests.support.browser import ENTER, TAB, Browser, browsing, needs_chromium
+from tests.support.browser import ENTER, RIGHT, TAB, Browser, browsing, needs_chromium
 from tests.support.documented_history import heartbeat
 from tests.support.robot_run import T0, T0_S
 
@@ -28,9 +29,14 @@ GOOD = "kJ7-x._~+/0123456789=="
 ATTACK = '<img src=x onerror="window.ran=1"><script>window.ran=1</script>'
 REVERSED = "/gnp\u202e.rorre"
 READY = """
-  const busy = document.getElementById('again').disabled;
-  return !busy && document.querySelector('#seen table') !== null;
+  const shown = document.getElementById('summary').getAttribute('aria-busy') === 'false';
+  return shown && !document.getElementById('memory').hidden;
 """
+LOOKED = "return document.getElementById('summary').getAttribute('aria-busy') === 'false'"
+REQUESTS = """
+  return performance.getEntriesByType('resource').map((each) => new URL(each.name).pathname);
+"""
+POSED = "return map.moment !== null"
 ANSWERED = "return /^answered|^no answer/.test(document.getElementById('outcome').textContent)"
 FOCUSED = "return document.activeElement.id"
 
@@ -77,29 +83,145 @@ def page(chromium: Browser, served: Served) -> Iterator[Browser]:
     """The page with everything shown; what it complains of fails the test."""
     chromium.looks(width=1200, height=900)
     chromium.complaints()
-    chromium.open(served.url("/"))
-    chromium.awaits(READY)
+    show(chromium, served)
     yield chromium
     assert chromium.complaints() == []
 
 
+def show(browser: Browser, served: Served, address: str = "") -> None:
+    """Opens the page anew, also where only the part behind # differs."""
+    browser.open("about:blank")
+    browser.open(served.url(f"/{address}"))
+    browser.awaits(READY)
+
+
+def test_a_first_look_is_four_requests(page: Browser) -> None:
+    requests = page.run(REQUESTS)
+    assert requests[:3] == ["/page/page.css", "/page/page.js", "/page/span"]
+    # Besides the page itself; what follows is asked for later, to see what is new.
+    assert set(requests[3:]) <= {"/page/span"}
+
+
 def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
-    line = page.text("#line")
-    assert "gaps, 1" in line
-    assert "damaged_0.mcap" in line
-    label = page.run("return document.querySelector('#line svg').getAttribute('aria-label')")
-    assert "1 gap (60 s), 1 damaged bag" in label
-    assert "/odom" in page.text("#topics")
-    assert "nav_msgs/msg/Odometry" in page.text("#topics")
+    assert page.run("return state.view.range.gaps.length") == 1
+    assert "damaged_0.mcap" in page.text("#state")
     assert "Recorder\nnot heard of" in page.text("#state")
     assert "GB" in page.text("#state")
-    assert "30.0 m in odom" in page.text("#way")
-    drawn = page.run("return document.querySelector('#way polyline').getAttribute('points')")
-    assert len(drawn.split(" ")) >= 2
+    label = page.run("return document.getElementById('map').getAttribute('aria-label')")
+    assert "30.0 m driven in odom" in label
+    assert "2 stops" in label
     # Nobody knows how it came over the gap.
-    assert page.run("return document.querySelectorAll('#way polyline').length") >= 2
-    assert page.run("return document.querySelectorAll('#way circle.stop').length") >= 1
-    assert "cup" in page.text("#seen")
+    assert page.run("return [...map.begins].length") == 2
+    assert "stood at x 15.00, y 0.00" in page.text("#events")
+    assert "Robot\nx\u00a030.00, y\u00a00.00\u00a0m" in page.text("#moment")
+    assert painted(page, "#map") > 1000
+    assert painted(page, "#timeline") > 1000
+
+
+def test_pointing_at_a_time_puts_the_robot_there_and_lists_what_it_saw(page: Browser) -> None:
+    at_s = T0_S + 10
+    page.point("#timeline", *page.run("return [line.x(arguments[0]), 60]", at_s))
+    page.awaits(POSED)
+    assert abs(page.run("return map.moment.x") - 10.0) < 0.5
+    page.awaits("return document.getElementById('moment').textContent.includes('It saw')")
+    assert "cup" in page.text("#moment")
+    assert page.text("#moment-title") == "At this time"
+    page.point("#timeline", 1, 1)
+
+
+def test_a_time_that_was_chosen_stays_and_is_in_the_address(page: Browser, served: Served) -> None:
+    page.press("#timeline", *page.run("return [line.x(arguments[0]), 60]", T0_S + 5))
+    page.awaits("return location.hash.includes('at=')")
+    address = page.run("return location.hash")
+    page.awaits("return document.getElementById('moment').textContent.includes('It saw')")
+    show(page, served, address)
+    page.awaits(POSED)
+    assert abs(page.run("return map.moment.x") - 5.0) < 0.5
+    page.run("document.getElementById('back').click()")
+    assert page.text("#moment-title") == "Now"
+    assert "at=" not in page.run("return location.hash")
+
+
+def test_pointing_at_the_path_is_pointing_at_a_time(page: Browser) -> None:
+    page.point("#map", *page.run("return [map.px(7), map.py(0)]"))
+    page.awaits(POSED)
+    assert abs(page.run("return map.moment.x") - 7.0) < 0.7
+
+
+def test_the_timeline_is_dragged_and_zoomed_and_the_address_has_the_span(page: Browser) -> None:
+    before = page.run("return state.span")
+    page.press("#time-in")
+    page.awaits("return state.last === null")
+    page.awaits(LOOKED)
+    zoomed = page.run("return state.span")
+    length = before["end"] - before["start"]
+    assert abs((zoomed["end"] - zoomed["start"]) - length / 2) < 0.1
+    page.drag("#timeline", (300, 60), (400, 60))
+    page.awaits("return state.span.start < arguments[0]", zoomed["start"] - 1)
+    page.awaits("return state.view.start < arguments[0]", zoomed["start"] - 1)
+    dragged = page.run("return state.span")
+    assert abs((dragged["end"] - dragged["start"]) - length / 2) < 0.1
+    assert f"from={dragged['start']:.3f}" in page.run("return location.hash")
+    page.run("document.getElementById('timeline').focus()")
+    page.keys("-")
+    page.awaits("return state.span.end - state.span.start > arguments[0]", length * 0.7)
+    page.press("#live")
+    page.awaits("return location.hash.startsWith('#last=')")
+    page.awaits(LOOKED)
+
+
+def test_a_stretch_and_a_thing_show_what_was_seen(page: Browser) -> None:
+    page.run("chooseStretch(state.view.events.find((each) => each.kind === 'stop'))")
+    page.awaits("return document.getElementById('moment').textContent.includes('Stood')")
+    assert "cup" in page.text("#moment")
+    assert page.text("#moment-title").startswith("stood at x 15.00")
+    page.run(
+        "[...document.querySelectorAll('#moment button')]"
+        ".find((each) => each.textContent === 'cup').click()"
+    )
+    page.awaits("return document.getElementById('moment').textContent.includes('sighting')")
+    assert page.text("#moment-title") == "cup"
+    assert page.run("return document.querySelectorAll('#moment li').length") >= 1
+
+
+def test_it_is_used_with_the_keyboard_alone(page: Browser) -> None:
+    page.keys(TAB)
+    assert page.run("return document.activeElement.className") == "skip"
+    page.run("document.getElementById('timeline').focus()")
+    assert page.run("return getComputedStyle(document.activeElement).outlineStyle") == "solid"
+    page.keys(RIGHT)
+    page.awaits("return state.t !== null")
+    value = page.run(
+        "const slider = document.activeElement;"
+        "return [slider.getAttribute('role'), slider.getAttribute('aria-valuetext'),"
+        " clock(state.t)]"
+    )
+    assert value[0] == "slider"
+    assert value[1] == value[2]
+    page.awaits("return document.getElementById('moment').getAttribute('aria-busy') === 'false'")
+
+
+def test_a_number_is_plotted_below_the_timeline(page: Browser, served: Served) -> None:
+    page.run("document.getElementById('plot-part').open = true")
+    page.awaits("return document.querySelectorAll('#plot-topic option').length > 0")
+    page.run(
+        "const topic = document.getElementById('plot-topic'); topic.value = '/odom';"
+        "topic.dispatchEvent(new Event('change'));"
+    )
+    field = "linear_velocity.x"
+    page.awaits(
+        "return [...document.querySelectorAll('#plot-field option')]"
+        ".some((each) => each.value === arguments[0])",
+        field,
+    )
+    page.run(f"document.getElementById('plot-field').value = '{field}'")
+    page.press("#plot-add")
+    page.awaits("return document.querySelector('.uplot canvas') !== null")
+    assert f"/odom:{field}: from 0 to 1" in page.run(
+        "return document.querySelector('.plot').getAttribute('aria-label')"
+    )
+    show(page, served, page.run("return location.hash"))
+    page.awaits("return document.querySelector('.uplot canvas') !== null")
 
 
 def write_odd_history(bag_dir: Path) -> None:
@@ -129,8 +251,7 @@ def replayed(scratch: Path) -> Iterator[Served]:
 def odd(chromium: Browser, replayed: Served) -> Iterator[Browser]:
     chromium.looks(width=360, height=740)
     chromium.complaints()
-    chromium.open(replayed.url("/"))
-    chromium.awaits(READY)
+    show(chromium, replayed)
     yield chromium
     assert chromium.complaints() == []
 
@@ -144,31 +265,33 @@ def test_of_bags_that_nobody_records_it_shows_neither_a_recorder_nor_a_budget(od
 
 
 def test_it_says_that_ago_counts_from_the_newest_recorded_moment(odd: Browser) -> None:
-    newest = odd.run("return clock(range.latest)")
-    assert f"Newest data\n{newest}" in odd.text("#state")
+    newest = odd.run("return clock(state.view.range.latest)")
+    assert f"recorded until {newest}" in odd.text("#summary")
     assert f"counts from the newest recorded moment, {newest}" in odd.text("#state")
 
 
-def test_what_is_left_out_of_a_long_reply_is_counted_and_marked(odd: Browser) -> None:
-    line = odd.text("#line")
-    assert "gaps, 22" in line
-    assert "with 2 more gaps" in line
-    assert odd.run("return document.querySelectorAll('#line rect.coarse').length") == 1
-    assert "not in the answers (30)" in line
-    shut = odd.run(
-        "return [...document.querySelectorAll('#line details')].map((each) => each.open)"
-    )
-    assert shut == [False, False]
+def test_what_is_left_out_of_a_long_list_is_counted(odd: Browser) -> None:
+    assert odd.run("return state.view.range.gaps.length") == 22
+    assert "not in the answers (30)" in odd.text("#state")
+    shut = odd.run("return [...document.querySelectorAll('#state details')].map((e) => e.open)")
+    assert shut
+    assert not any(shut)
 
 
 def test_long_names_leave_room_for_what_stands_beside_them(odd: Browser) -> None:
-    assert odd.run("return document.documentElement.scrollWidth") <= 360
-    assert odd.run("return document.querySelectorAll('#topics tbody tr').length") == 62
-    narrow = odd.run(
-        "return [...document.querySelectorAll('td')].filter((each) => each.clientWidth < 60)"
-        ".map((each) => each.textContent)"
-    )
-    assert narrow == []
+    """Whatever fonts there are: no text is narrower than a few words, and nothing is cut."""
+    for family in ("", "* { font-family: monospace !important; font-size: 20px !important; }"):
+        odd.run(
+            "const sheet = new CSSStyleSheet(); sheet.replaceSync(arguments[0]);"
+            "document.adoptedStyleSheets = [sheet];",
+            family,
+        )
+        assert odd.run("return document.documentElement.scrollWidth") <= 360
+        narrow = odd.run(
+            "return [...document.querySelectorAll('li > *, dd')].filter((each) =>"
+            " each.clientWidth > 0 && each.clientWidth < 60).map((each) => each.textContent)"
+        )
+        assert narrow == []
 
 
 def test_it_shows_what_the_recorder_says_of_itself(chromium: Browser, scratch: Path) -> None:
@@ -181,7 +304,7 @@ def test_it_shows_what_the_recorder_says_of_itself(chromium: Browser, scratch: P
     write_heartbeat(bag_dir, beat)
     with serving(bag_dir, scratch / "log_robot", "storage=mcap") as server:
         chromium.open(server.url("/"))
-        chromium.awaits("return !document.getElementById('again').disabled")
+        chromium.awaits(LOOKED)
         state = chromium.text("#state")
     assert "recording, 2 restarts" in state
     assert "Never heard: /scan" in state
@@ -189,23 +312,22 @@ def test_it_shows_what_the_recorder_says_of_itself(chromium: Browser, scratch: P
     assert "and 15 more" in state
 
 
-def test_without_a_bag_directory_every_part_says_so(chromium: Browser, scratch: Path) -> None:
+def test_without_a_bag_directory_it_says_so(chromium: Browser, scratch: Path) -> None:
     given = ("storage=mcap", "recorder=none")
     with serving(scratch / "nowhere", scratch / "log_nowhere", *given) as server:
         chromium.open(server.url("/"))
-        chromium.awaits("return !document.getElementById('again').disabled")
+        chromium.awaits(LOOKED)
         assert "does not exist" in chromium.text("#state")
-        assert "does not exist" in chromium.text("#line")
-        assert "does not exist" in chromium.text("#topics")
-        for part in ("#way", "#seen"):
-            assert chromium.text(part) == "There is no closed bag with a message."
+        assert "nothing is recorded" in chromium.text("#summary")
+        assert chromium.run("return document.getElementById('memory').hidden")
 
 
 def test_what_was_recorded_is_shown_as_text_and_never_runs(page: Browser) -> None:
-    assert f"/{ATTACK}" in page.text("#topics")
-    assert ATTACK in page.text("#seen")
-    assert "\u202e" not in page.text("#topics")
-    assert "/gnp\\u202e.rorre" in page.text("#topics")
+    page.run("pointed(state.view.range.latest, true)")
+    page.awaits("return document.getElementById('moment').textContent.includes('It saw')")
+    assert ATTACK in page.text("#moment")
+    assert "\u202e" not in page.run("return document.body.textContent")
+    assert "/gnp\\u202e.rorre" in page.text("#events")
     ask(page, "get_topic_seconds_ago", topic=f"/{ATTACK}", seconds_ago="1")
     assert "window.ran=1" in page.text("#told")
     assert page.run("return window.ran === undefined")
@@ -224,9 +346,9 @@ def test_should_text_become_markup_after_all_it_is_refused(page: Browser) -> Non
 
 
 def test_a_tool_is_asked_with_the_keyboard_alone(page: Browser) -> None:
-    page.keys(TAB)
-    assert page.run("return document.activeElement.className") == "skip"
+    page.run("document.querySelector('#ask-part summary').focus()")
     page.keys(ENTER)
+    page.awaits("return document.getElementById('tool').options.length > 0")
     page.keys(TAB)
     assert page.run(FOCUSED) == "tool"
     page.keys("get_position_sec")
@@ -249,6 +371,7 @@ def test_a_question_without_an_answer_shows_why(page: Browser) -> None:
 
 
 def test_every_tool_that_reads_has_a_form_with_labels(page: Browser) -> None:
+    choose(page, "recap")
     names = page.run(
         "return [...document.getElementById('tool').options].map((each) => each.value)"
     )
@@ -271,7 +394,9 @@ def test_it_fits_its_window_and_can_be_read(page: Browser, width: int, dark: boo
     colours = page.run(
         "const shown = (name, at) => getComputedStyle(at)[name].match(/\\d+/g).map(Number);"
         "const card = shown('backgroundColor', document.querySelector('section'));"
-        "return [...document.querySelectorAll('section p, section td, section dt, section th')]"
+        "const texts = 'section p, section li, section dt, section dd, section h2';"
+        "return [...document.querySelectorAll(texts)]"
+        ".filter((each) => each.clientWidth > 0)"
         ".map((each) => [shown('color', each).slice(0, 3), card.slice(0, 3)])"
     )
     assert min(contrast(*each) for each in colours) >= 4.5
@@ -283,7 +408,7 @@ def test_with_a_token_it_shows_nothing_until_the_token_was_typed(
     chromium: Browser, served: Served, scratch: Path
 ) -> None:
     chromium.looks(width=1200, height=900)
-    given = ("storage=mcap", "data.now=wall")
+    given = ("storage=mcap", "data.now=wall", "server.tools=spec", "server.keep_questions=5")
     with serving(scratch / "bags", scratch / "log_token", *given, MEMORY_API_TOKEN=GOOD) as closed:
         chromium.open(closed.url("/"))
         chromium.awaits("return !document.getElementById('locked').hidden")
@@ -295,11 +420,70 @@ def test_with_a_token_it_shows_nothing_until_the_token_was_typed(
         chromium.keys(GOOD + ENTER)
         chromium.awaits(READY)
         assert chromium.run("return document.getElementById('locked').hidden")
-        assert "/odom" in chromium.text("#topics")
         assert "counts from the time of this look" in chromium.text("#state")
+        assert GOOD not in chromium.run("return location.href + document.body.innerHTML")
+        # Only the tools of the specification are offered, and the page has all the same.
+        chromium.run("pointed(state.view.range.latest - 5, true)")
+        chromium.awaits("return document.getElementById('moment').textContent.includes('It saw')")
+        ask(chromium, "get_position_at", timestamp=str(T0_S + 5))
+        asked = {"name": "get_velocity_at", "arguments": {"timestamp": T0_S + 5}}
+        httpx2.post(
+            closed.url("/mcp"),
+            headers={"authorization": f"Bearer {GOOD}", "accept": "application/json"},
+            json={"jsonrpc": "2.0", "id": 1, "method": "tools/call", "params": asked},
+        )
+        chromium.awaits("return document.querySelectorAll('#questions pre').length > 0")
+        assert "get_velocity_at" in chromium.text("#questions")
+        assert "get_position_at" not in chromium.text("#questions")
+        chromium.open(closed.url("/"))
+        chromium.awaits(READY)
+        chromium.run("sessionStorage.clear()")
+    chromium.complaints()
+
+
+def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> None:
+    bag_dir = scratch / "live"
+    begin = time.time_ns() - 60 * NS_PER_S
+    drive(bag_dir, "one", begin, 20)
+    chromium.looks(width=1200, height=900)
+    with serving(bag_dir, scratch / "log_live", "storage=mcap", "recorder=none") as server:
+        show(chromium, server)
+        chromium.awaits("return state.view.catalogue === null")
+        assert chromium.run("return state.view.robot.x") == 20
+        chromium.run("window.mine = 1")
+        drive(bag_dir, "two", begin + 20 * NS_PER_S, 10, x=20.0)
+        chromium.awaits("return state.view.robot.x === 30")
+        assert chromium.run("return window.mine") == 1
+        path = chromium.run("return state.view.path")
+        assert path["t"] == sorted(path["t"])
+        assert path["x"][0] == 0
+        assert path["x"][-1] == 30
+        assert path["begins"] == [0]
+
+
+def drive(bag_dir: Path, name: str, begin: int, seconds: int, x: float = 0.0) -> None:
+    """A bag of a robot that drives 1 m/s, in place at once as a closed one."""
+    at_s = [n / 10 for n in range(seconds * 10 + 1)]
+    messages = [odom(begin + int(s * NS_PER_S), x + s, 0.0, vx=1.0) for s in at_s]
+    write_mcap(bag_dir / name / f"{name}_0.mcap", messages)
+
+
+def painted(page: Browser, canvas: str) -> int:
+    """How many pixels of a canvas are not empty."""
+    return int(
+        page.run(
+            "const canvas = document.querySelector(arguments[0]);"
+            "const { data } = canvas.getContext('2d')"
+            ".getImageData(0, 0, canvas.width, canvas.height);"
+            "return data.filter((each, n) => n % 4 === 3 && each > 0).length;",
+            canvas,
+        )
+    )
 
 
 def choose(page: Browser, tool: str) -> None:
+    page.run("document.getElementById('ask-part').open = true")
+    page.awaits("return document.getElementById('tool').options.length > 0")
     page.run(
         "const tool = document.getElementById('tool'); tool.value = arguments[0];"
         "tool.dispatchEvent(new Event('change'));",

@@ -39,6 +39,7 @@ class Listening(Dispatcher):
         client: Hashable = None,
         *,
         for_resource: bool = False,
+        for_page: bool = False,
     ) -> Reply:
         self.asked.append(client)
         return Reply("{}")

@@ -25,6 +25,7 @@ CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
 CHROMEDRIVER: Final = shutil.which("chromedriver")
 TAB: Final = "\ue004"
 ENTER: Final = "\ue007"
+RIGHT: Final = "\ue014"
 
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None or CHROMEDRIVER is None,
@@ -68,9 +69,39 @@ class Browser:
     def text(self, selector: str) -> str:
         return str(self.run("return document.querySelector(arguments[0]).innerText", selector))
 
-    def awaits(self, script: str) -> None:
+    def awaits(self, script: str, *arguments: object) -> None:
         """Until it returns something that is true."""
-        until(lambda: self.run(script) or None)
+        until(lambda: self.run(script, *arguments) or None)
+
+    def point(self, selector: str, x: float, y: float) -> None:
+        """Moves the mouse to a place (px) of an element."""
+        self._mouse(self._move(selector, x, y))
+
+    def press(self, selector: str, x: float = 5, y: float = 5) -> None:
+        """Clicks at a place of an element."""
+        self.drag(selector, (x, y), (x, y))
+
+    def drag(self, selector: str, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Presses the mouse at a place of an element, moves it to another, and lets it go."""
+        begin, stop = self._move(selector, *start), self._move(selector, *end)
+        middle = {**stop, "x": (begin["x"] + stop["x"]) // 2, "y": (begin["y"] + stop["y"]) // 2}
+        down, up = ({"type": f"pointer{kind}", "button": 0} for kind in ("Down", "Up"))
+        moves = [] if begin == stop else [middle, stop]
+        self._mouse(begin, down, *moves, up)
+
+    def _move(self, selector: str, x: float, y: float) -> dict[str, Any]:
+        box = self.run(
+            "const shown = document.querySelector(arguments[0]);"
+            "shown.scrollIntoView({ block: 'center' });"
+            "const box = shown.getBoundingClientRect(); return [box.left, box.top];",
+            selector,
+        )
+        at = {"x": round(box[0] + x), "y": round(box[1] + y)}
+        return {"type": "pointerMove", "duration": 0, "origin": "viewport", **at}
+
+    def _mouse(self, *actions: dict[str, Any]) -> None:
+        kind = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}}
+        self._ask("POST", "/actions", {"actions": [{**kind, "actions": [*actions]}]})
 
     def keys(self, typed: str) -> None:
         """Types on the keyboard, wherever the focus is."""

@@ -77,6 +77,7 @@ class TestDefaults:
                 "max_reply_chars": 24000,
                 "tools": "all",
                 "write_tools": False,
+                "keep_questions": 0,
                 "metrics": False,
                 "traces": False,
             },

@@ -157,6 +157,11 @@ class Deadline:
         """Returns a deadline that never expires."""
         return cls(math.inf, math.inf)
 
+    def within(self, budget_s: float) -> Deadline:
+        """Returns a deadline `budget_s` seconds from now, or this one if that is earlier."""
+        at_s = min(self.at_s, self._monotonic() + budget_s)
+        return Deadline(at_s, min(self.budget_s, budget_s), self._monotonic)
+
     def expired(self) -> bool:
         """Returns whether the time is up."""
         return self._monotonic() >= self.at_s

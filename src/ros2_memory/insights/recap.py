@@ -118,11 +118,14 @@ def recap(
     where: JsonValue = None,
     frame_id: str | None = None,
     min_score: float | None = None,
+    most_events: int = MOST_EVENTS,
+    with_changes: bool = True,
 ) -> Recap:
     """Returns what happened in a window; with `where` only while the robot was in that region.
 
     Places are in the map where transforms lead there at their time, or in `frame_id`. Things in
-    view count where their best score is `min_score` or more, or where they have none.
+    view count where their best score is `min_score` or more, or where they have none. Of more than
+    `most_events` the most important are returned, `with_changes` with what changed before them.
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
@@ -139,7 +142,9 @@ def recap(
     there = None if region is None else _There(times_in_region(view, region, window), elapsed)
     found = found_events(view, window)
     least = memory.limits.min_score if min_score is None else min_score
-    reported, things, throughout = _topic_events(view, window, found, there, least)
+    reported, things, throughout = _topic_events(
+        view, window, found, there, min_score=least, most=most_events
+    )
     events = [*_stops(drive, places), *_drops(drive), *reported]
     events += [
         Event("gap", begin, until, "nothing was recorded")
@@ -154,8 +159,9 @@ def recap(
     counts = Counter(each.kind for each in events)
     if things:
         counts["thing"] = things
-    shown = _most_important(view, events, counts)
-    shown = _with_changes(changes_in(view, window, found), shown)
+    shown = _most_important(view, events, counts, most_events)
+    if with_changes:
+        shown = _with_changes(changes_in(view, window, found), shown)
     if places is not None:
         shown = [_in_place(each, places) for each in shown]
     shown = [
@@ -279,11 +285,13 @@ def _topic_events(
     window: TimeWindow,
     found_of: Mapping[str, TopicEvents | None],
     there: _There | None,
+    *,
     min_score: float,
+    most: int,
 ) -> tuple[list[Event], int, set[str]]:
     """Returns events that messages report, the number of things seen, and those seen throughout.
 
-    Of things that came or went, only the `MOST_EVENTS` that were seen longest are among the events.
+    Of things that came or went, only the `most` that were seen longest are among the events.
     """
     start, end = window.asked()
     newest = view.snapshot.latest
@@ -321,7 +329,7 @@ def _topic_events(
             goes_on=each.last == last_seen.get(each.label),
             score=each.best,
         )
-        for each in things.longest(MOST_EVENTS)
+        for each in things.longest(most)
     ]
     return events, things.size, throughout
 
@@ -329,12 +337,14 @@ def _topic_events(
 def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:
     for (start, end, box), goes_on in drive.standstills:
         (x, y, _), frame = box.centre, ""
+        point: tuple[float, float] | None = (x, y)
         if places is not None and places.frame_id != places.pose_frame:
             point = places.at((start + end) // 2)
             x, y = point or (x, y)
             frame = "" if point else f" in {places.pose_frame}"
         # z: a rounded -0.00 reads as 0.00.
-        yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}{frame}", goes_on)
+        text = f"stood at x {x:z.2f}, y {y:z.2f}{frame}"
+        yield Event("stop", start, end, text, goes_on, point=point)
 
 
 def _drops(drive: Drive) -> Iterator[Event]:
@@ -431,8 +441,10 @@ def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event
     ]
 
 
-def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -> list[Event]:
-    """Returns at most `MOST_EVENTS`, in order of time: of a kind those that lasted longest.
+def _most_important(
+    view: View, events: Sequence[Event], counts: Counter[str], most: int
+) -> list[Event]:
+    """Returns at most `most`, in order of time: of a kind those that lasted longest.
 
     `counts` has how many there are of each kind, also of those that are not among `events`.
     """
@@ -443,7 +455,7 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
             0 if each.end is None else each.start - each.end,
         ),
     )
-    shown = ranked[:MOST_EVENTS]
+    shown = ranked[:most]
     left_out = counts - Counter(each.kind for each in shown)
     if left_out:
         named = ", ".join(

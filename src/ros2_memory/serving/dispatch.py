@@ -31,14 +31,18 @@ from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import FairQueue
+from ros2_memory.serving.question_log import QuestionLog
+from ros2_memory.tools.replies import Reply
+from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Mapping, Sequence
+    from collections.abc import Callable, Hashable, Mapping, Sequence
 
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.history.context import Memory
     from ros2_memory.tools.declaration import Question, Tool
-    from ros2_memory.tools.replies import Replies, Reply
+    from ros2_memory.tools.replies import Replies
+    from ros2_memory.tools.reply_size import JsonObject
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2
@@ -61,9 +65,10 @@ class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
     `readable`: tools that only the resources use. `log_arguments`: whether log events show what a
-    caller wrote, cut short.
+    caller wrote, cut short. `most_questions`: how many calls are kept for the page.
 
     Attributes:
+        questions: the latest calls with their replies.
         tools: the tools that a call can name, in the order of their declaration.
         quick: the queue of the other tools.
         blocking: the queue of the tools that are declared as blocking.
@@ -79,8 +84,10 @@ class Dispatcher:
         readable: Sequence[Tool] = (),
         telemetry: Telemetry = SILENT,
         log_arguments: bool = True,
+        most_questions: int = 0,
     ) -> None:
         self.tools = (*tools,)
+        self.questions = QuestionLog(most_questions)
         self._memory = memory
         self._tools = {tool.name: tool for tool in tools}
         self._readable = self._tools | {each.name: each for each in readable}
@@ -105,18 +112,19 @@ class Dispatcher:
         client: Hashable = None,
         *,
         for_resource: bool = False,
+        for_page: bool = False,
     ) -> Reply:
         """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
         Where more calls wait than there are threads, `client`s take turns. `for_resource`: whether
-        the tools that only the resources use can be named, too.
+        the tools that only the resources use can be named, too. `for_page`: whether the page asks,
+        which does not keep its own questions.
         """
         tools = self._readable if for_resource else self._tools
         begun = time.perf_counter_ns()
-        query_timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
         over = threading.Event()
-        call = Call(Deadline.after(query_timeout_s, partial(self._monotonic, over)))
-        outcome, chars = "cancelled", 0
+        call = self._call(over)
+        outcome, text = "cancelled", ""
         correlation_id = uuid.uuid4().hex[:12]
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
             try:
@@ -125,19 +133,50 @@ class Dispatcher:
                 except Exception:
                     log.exception("tool_failed")
                     outcome, reply = self._internal()
-                chars = len(reply.text)
+                text = reply.text
             finally:
                 over.set()
                 done = Answered(
                     name if name in tools else UNKNOWN_TOOL,
                     outcome,
                     unix_from_ns(time.perf_counter_ns() - begun),
-                    chars,
+                    len(text),
                     correlation_id,
                     call.stages.as_ms(),
                 )
                 self._report(done, name, given)
+                if not for_page:
+                    self.questions.add(name, given, done, text)
         return reply
+
+    async def look(
+        self, work: Callable[[Memory, Call], JsonObject], client: Hashable = None
+    ) -> Reply:
+        """Returns what `work` returns as JSON, or its error; within the time of a call.
+
+        For the page: it waits in the queue of the calls that may take long, and is no tool call of
+        the log and the metrics. Raises nothing but cancellation.
+        """
+        over = threading.Event()
+        call, wait = self._call(over), _Wait()
+
+        def made() -> tuple[str, Reply]:
+            return self._asked(lambda: Reply(to_json_text(work(self._memory, call))), wait)
+
+        with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
+            try:
+                with anyio.move_on_after(self._call_timeout_s):
+                    return (await self.blocking.run(("page", client), made))[1]
+                return self._replies.error(self._timeout("the page", wait))
+            except EpisodicError as error:
+                return self._replies.error(error)
+            finally:
+                over.set()
+
+    def _call(self, over: threading.Event) -> Call:
+        """Returns a call whose query ends a little before the time of a call does."""
+        timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
+        return Call(Deadline.after(timeout_s, partial(self._monotonic, over)))
 
     def _report(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
         """Logs a call that is over, and passes it to the observers."""
@@ -198,10 +237,18 @@ class Dispatcher:
 
     def _ask(self, question: Question, call: Call, wait: _Wait) -> tuple[str, Reply]:
         """Runs the query and renders its answer, in a worker thread."""
+
+        def answer() -> Reply:
+            found = question(self._memory, call)
+            return self._replies.answer(found, from_active=call.used_active)
+
+        return self._asked(answer, wait)
+
+    def _asked(self, answer: Callable[[], Reply], wait: _Wait) -> tuple[str, Reply]:
+        """Returns the outcome and the reply, in a worker thread; errors as replies."""
         wait.end()
         try:
-            answer = question(self._memory, call)
-            return "ok", self._replies.answer(answer, from_active=call.used_active)
+            return "ok", answer()
         except NoDataError as error:
             return f"{error.code}: {error.reason}", self._replies.error(error)
         except QueryTimeoutError as error:

@@ -173,7 +173,9 @@ class EpisodicServer(MCPServer[object]):
                 context.request_context.meta or {}
             ):
                 tasks.start_soon(self._report_progress, context.report_progress)
-            reply = await self.dispatcher.answer(name, arguments, _client(context))
+            reply = await self.dispatcher.answer(
+                name, arguments, _client(context), for_page=_is_page(context)
+            )
             tasks.cancel_scope.cancel()
         return CallToolResult(
             content=[TextContent(type="text", text=reply.text)], is_error=reply.is_error
@@ -309,6 +311,12 @@ def _client(context: object) -> Hashable:
     address = request.client.host if request.client else ""
     name = request.headers.get("mcp-session-id") or request.headers.get("user-agent", "")
     return address, name[:_LONGEST_NAME]
+
+
+def _is_page(context: object) -> bool:
+    """Returns whether the server's own page asks: only browsers name the site of a request."""
+    request = context.request_context.request if isinstance(context, Context) else None
+    return isinstance(request, Request) and request.headers.get("sec-fetch-site") == "same-origin"
 
 
 def _listed(tool: Tool) -> ListedTool:

@@ -20,7 +20,6 @@ from starlette.routing import Route
 from ros2_memory.serving.auth import (
     AUTHENTICATED,
     HEALTH_PATH,
-    LOOPBACK_NAMES,
     RECORDING_PATH,
     ForgeryGuard,
     TokenGate,
@@ -29,7 +28,7 @@ from ros2_memory.serving.page import Page
 from ros2_memory.serving.request_limits import RequestLimits
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 
     from mcp.server.mcpserver import MCPServer
     from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
@@ -79,6 +78,7 @@ def web_app(
     background: Background,
     api_token: str | None = None,
     metrics: Callable[[], Awaitable[Exposition]] | None = None,
+    page: Sequence[Route] = (),
 ) -> WebApp:
     """Returns the application that listens on `host`.
 
@@ -88,8 +88,9 @@ def web_app(
         health: returns what `/health` shows.
         background: runs from start to end of the application, and is cancelled then.
         api_token: demanded of every request, if there is one. Requests without it see only the
-            status of `/health`, and on the loopback address the page, which asks for it.
+            status of `/health`, and the page, which holds no data and asks for it.
         metrics: returns what `/metrics` shows; without it there is no such path.
+        page: where the page reads what it shows.
     """
     # `ForgeryGuard` checks all routes instead, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
@@ -123,6 +124,7 @@ def web_app(
         Route(_MCP_PATH, McpEndpoint(plain.handle_request, streaming.handle_request)),
         Route(HEALTH_PATH, show_health, methods=["GET"]),
         Route(RECORDING_PATH, show_recording, methods=["GET"]),
+        *page,
     ]
     if metrics is not None:
 
@@ -132,15 +134,10 @@ def web_app(
 
         routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
     app: ASGIApp = RequestLimits(SessionIds(Starlette(routes=routes, lifespan=lifespan)))
-    if host.lower() not in LOOPBACK_NAMES:
-        app = Page(app)
     if api_token is not None:
         app = TokenGate(app, api_token)
-    if host.lower() in LOOPBACK_NAMES:
-        # The page comes before the token: it holds no data, and asks for the token. Where other
-        # machines can reach the server, the token comes first.
-        app = Page(app)
-    return WebApp(ForgeryGuard(app, host, admits=api_token is None))
+    # The page comes before the token: it holds no data, and asks for the token.
+    return WebApp(ForgeryGuard(Page(app), host, admits=api_token is None))
 
 
 def _session_manager(

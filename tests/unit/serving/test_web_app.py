@@ -17,6 +17,7 @@ from ros2_memory.history.context import Memory
 from ros2_memory.serving.auth import ForgeryGuard
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.serving.web_app import GRACE_S, WebApp, web_app
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies
@@ -51,7 +52,14 @@ def app(
         known = {} if recorder is None else {"recorder": recorder}
         return {"status": "ok", "bags": 3, **known}
 
-    return web_app(server, host=host, health=health, background=background, api_token=api_token)
+    return web_app(
+        server,
+        host=host,
+        health=health,
+        background=background,
+        api_token=api_token,
+        page=page_routes(dispatcher),
+    )
 
 
 @asynccontextmanager

@@ -1,17 +1,16 @@
-"""The page at `/`: the memory at a glance, for a browser on this machine.
+"""The page at `/`: the memory to be looked at, for a browser.
 
-The page has no data of its own and reads it through `/mcp`, so a browser without the token sees an
-empty page. Recorded text may be hostile: the page shows it as text alone. Should that ever fail,
-its Content-Security-Policy allows no script, style or destination but its own.
+The page itself holds no data and is served to everybody who can reach the server; it reads from
+`/page/span`, `/page/moment` and `/mcp`, which demand the token where there is one. Recorded text
+may be hostile: the page shows it as text alone. Should that ever fail, its Content-Security-Policy
+allows no script, style or destination but this server's own, and no inline script at all.
 """
 
 from __future__ import annotations
 
-import base64
 import hashlib
-import re
 from importlib import resources
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from starlette.responses import Response
 
@@ -19,57 +18,71 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 PAGE_PATH: Final = "/"
+SCRIPTS: Final = (
+    "vendor/uPlot.iife.min.js",
+    "text.js",
+    "server.js",
+    "map.js",
+    "timeline.js",
+    "signals.js",
+    "panels.js",
+    "ask.js",
+    "main.js",
+)
+"""The parts of `/page/page.js`, in order: one file, so that a first look is four requests."""
+STYLES: Final = ("vendor/uPlot.min.css", "page.css")
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
+    "require-trusted-types-for 'script'; trusted-types 'none'"
+)
+"""It loads its own script and style by their address, connects only to its own origin, is not
+framed, and makes no markup or code of text."""
 
-_INLINE: Final = re.compile(rb"<(script|style)>(.*?)</\1>", re.DOTALL)
 _METHODS: Final = frozenset({"GET", "HEAD"})
 
 
+class _File(NamedTuple):
+    body: bytes
+    media_type: str
+    etag: str
+
+
+def _file(names: tuple[str, ...], media_type: str) -> _File:
+    folder = resources.files(__name__)
+    body = b"\n".join(folder.joinpath(name).read_bytes() for name in names)
+    return _File(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+
+
 class Page:
-    """Answers `GET /` with the page, and passes everything else on."""
+    """Answers GET of the page's three files, and passes everything else on."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._html = resources.files(__name__).joinpath("index.html").read_bytes()
-        self._headers = {
-            "content-security-policy": policy(self._html),
-            "x-content-type-options": "nosniff",
-            "referrer-policy": "no-referrer",
-            "cross-origin-resource-policy": "same-origin",
-            "cache-control": "no-cache",
+        self._files = {
+            PAGE_PATH: _file(("index.html",), "text/html"),
+            "/page/page.js": _file(SCRIPTS, "text/javascript"),
+            "/page/page.css": _file(STYLES, "text/css"),
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles an ASGI connection."""
-        is_page = scope["type"] == "http" and scope["path"] == PAGE_PATH
-        if not is_page or scope["method"] not in _METHODS:
+        file = self._files.get(scope["path"]) if scope["type"] == "http" else None
+        if file is None or scope["method"] not in _METHODS:
             await self._app(scope, receive, send)
             return
+        headers = {
+            "content-security-policy": POLICY,
+            "x-content-type-options": "nosniff",
+            "referrer-policy": "no-referrer",
+            "cross-origin-resource-policy": "same-origin",
+            "cache-control": "no-cache",
+            "etag": file.etag,
+        }
+        known = dict(scope["headers"]).get(b"if-none-match", b"")
+        if known.decode("latin-1") == file.etag:
+            await Response(status_code=304, headers=headers)(scope, receive, send)
+            return
         # Uvicorn leaves the body out of the response to HEAD.
-        response = Response(self._html, media_type="text/html", headers=self._headers)
+        response = Response(file.body, media_type=file.media_type, headers=headers)
         await response(scope, receive, send)
-
-
-def policy(html: bytes) -> str:
-    """Returns the Content-Security-Policy of a page that loads nothing.
-
-    Its inline scripts and styles are allowed by their hash (CSP level 3, section 2.3.1). It may
-    load no other, connect only to its own origin, and not be framed.
-    """
-    hashes: dict[bytes, list[str]] = {b"script": [], b"style": []}
-    for kind, body in _INLINE.findall(html):
-        digest = base64.b64encode(hashlib.sha256(body).digest()).decode("ascii")
-        hashes[kind].append(f"'sha256-{digest}'")
-    return "; ".join(
-        (
-            "default-src 'none'",
-            f"script-src {' '.join(hashes[b'script'])}",
-            f"style-src {' '.join(hashes[b'style'])}",
-            "connect-src 'self'",
-            "img-src data:",
-            "base-uri 'none'",
-            "form-action 'none'",
-            "frame-ancestors 'none'",
-            "require-trusted-types-for 'script'",
-            "trusted-types 'none'",
-        )
-    )

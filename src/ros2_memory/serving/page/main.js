@@ -1,0 +1,373 @@
+/* What is shown, where it comes from, and what follows what: the only state of the page. */
+
+const POLL_MS = 2000;
+const FILLING_MS = 4000;
+const REST_MS = 200;
+const OVERLAP_S = 60;  // of the newest events, some go on
+const STATUS_MS = 60000;
+const MOST_DUTY = 100;  // things are looked up in at most a hundredth of the time
+
+const state = {
+  view: null,
+  last: 3600,  // seconds of a live page; null for a chosen span
+  span: null,
+  t: null,  // the chosen time; null for now
+  hovered: null,
+};
+let asking = null;  // cancels the running look
+let isLooking = false;
+let thingsAt = 0;
+let statusAt = 0;
+let lookedAt = 0;
+let lookLater = 0;
+let restLater = 0;
+let turn = 0;  // of questions about a moment
+
+const map = new RobotMap(at("map"), { time: pointed, thing: (each) => chooseThing(each),
+  stretch: chooseStretch });
+const line = new Timeline(at("timeline"), { span: spanned, time: pointed, stretch: chooseStretch });
+const plots = new Plots(at("plots"), { time: pointed, changed: () => remember() });
+
+/* The address has what is shown: #last=3600, or #from=...&to=..., with &at=... and &plot=... */
+function remember() {
+  const given = new URLSearchParams();
+  if (state.last !== null) given.set("last", state.last);
+  else {
+    given.set("from", state.span.start.toFixed(3));
+    given.set("to", state.span.end.toFixed(3));
+  }
+  if (state.t !== null) given.set("at", state.t.toFixed(3));
+  for (const each of plots.names) given.append("plot", each);
+  const hash = `#${given}`;
+  if (location.hash !== hash) history.replaceState(null, "", hash);
+}
+function readAddress() {
+  const given = new URLSearchParams(location.hash.slice(1));
+  const number = (name) => (given.has(name) && Number.isFinite(Number(given.get(name)))
+    ? Number(given.get(name)) : null);
+  const [from, to] = [number("from"), number("to")];
+  if (given.get("last") === "all") state.last = "all";
+  else state.last = number("last") || 3600;
+  if (from !== null && to !== null && from < to) {
+    state.last = null;
+    state.span = { start: from, end: to };
+  }
+  state.t = number("at");
+  plots.use(given.getAll("plot"));
+}
+
+function query() {
+  const given = new URLSearchParams();
+  if (state.last === null) {
+    given.set("start", state.span.start.toFixed(3));
+    given.set("end", state.span.end.toFixed(3));
+  } else given.set("last", state.last === "all" ? 1e10 : state.last);
+  for (const each of plots.names) given.append("signal", each);
+  return given;
+}
+
+/* Looks anew at the whole span, or only for what is newer than what is shown. */
+async function look(isMore = false, isPatient = false) {
+  if (asking) asking.abort();
+  const mine = asking = new AbortController();
+  const given = query();
+  const view = state.view;
+  if (isPatient) given.set("patient", "1");
+  if (isMore) {
+    const isOld = Date.now() - statusAt > STATUS_MS;
+    given.set("version", isOld ? "" : view.version);
+    if (!isOld) given.set("status", "0");
+    given.set("since", Math.max(Math.min(view.end, view.range.latest) - OVERLAP_S, view.start));
+    if (Date.now() - thingsAt < MOST_DUTY * (view.things_ms || 0)) given.set("things", "0");
+  }
+  isLooking = true;
+  at("summary").setAttribute("aria-busy", "true");
+  try {
+    const reply = await asked("/page/span", given, mine.signal);
+    if (mine !== asking) return;
+    at("locked").hidden = true;
+    at("trouble").hidden = true;
+    if (reply.unchanged) {
+      view.range.now = reply.now;
+      showSummary();
+      return;
+    }
+    lookedAt = Date.now();
+    if (reply.things) thingsAt = lookedAt;
+    if (reply.status) statusAt = lookedAt;
+    state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
+    show(reply, isMore);
+    // What takes long comes later: the rest can be looked at until then.
+    const isPart = reply.range && reply.range.earliest !== null && !(reply.events && reply.path !== undefined);
+    if (isPart && !isPatient && !reply.catalogue) setTimeout(() => look(false, true), 50);
+  } catch (error) {
+    if (mine !== asking || error.name === "AbortError") return;
+    if (error instanceof Locked) lock(error);
+    else {
+      at("trouble").textContent = plain(error.message);
+      at("trouble").hidden = false;
+    }
+  } finally {
+    if (mine === asking) {
+      isLooking = false;
+      at("summary").setAttribute("aria-busy", "false");
+    }
+  }
+}
+function whole(reply) {
+  return { path: null, robot: null, places: [], moments: [], ...reply, things: reply.things || [],
+    events: reply.events || [], isWhole: Boolean(reply.events && reply.path !== undefined) };
+}
+/* What is shown, with an answer about what came since. */
+function continued(view, reply) {
+  const next = { ...view, ...reply, things: reply.things || view.things };
+  next.range = reply.range || { ...view.range, now: reply.now, latest: reply.latest };
+  const since = reply.since;
+  const older = view.path ? lastBefore(view.path.t, since - 0.001) + 1 : 0;
+  const path = reply.path || null;
+  next.path = path || view.path;
+  if (path && view.path && path.frame === view.path.frame) {
+    const first = view.path.t.findIndex((each) => each >= reply.start);
+    const from = first < 0 ? older : Math.min(first, older);
+    const column = (name) => [...view.path[name].slice(from, older), ...path[name]];
+    const isNew = older === from || !path.continues;
+    next.path = { ...path, t: column("t"), x: column("x"), y: column("y"), yaw: column("yaw"),
+      begins: [...new Set([0, ...view.path.begins.filter((each) => each > from && each < older)
+        .map((each) => each - from),
+      ...path.begins.slice(isNew ? 0 : 1).map((each) => each + older - from)])] };
+  }
+  const kept = view.events.filter((each) => each.t < since
+    && (each.end === undefined ? each.t : each.end) >= reply.start);
+  const more = (reply.events || []).filter((each) => {
+    const begun = each.t <= since + 0.5 && kept.find((one) => one.kind === each.kind
+      && (one.kind === "stop" || one.text === each.text)
+      && (one.end === undefined || one.end >= since - 0.5));
+    if (begun && each.end !== undefined) begun.end = Math.max(begun.end || 0, each.end);
+    return !begun;
+  });
+  next.events = [...kept, ...more];
+  // Totals of the newest minute are not those of the span.
+  for (const key of ["distance_m", "counts", "max_speed", "stood_s"]) next[key] = view[key];
+  return next;
+}
+
+function lock(error) {
+  at("locked").hidden = false;
+  at("memory").hidden = true;
+  at("summary").textContent = "";
+  at("locked-why").textContent = token ? plain(error.message) : "";
+  at("token").focus();
+}
+
+function show(reply, isMore) {
+  const view = state.view;
+  const { range, status } = view;
+  latest = range.latest;
+  showState(at("state"), status, range);
+  showSummary();
+  showFilling(view.catalogue);
+  at("questions-part").hidden = !view.questions;
+  if (view.questions) showQuestions(at("questions"), view.questions);
+  at("memory").hidden = range.earliest === null;
+  if (range.earliest === null) return;
+  state.span = state.last === null ? state.span : { start: view.start, end: view.end };
+  map.show(view);
+  line.show(view, state.span);
+  plots.move(state.span);
+  plots.show(reply.signals || [], isMore);
+  showThings(at("things"), view, chooseThing);
+  showEvents(at("events"), view, chooseStretch);
+  showKey();
+  showSpan();
+  showControls();
+  if (state.t === null && !line.stretch && !map.chosen) showNow(at("moment"), view, chooseThing);
+  else if (!isMore && state.t !== null) pointed(state.t, true);
+  place(state.hovered === null ? state.t : state.hovered);
+  remember();
+}
+function showSummary() {
+  const { range, status } = state.view;
+  const sound = status.trust === "nothing is known to be missing";
+  const halted = status.latest !== null && status.now === status.latest;
+  const newest = range.latest === null ? "nothing is recorded"
+    : halted ? `recorded until ${clock(range.latest)}` : `newest data ${ago(range.now - range.latest)}`;
+  const parts = [recorderOf(status), newest, sound ? "nothing is known to be missing" : "see State"];
+  at("summary").textContent = plain(parts.filter(Boolean).join(" \u00b7 "));
+}
+function showFilling(catalogue) {
+  at("filling").hidden = !catalogue;
+  if (!catalogue) return;
+  const done = Math.floor(100 * (catalogue.closed - catalogue.waiting) / (catalogue.closed || 1));
+  at("filled").value = done;
+  at("filled-text").textContent = `The catalogue is being filled: ${done} % of `
+    + `${counted(catalogue.closed, "bag")}. Until then answers take longer.`;
+}
+function showKey() {
+  const view = state.view;
+  const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
+  const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
+  at("map-key").replaceChildren(one("path", view.distance_m === null || view.distance_m === undefined
+    ? "path" : `path, ${far(view.distance_m)}`), one("now", "robot now"),
+  one("robot", "at the time pointed at"), one("stood", `stops, ${map.stops.length}`),
+  one("seen", `things, ${map.things.length}${more}`),
+  ...((view.places || []).length ? [one("place", "places")] : []),
+  ...(view.path ? [el("span", {}, "frame ", bdi(view.path.frame))] : []),
+  ...(view.path && !view.path.whole ? [el("span", { class: "warn" }, "older path is being read")] : []));
+}
+function showSpan() {
+  const { start, end } = state.span;
+  const to = day(start) === day(end) ? timeOfDay(end) : clock(end);
+  at("span-text").textContent = `${clock(start)} to ${to} (${lasting(end - start)})`;
+}
+function showControls() {
+  at("live").setAttribute("aria-pressed", String(state.last !== null));
+  const length = at("length");
+  const value = state.last === null ? "other" : String(state.last);
+  const known = [...length.options].some((each) => each.value === value);
+  length.value = known ? value : "other";
+}
+
+/* Puts the robot, the marker of the timeline and those of the plots to a time. */
+function place(t) {
+  map.place(t);
+  line.mark(t);
+  plots.mark(t);
+}
+/* A time is pointed at, or chosen; null: no longer. */
+function pointed(t, isChosen) {
+  if (!state.view) return;
+  if (isChosen) {
+    state.t = t;
+    state.hovered = null;
+    line.choose(null);
+    map.choose(null);
+    remember();
+  } else state.hovered = t;
+  const shown = t === null ? state.t : t;
+  place(shown);
+  clearTimeout(restLater);
+  turn++;
+  if (!isChosen && (line.stretch || map.chosen)) return;
+  if (shown === null) {
+    head("Now", "");
+    showNow(at("moment"), state.view, chooseThing);
+    return;
+  }
+  head("At this time", clock(shown), state.t !== null);
+  restLater = setTimeout(() => ask({ t: shown.toFixed(3) },
+    (answer) => showMoment(at("moment"), answer, map.at(shown), (label) => chooseLabel(label))),
+  isChosen ? 0 : REST_MS);
+}
+function head(title, text, isChosen = false) {
+  at("moment-title").textContent = plain(title);
+  at("moment-time").textContent = plain(text);
+  at("back").hidden = !isChosen;
+}
+async function ask(given, then) {
+  const mine = ++turn;
+  at("moment").setAttribute("aria-busy", "true");
+  try {
+    const answer = await asked("/page/moment", given);
+    if (mine === turn) then(answer);
+  } catch (error) {
+    if (error instanceof Locked) lock(error);
+    else if (mine === turn) at("moment").replaceChildren(soft(error.message));
+  } finally {
+    if (mine === turn) at("moment").setAttribute("aria-busy", "false");
+  }
+}
+function chooseThing(thing) {
+  map.choose(thing);
+  line.choose(null);
+  sightings(thing.label);
+}
+function chooseLabel(label) {
+  const thing = state.view.things.find((each) => each.label === label);
+  if (thing) map.choose(thing);
+  sightings(label);
+}
+function sightings(label) {
+  const { start, end } = state.span;
+  head(label, `seen from ${clock(start)} to ${clock(end)}`, true);
+  ask({ label, start: start.toFixed(3), end: end.toFixed(3) },
+    (answer) => showSightings(at("moment"), answer, (t) => pointed(t, true)));
+}
+/* An event or a chosen stretch; one of no length is a time. */
+function chooseStretch(event) {
+  if (event.end === undefined || event.end <= event.t) { pointed(event.t, true); return; }
+  clearTimeout(restLater);
+  state.t = event.t;
+  map.choose(null);
+  place(event.t);
+  line.choose(event);
+  remember();
+  head(event.text, `${clock(event.t)}, for ${lasting(event.end - event.t)}`, true);
+  ask({ start: event.t.toFixed(3), end: event.end.toFixed(3) },
+    (answer) => showStretch(at("moment"), answer, chooseLabel, chooseStretch));
+}
+
+/* The timeline was dragged or zoomed. */
+function spanned(start, end, isDone) {
+  state.last = null;
+  state.span = { start, end };
+  plots.move(state.span);
+  showSpan();
+  showControls();
+  remember();
+  clearTimeout(lookLater);
+  lookLater = setTimeout(() => look(), isDone ? 60 : REST_MS);
+}
+
+at("unlock").addEventListener("submit", (event) => {
+  event.preventDefault();
+  keepToken(at("token").value.trim());
+  at("token").value = "";
+  look();
+});
+at("length").addEventListener("change", () => {
+  const chosenLength = at("length").value;
+  state.last = chosenLength === "all" ? "all" : Number(chosenLength);
+  look();
+});
+at("live").addEventListener("click", () => {
+  if (state.last === null) {
+    const length = Math.round(state.span.end - state.span.start);
+    state.last = Math.max(length, 1);
+  } else {
+    state.last = null;
+    remember();
+    showControls();
+  }
+  look();
+});
+at("back").addEventListener("click", () => pointed(null, true));
+at("map-in").addEventListener("click", () => map.zoom(1.4));
+at("map-out").addEventListener("click", () => map.zoom(1 / 1.4));
+at("map-fit").addEventListener("click", () => map.fit());
+at("earlier").addEventListener("click", () => line.pan(-0.5));
+at("later").addEventListener("click", () => line.pan(0.5));
+at("time-in").addEventListener("click", () => line.zoom(2));
+at("time-out").addEventListener("click", () => line.zoom(0.5));
+offerPlots((name) => {
+  plots.use([...plots.names, name]);
+  remember();
+  look();
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  map.draw();
+  line.draw();
+});
+window.addEventListener("hashchange", () => { readAddress(); look(); });
+document.addEventListener("visibilitychange", () => { if (!document.hidden && state.view) follow(); });
+
+/* Looks for what is new, as long as somebody looks at the page. */
+async function follow() {
+  if (document.hidden || isLooking || !state.view || !at("locked").hidden) return;
+  const { view } = state;
+  if (view.catalogue && Date.now() - lookedAt < FILLING_MS) return;
+  const isWhole = !view.catalogue && view.isWhole;
+  if (isWhole || Date.now() - lookedAt > FILLING_MS) await look(isWhole, !isWhole);
+}
+readAddress();
+look();
+setInterval(follow, POLL_MS);

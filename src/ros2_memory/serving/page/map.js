@@ -1,0 +1,357 @@
+/* The map: the path, things, standstills, places, the robot now and at the time pointed at. */
+
+const NEAR_PX = 14;
+const UNSEEN_S = 10;  // the robot may have moved since an older pose
+
+/* The number of the last time that is not after `t`; -1 before the first. */
+function lastBefore(times, t) {
+  let low = 0;
+  let high = times.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= t) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}
+
+/* Whether two boxes of text touch. */
+const meet = (one, other) => one.x < other.x + other.w + 3 && other.x < one.x + one.w + 3
+  && one.y < other.y + other.h && other.y < one.y + one.h;
+
+class RobotMap {
+  /* `told` has time(t, isChosen), thing(thing), stretch(event). */
+  constructor(canvas, told) {
+    this.canvas = canvas;
+    this.told = told;
+    this.draw = eachFrame(() => this.drawn());
+    this.view = null;
+    this.fits = true;
+    this.centre = { x: 0, y: 0 };
+    this.scale = 40;
+    this.moment = null;
+    this.chosen = null;
+    pointers(canvas, {
+      hover: (x, y, event) => this.hover(x, y, event),
+      leave: () => told.time(null, false),
+      click: (x, y) => this.click(x, y),
+      drag: (dx, dy) => this.pan(dx, dy),
+      drop: () => {},
+      zoom: (factor, x, y) => this.zoom(factor, x, y),
+    });
+    canvas.addEventListener("keydown", (event) => this.key(event));
+    new ResizeObserver(() => this.draw()).observe(canvas);
+  }
+
+  show(view) {
+    this.view = view;
+    this.begins = new Set(view.path ? view.path.begins : []);
+    const path = view.path;
+    this.things = view.things.filter((each) => path && each.frame === path.frame);
+    this.stops = view.events.filter((each) => each.kind === "stop" && each.x !== undefined);
+    const driven = path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame)}` : "no path";
+    this.canvas.setAttribute("aria-label", `Map: ${driven}, ${counted(this.stops.length, "stop")}, `
+      + `${counted(this.things.length, "thing")}. Arrow keys move it, plus and minus zoom.`);
+    this.draw();
+  }
+
+  /* Where the robot was at a time: between two poses, or at one shortly before. */
+  at(t) {
+    const path = this.view && this.view.path;
+    if (!path) return null;
+    const n = lastBefore(path.t, t);
+    if (n < 0) return null;
+    const here = { x: path.x[n], y: path.y[n], yaw: path.yaw[n] };
+    if (n + 1 === path.t.length || this.begins.has(n + 1)) {
+      return t - path.t[n] <= UNSEEN_S ? here : null;
+    }
+    const share = (t - path.t[n]) / (path.t[n + 1] - path.t[n] || 1);
+    const turned = path.yaw[n] === null || path.yaw[n + 1] === null ? null
+      : path.yaw[n] + (path.yaw[n + 1] - path.yaw[n]) * share;
+    return { x: here.x + (path.x[n + 1] - here.x) * share,
+      y: here.y + (path.y[n + 1] - here.y) * share, yaw: turned };
+  }
+
+  /* Puts the robot where it was at a time; null: where it is now. */
+  place(t) {
+    this.moment = t === null ? null : this.at(t);
+    this.draw();
+  }
+  choose(thing) {
+    this.chosen = thing;
+    this.draw();
+  }
+
+  pan(dx, dy) {
+    this.fits = false;
+    this.centre.x -= dx / this.scale;
+    this.centre.y += dy / this.scale;
+    this.draw();
+  }
+  zoom(factor, x = this.canvas.clientWidth / 2, y = this.canvas.clientHeight / 2) {
+    this.fits = false;
+    const before = this.world(x, y);
+    this.scale = clamp(this.scale * factor, 0.001, 5000);
+    const after = this.world(x, y);
+    this.centre.x += before.x - after.x;
+    this.centre.y += before.y - after.y;
+    this.draw();
+  }
+  fit() {
+    this.fits = true;
+    this.draw();
+  }
+  key(event) {
+    const by = 40;
+    const moves = { ArrowLeft: [by, 0], ArrowRight: [-by, 0], ArrowUp: [0, by], ArrowDown: [0, -by] };
+    if (moves[event.key]) this.pan(...moves[event.key]);
+    else if (event.key === "+" || event.key === "=") this.zoom(1.3);
+    else if (event.key === "-") this.zoom(1 / 1.3);
+    else if (event.key === "0") this.fit();
+    else return;
+    event.preventDefault();
+  }
+
+  world(px, py) {
+    return { x: this.centre.x + (px - this.canvas.clientWidth / 2) / this.scale,
+      y: this.centre.y - (py - this.canvas.clientHeight / 2) / this.scale };
+  }
+  px(x) { return this.canvas.clientWidth / 2 + (x - this.centre.x) * this.scale; }
+  py(y) { return this.canvas.clientHeight / 2 - (y - this.centre.y) * this.scale; }
+
+  near(points, x, y) {
+    let best = null;
+    let least = NEAR_PX;
+    for (const each of points) {
+      const away = Math.hypot(this.px(each.x) - x, this.py(each.y) - y);
+      if (away < least) { least = away; best = each; }
+    }
+    return best;
+  }
+  /* The time at which the path is nearest to a point of the canvas, if it is near. */
+  timeNear(x, y) {
+    const path = this.view && this.view.path;
+    if (!path) return null;
+    let best = null;
+    let least = NEAR_PX;
+    for (let n = 0; n < path.t.length; n++) {
+      const last = n + 1 === path.t.length || this.begins.has(n + 1);
+      const to = last ? n : n + 1;
+      const [ax, ay] = [this.px(path.x[n]), this.py(path.y[n])];
+      const [dx, dy] = [this.px(path.x[to]) - ax, this.py(path.y[to]) - ay];
+      const square = dx * dx + dy * dy;
+      const share = square ? clamp(((x - ax) * dx + (y - ay) * dy) / square, 0, 1) : 0;
+      const away = Math.hypot(ax + dx * share - x, ay + dy * share - y);
+      if (away <= least) { least = away; best = path.t[n] + (path.t[to] - path.t[n]) * share; }
+    }
+    return best;
+  }
+
+  hover(x, y, event) {
+    const thing = this.near(this.things || [], x, y);
+    if (thing) {
+      tip(`${thing.label}, seen ${counted(thing.times, "time")}, last ${clock(thing.last)}`, event);
+      return;
+    }
+    const stop = this.near(this.stops || [], x, y);
+    if (stop) {
+      const away = stop.end === undefined ? "" : ` for ${lasting(stop.end - stop.t)}`;
+      tip(`stood${away}${stop.in ? ` in ${stop.in}` : ""}, from ${clock(stop.t)}`, event);
+      this.told.time(stop.t, false);
+      return;
+    }
+    const t = this.timeNear(x, y);
+    tip(t === null ? "" : clock(t), event);
+    this.told.time(t, false);
+  }
+  click(x, y) {
+    const thing = this.near(this.things || [], x, y);
+    if (thing) { this.told.thing(thing); return; }
+    const stop = this.near(this.stops || [], x, y);
+    if (stop) { this.told.stretch(stop); return; }
+    const t = this.timeNear(x, y);
+    if (t !== null) this.told.time(t, true);
+  }
+
+  /* Shows all that is there, as large as it can be. */
+  fitted(width, height) {
+    const xs = [];
+    const ys = [];
+    const add = (x, y) => { xs.push(x); ys.push(y); };
+    const { path, places = [], robot } = this.view;
+    if (path) path.t.forEach((_, n) => add(path.x[n], path.y[n]));
+    for (const each of this.things) add(each.x, each.y);
+    if (robot && path && !xs.length) add(robot.x, robot.y);
+    for (const each of places) {
+      if (each.circle) {
+        const [x, y, r] = each.circle;
+        add(x - r, y - r);
+        add(x + r, y + r);
+      } else each.corners.forEach(([x, y]) => add(x, y));
+    }
+    if (!xs.length) return;
+    const low = { x: xs.reduce((a, b) => Math.min(a, b)), y: ys.reduce((a, b) => Math.min(a, b)) };
+    const high = { x: xs.reduce((a, b) => Math.max(a, b)), y: ys.reduce((a, b) => Math.max(a, b)) };
+    this.centre = { x: (low.x + high.x) / 2, y: (low.y + high.y) / 2 };
+    this.scale = Math.min((width - 70) / Math.max(high.x - low.x, 1),
+      (height - 60) / Math.max(high.y - low.y, 1));
+  }
+
+  drawn() {
+    const { context: c, width, height } = sharp(this.canvas);
+    if (!this.view || !width) return;
+    if (this.fits) this.fitted(width, height);
+    c.font = "12px system-ui, sans-serif";
+    c.lineJoin = "round";
+    this.drawGrid(c, width, height);
+    this.taken = [];
+    this.drawPlaces(c);
+    this.drawPath(c);
+    this.drawStops(c);
+    this.drawThings(c, width, height);
+    const { robot, path } = this.view;
+    if (robot && path) this.drawRobot(c, robot, colour("now"), this.moment === null);
+    if (this.moment) this.drawRobot(c, this.moment, colour("robot"), true);
+    if (!path || !path.t.length) {
+      c.fillStyle = colour("soft");
+      c.textAlign = "center";
+      c.fillText("No poses in this time.", width / 2, height / 2);
+      c.textAlign = "left";
+    }
+  }
+  drawGrid(c, width, height) {
+    const by = step(width / this.scale, 6);
+    const digits = Math.max(0, -Math.floor(Math.log10(by)));
+    const low = this.world(0, height);
+    const high = this.world(width, 0);
+    c.strokeStyle = colour("grid");
+    c.fillStyle = colour("soft");
+    c.lineWidth = 1;
+    c.beginPath();
+    for (let n = Math.ceil(low.x / by); n * by < high.x; n++) {
+      const x = Math.round(this.px(n * by)) + 0.5;
+      c.moveTo(x, 0);
+      c.lineTo(x, height);
+      if (x > 24 && x < width - 24) c.fillText(`${(n * by).toFixed(digits)}`, x + 3, height - 5);
+    }
+    for (let n = Math.ceil(low.y / by); n * by < high.y; n++) {
+      const y = Math.round(this.py(n * by)) + 0.5;
+      c.moveTo(0, y);
+      c.lineTo(width, y);
+      if (y > 16 && y < height - 22) c.fillText(`${(n * by).toFixed(digits)}`, 3, y - 4);
+    }
+    c.stroke();
+    c.textAlign = "right";
+    c.fillText("m", width - 6, height - 5);
+    c.textAlign = "left";
+  }
+  drawPlaces(c) {
+    c.lineWidth = 1;
+    const names = [];
+    for (const each of this.view.places || []) {
+      c.beginPath();
+      let top = [0, 0];
+      if (each.circle) {
+        const [x, y, r] = each.circle;
+        c.arc(this.px(x), this.py(y), Math.max(r * this.scale, 2), 0, 2 * Math.PI);
+        top = [x, y + r];
+      } else {
+        for (const [x, y] of each.corners) c.lineTo(this.px(x), this.py(y));
+        c.closePath();
+        top = [each.corners.reduce((sum, [x]) => sum + x, 0) / each.corners.length,
+          Math.max(...each.corners.map(([, y]) => y))];
+      }
+      c.fillStyle = colour("place");
+      c.fill();
+      c.strokeStyle = colour("place-line");
+      c.stroke();
+      const name = plain(each.name).slice(0, 24);
+      const wide = c.measureText(name).width;
+      const box = { x: this.px(top[0]) - wide / 2, y: this.py(top[1]) + 4, w: wide, h: 14 };
+      names.push([name, box]);
+    }
+    c.fillStyle = colour("soft");
+    for (const [name, box] of names) {
+      if (this.taken.some((one) => meet(one, box))) continue;
+      this.taken.push(box);
+      c.fillText(name, box.x, box.y + 11);
+    }
+  }
+  drawPath(c) {
+    const path = this.view.path;
+    if (!path) return;
+    c.strokeStyle = colour("path");
+    c.lineWidth = 2;
+    c.beginPath();
+    for (let n = 0; n < path.t.length; n++) {
+      const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
+      if (this.begins.has(n)) c.moveTo(x, y);
+      else c.lineTo(x, y);
+    }
+    c.stroke();
+  }
+  drawStops(c) {
+    c.fillStyle = colour("stood");
+    c.strokeStyle = colour("card");
+    c.lineWidth = 1.5;
+    for (const each of this.stops) {
+      const lasted = (each.end || each.t) - each.t;
+      c.beginPath();
+      c.arc(this.px(each.x), this.py(each.y), clamp(3 + Math.log10(lasted + 1) * 1.6, 4, 10), 0,
+        2 * Math.PI);
+      c.fill();
+      c.stroke();
+    }
+  }
+  /* The newest things have their names, as far as there is room. */
+  drawThings(c, width, height) {
+    for (const each of this.things) {
+      const [x, y] = [this.px(each.x), this.py(each.y)];
+      if (x < -20 || y < -20 || x > width + 20 || y > height + 20) continue;
+      const isChosen = this.chosen && this.chosen.label === each.label
+        && this.chosen.x === each.x && this.chosen.y === each.y;
+      c.fillStyle = colour("seen");
+      c.strokeStyle = colour(isChosen ? "ink" : "card");
+      c.lineWidth = isChosen ? 2.5 : 1.5;
+      c.beginPath();
+      c.moveTo(x, y - 6);
+      c.lineTo(x + 6, y);
+      c.lineTo(x, y + 6);
+      c.lineTo(x - 6, y);
+      c.closePath();
+      c.fill();
+      c.stroke();
+      const name = plain(each.label).slice(0, 24);
+      const wide = c.measureText(name).width;
+      const right = x + 9 + wide < width - 2;
+      const box = { x: right ? x + 9 : x - 9 - wide, y: y - 7, w: wide, h: 14 };
+      if (!isChosen && this.taken.some((one) => meet(one, box))) continue;
+      this.taken.push(box);
+      c.lineWidth = 3;
+      c.strokeStyle = colour("card");
+      c.strokeText(name, box.x, y + 4);
+      c.fillStyle = colour("ink");
+      c.fillText(name, box.x, y + 4);
+    }
+  }
+  drawRobot(c, robot, fill, isFilled) {
+    c.save();
+    c.translate(this.px(robot.x), this.py(robot.y));
+    c.beginPath();
+    if (robot.yaw === null || robot.yaw === undefined) c.arc(0, 0, 8, 0, 2 * Math.PI);
+    else {
+      c.rotate(-robot.yaw * Math.PI / 180);
+      c.moveTo(14, 0);
+      c.lineTo(-9, 9);
+      c.lineTo(-5, 0);
+      c.lineTo(-9, -9);
+      c.closePath();
+    }
+    c.lineWidth = 2;
+    c.fillStyle = isFilled ? fill : colour("card");
+    c.strokeStyle = isFilled ? colour("card") : fill;
+    c.fill();
+    c.stroke();
+    c.restore();
+  }
+}

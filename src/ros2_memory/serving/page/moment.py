@@ -1,0 +1,152 @@
+"""What the page shows of a moment, of a stretch of time, and of a label that was seen in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.view import TimeRange, open_span
+from ros2_memory.insights.changes_before import before
+from ros2_memory.insights.recap import found_events, recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.serving.page.span import event_shown
+from ros2_memory.tools.reply_json import planar_pose, render, rounded
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.results import Recap
+    from ros2_memory.tools.reply_size import JsonObject
+
+AROUND_S: Final = 1.0
+"""How long before and after a moment counts as seen at it: a detector reports once a second."""
+MOST_SEEN: Final = 60
+MOST_SIGHTINGS: Final = 30
+_CHANGES_S: Final = 10.0
+_IN_VIEW: Final = " in view"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MomentRequest:
+    """Either a moment `t_s`, or a stretch from `start_s` to `end_s`; Unix seconds.
+
+    `label`: only its sightings in the stretch are asked for.
+    """
+
+    t_s: float | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    label: str = ""
+
+
+def moment_shown(memory: Memory, call: Call, request: MomentRequest) -> JsonObject:
+    """Returns where the robot was at a moment, what it saw and what had changed; or of a stretch.
+
+    Raises:
+        InvalidArgumentsError: neither a moment nor a stretch was given.
+        NoDataError: the memory holds nothing.
+        QueryTimeoutError: the call's time is over.
+    """
+    start_s, end_s = request.start_s, request.end_s
+    if request.t_s is not None:
+        return _moment(memory, call, request.t_s)
+    if start_s is None or end_s is None:
+        raise InvalidArgumentsError("give t, or start and end, in Unix seconds")
+    if request.label:
+        return _sightings(memory, call, request.label, start_s, end_s)
+    return _stretch(memory, call, start_s, end_s)
+
+
+def _moment(memory: Memory, call: Call, at_s: float) -> JsonObject:
+    found = before(memory, call, at_s, _CHANGES_S, None)
+    around = recap(
+        memory,
+        call,
+        TimeRange(at_s - AROUND_S, at_s + AROUND_S),
+        most_events=MOST_SEEN,
+        with_changes=False,
+    )
+    changes = [*found.changes, *found.after]
+    return {
+        "t": at_s,
+        "robot": None if found.robot is None else planar_pose(found.robot),
+        "frame": None if found.robot is None else found.robot.frame_id,
+        "speed": None if found.speed_mps is None else rounded(found.speed_mps, 2),
+        "state": dict(found.state),
+        "changes": [
+            {"text": each.text, "before_s": round(unix_from_ns(each.before), 1)} for each in changes
+        ],
+        "seen": _seen(around),
+        "notes": [*dict.fromkeys([*found.notes, *around.notes])],
+    }
+
+
+def _stretch(memory: Memory, call: Call, start_s: float, end_s: float) -> JsonObject:
+    found = recap(
+        memory, call, TimeRange(start_s, end_s), most_events=MOST_SEEN, with_changes=False
+    )
+    others = [event_shown(each) for each in found.events if each.kind != "thing"]
+    return {
+        "start": start_s,
+        "end": end_s,
+        "distance_m": None if found.distance_m is None else rounded(found.distance_m, 1),
+        "stood_s": None if found.stood is None else round(unix_from_ns(found.stood), 1),
+        "seen": _seen(found),
+        "events": [*others],
+        "notes": [*found.notes],
+    }
+
+
+def _seen(found: Recap) -> list[JsonValue]:
+    """Returns what was in view, each label once: first what was all the time."""
+    rows: dict[str, JsonObject] = {each: {"label": each} for each in found.throughout}
+    for event in found.events:
+        label = event.text.removesuffix(_IN_VIEW)
+        if event.kind == "thing" and label not in rows:
+            rows[label] = {**event_shown(event), "label": label}
+    return [*rows.values()]
+
+
+def _sightings(memory: Memory, call: Call, label: str, start_s: float, end_s: float) -> JsonObject:
+    """Returns the newest sightings of a label, over all detectors."""
+    view, window = open_span(memory, call, TimeRange(start_s, end_s))
+    detectors = [
+        topic
+        for topic, found in found_events(view, window).items()
+        if found is not None and found.visible.size
+    ]
+    rows: list[JsonObject] = []
+    notes: list[str] = []
+    total: int | None = 0
+    for topic in detectors:
+        found = find_matches(
+            memory,
+            call,
+            topic,
+            "contains",
+            label,
+            start_s=start_s,
+            end_s=end_s,
+            limit=MOST_SIGHTINGS,
+        )
+        reply = render(found)
+        if isinstance(reply, dict) and isinstance(reply["sightings"], list):
+            rows += [each for each in reply["sightings"] if isinstance(each, dict)]
+        total = None if total is None or found.total is None else total + found.total
+        notes += found.notes
+    rows.sort(key=_last_seen, reverse=True)
+    return {
+        "label": label,
+        "start": start_s,
+        "end": end_s,
+        "sightings": [*rows[:MOST_SIGHTINGS]],
+        "total": total,
+        "notes": [*dict.fromkeys(notes)],
+    }
+
+
+def _last_seen(sighting: JsonObject) -> float:
+    last = sighting.get("last_seen")
+    return last if isinstance(last, float) else 0.0

@@ -1,0 +1,175 @@
+/* The lists beside the map and below it: a moment, a stretch, things, events, state, questions. */
+
+const ZONE = Intl.DateTimeFormat().resolvedOptions().timeZone;
+const ONE = { gaps: "gap", "clock steps": "clock step", silences: "silence", errors: "error",
+  "failed goals": "failed goal", stops: "stop", flips: "flip", "speed drops": "speed drop",
+  goals: "goal", "sights of things": "sight of a thing" };
+const MISSED = "not_seen_where_expected";
+
+function robotRows(robot, extra = []) {
+  const rows = [];
+  if (robot) rows.push(entry("Robot", metres(robot)));
+  if (robot && robot.in) rows.push(entry("In", bdi(robot.in)));
+  const yaw = robot ? robot.yaw_deg ?? robot.yaw : null;
+  if (yaw !== null && yaw !== undefined) rows.push(entry("Heading", `${Math.round(yaw)}\u00b0`));
+  return [...rows, ...extra];
+}
+function notesOf(notes) {
+  const rows = (notes || []).map((each) => el("li", { class: "soft" }, each));
+  return rows.length ? [el("details", {}, el("summary", {}, counted(rows.length, "note")),
+    el("ul", {}, ...rows))] : [];
+}
+
+/* `seen`: what was in view; a click shows the sightings of a label. */
+function seenRows(seen, choose) {
+  return seen.map((each) => pair(link(each.label, () => choose(each.label)),
+    each.end - each.t >= 1 ? `for ${lasting(each.end - each.t)}` : ""));
+}
+
+function showMoment(host, answer, robot, choose) {
+  const extra = [];
+  for (const each of answer.seen) delete each.end;  // only what is around the moment was looked at
+  if (answer.speed !== null) extra.push(entry("Speed", `${answer.speed.toFixed(2)} m/s`));
+  for (const [name, value] of Object.entries(answer.state)) {
+    extra.push(entry(name, bdi(value === true ? "yes" : value === false ? "no" : value)));
+  }
+  const changes = answer.changes.map((each) => pair(bdi(each.text),
+    each.before_s < 0 ? `${lasting(each.before_s)} later` : `${lasting(each.before_s)} before`));
+  host.replaceChildren(el("dl", {}, ...robotRows(answer.robot || robot, extra)),
+    el("h3", {}, "It saw"), ...(answer.seen.length ? listing(seenRows(answer.seen, choose), 8)
+      : [soft("Nothing.")]),
+    ...(changes.length ? [el("h3", {}, "What changed around it"), ...listing(changes)] : []),
+    ...notesOf(answer.notes));
+}
+function showStretch(host, answer, choose, point) {
+  const rows = [entry("Length", lasting(answer.end - answer.start))];
+  if (answer.distance_m !== null) rows.push(entry("Driven", far(answer.distance_m)));
+  if (answer.stood_s !== null) rows.push(entry("Stood", lasting(answer.stood_s)));
+  host.replaceChildren(el("dl", {}, ...rows), el("h3", {}, "It saw"),
+    ...(answer.seen.length ? listing(seenRows(answer.seen, choose), 8) : [soft("Nothing.")]),
+    ...(answer.events.length ? [el("h3", {}, "What happened"),
+      ...listing(eventRows(answer.events, point))] : []),
+    ...notesOf(answer.notes));
+}
+function showSightings(host, answer, point) {
+  const rows = answer.sightings.map((each) => {
+    const where = each.place || each.robot;
+    const place = where ? `${each.place ? "" : "robot at "}${metres(where)}` : "";
+    return pair(link(clock(each.last_seen), () => point(each.last_seen)),
+      `${place}${each.in ? ` in ${each.in}` : ""}`);
+  });
+  const total = answer.total === null ? "more" : answer.total;
+  host.replaceChildren(
+    soft(answer.total === rows.length ? `${counted(rows.length, "sighting")}, newest first.`
+      : `The newest ${rows.length} of ${total} sightings.`),
+    ...listing(rows, 10), ...notesOf(answer.notes));
+}
+/* What is known of now without another question. */
+function showNow(host, view, choose) {
+  const { robot, path, range } = view;
+  const newest = view.things.filter((each) => range.latest - each.last <= 5);
+  const frame = path ? [entry("Frame", bdi(path.frame))] : [];
+  const seen = newest.map((each) => pair(link(each.label, () => choose(each)), metres(each)));
+  host.replaceChildren(
+    ...(robot ? [el("dl", {}, ...robotRows(robot, frame))] : [soft("Where the robot is, is not known.")]),
+    el("h3", {}, "In view"), ...(seen.length ? listing(seen, 8) : [soft("Nothing.")]));
+}
+
+function showThings(host, view, choose) {
+  const now = view.range.now;
+  const rows = view.things.map((each) => pair(
+    el("span", {}, link(each.label, () => choose(each)), each.in ? ` in ${plain(each.in)}` : "",
+      each.state === MISSED ? el("span", { class: "warn" }, " no longer there") : ""),
+    `${metres(each)} \u00b7 ${ago(now - each.last)}`));
+  host.replaceChildren(...(rows.length ? listing(rows, 8) : [soft("Nothing was seen in this time.")]));
+}
+function eventRows(events, point) {
+  return events.map((each) => pair(
+    link(each.in ? `${each.text} in ${each.in}` : each.text, () => point(each)),
+    `${clock(each.t)}${each.end > each.t ? `, ${lasting(each.end - each.t)}` : ""}`));
+}
+function showEvents(host, view, point) {
+  const shown = view.events.filter((each) => each.kind !== "thing").reverse();
+  const counts = Object.entries(view.counts || {})
+    .map(([kind, n]) => `${n} ${n === 1 ? ONE[kind] || kind : kind}`).join(", ");
+  host.replaceChildren(...(counts ? [soft(counts)] : []),
+    ...(shown.length ? listing(eventRows(shown, point), 8)
+      : [soft(view.isWhole ? "Nothing happened." : "Not known yet.")]),
+    ...notesOf(view.notes));
+}
+
+/* Topics of one kind, which may be many, in one line. */
+function together(title, kind, status) {
+  const topics = status[kind] || [];
+  if (!topics.length) return [];
+  const more = (status[kind + "_count"] || topics.length) - topics.length;
+  const names = topics.flatMap((each, n) => [n ? ", " : "", bdi(each)]);
+  return [el("p", { class: "warn" }, `! ${title}: `, ...names, more ? ` and ${more} more` : "")];
+}
+function faults(title, kind, range) {
+  const files = range[kind];
+  if (!files.length) return [];
+  const rows = files.map((each) => el("li", {}, bdi(each.file), ": ", bdi(each.reason)));
+  return [el("p", { class: "bad" }, `! ${title} (${range[kind + "_count"] || files.length})`),
+    ...listing(rows)];
+}
+const recorderOf = (status) => (status.recorder === null ? "" : status.recorder
+  + (status.recorder_alive ? "" : ", not alive")
+  + (status.restarts ? `, ${counted(status.restarts, "restart")}` : ""));
+
+function showState(host, status, range) {
+  const sound = status.trust === "nothing is known to be missing";
+  const own = status.budget.max_gb !== null;
+  const recorder = recorderOf(status)
+    || (own ? "not heard of" : "none belongs to this memory");
+  const halted = status.latest !== null && status.now === status.latest;
+  const failing = status.recorder !== null && status.recorder !== "stopped"
+    && !status.recorder_alive;
+  const budget = status.budget;
+  const list = el("dl", {},
+    entry("Recorder", el("span", { class: failing ? "bad" : "" }, recorder)),
+    entry("Recorded", range.earliest === null ? "nothing"
+      : `${lasting(range.latest - range.earliest)} in ${counted(range.bags, "bag")}`),
+    entry("Gaps", String(range.gaps.length)));
+  if (own) {
+    list.append(entry("Budget", `${budget.used_gb} of ${budget.max_gb} GB`,
+      el("meter", { min: 0, max: budget.max_gb, value: budget.used_gb, "aria-label": "Budget used" })));
+    if (budget.foreign_gb) list.append(entry("Foreign bags", `${budget.foreign_gb} GB`));
+    if (budget.growth_gb_per_day !== null) {
+      list.append(entry("Growth", `${budget.growth_gb_per_day} GB a day`));
+    }
+  } else list.append(entry("Size", `${budget.used_gb} GB`));
+  if (budget.full_in_days !== undefined) list.append(entry("Full in", `${budget.full_in_days} days`));
+  for (const each of status.rules || []) {
+    const last = each.last_ago_s === undefined ? "" : `, ${ago(each.last_ago_s)}`;
+    list.append(entry(`Rule ${each.rule}`, `fired ${counted(each.fired, "time")}${last}; `
+      + counted(each.moments, "moment") + (each.refused ? `, ${each.refused} refused` : "")));
+  }
+  const parts = [el("p", { class: sound ? "good" : "warn" },
+    (sound ? "\u2713 " : "! ") + status.trust), list];
+  for (const each of status.fell_silent) {
+    parts.push(el("p", { class: "warn" }, "! ", bdi(each.topic), ` fell silent ${ago(each.ago_s)}`));
+  }
+  for (const each of status.rules || []) {
+    const since = each.matches_since === undefined ? ""
+      : `it has matched without an end since ${clock(each.matches_since)}`;
+    const why = [each.problem, since].filter(Boolean).join("; ");
+    if (why) parts.push(el("p", { class: "warn" }, `! Rule ${each.rule}: ${why}`));
+  }
+  parts.push(...together("Never heard", "never_heard", status),
+    ...together("Offered by nobody", "missing", status),
+    ...faults("Damaged bags, not in the answers", "damaged", range),
+    ...faults("Incomplete bags", "incomplete", range), ...faults("Unread bags", "unread", range),
+    ...faults("Bags with a wrong clock", "clock_faults", range), ...notesOf(range.notes));
+  const since = halted ? "the newest recorded moment" : "the time of this look";
+  parts.push(soft(`\u201cAgo\u201d counts from ${since}, ${clock(status.now)}. Time zone: ${ZONE}.`));
+  host.replaceChildren(...parts);
+}
+
+function showQuestions(host, questions) {
+  const rows = questions.map((each) => el("li", {}, el("details", {},
+    el("summary", {}, `${timeOfDay(each.asked)} ${plain(each.tool)} ${plain(each.arguments)}: `
+      + `${each.outcome}, ${Math.round(each.ms)} ms`),
+    el("pre", {}, each.answer))));
+  host.replaceChildren(...(rows.length ? listing(rows, 8) : [soft("None yet.")]));
+}

@@ -1,0 +1,114 @@
+"""The two endpoints of the page: `/page/span` and `/page/moment`, each a GET that returns JSON.
+
+They answer from the same queries as the tools, in the queue of the tools that may take long.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from starlette.responses import Response
+from starlette.routing import Route
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.serving.page.moment import MomentRequest, moment_shown
+from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
+from ros2_memory.serving.page.span import LAST_S, SpanRequest, span_shown
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from starlette.datastructures import QueryParams
+    from starlette.requests import Request
+
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.serving.backfill import Progress
+    from ros2_memory.serving.dispatch import Dispatcher
+    from ros2_memory.tools.reply_size import JsonObject
+
+SPAN_PATH: Final = "/page/span"
+MOMENT_PATH: Final = "/page/moment"
+
+_HEADERS: Final = {
+    "cache-control": "no-store",
+    "x-content-type-options": "nosniff",
+    "cross-origin-resource-policy": "same-origin",
+}
+_LONGEST_LABEL: Final = 200
+
+
+def page_routes(
+    dispatcher: Dispatcher, progress: Callable[[], Progress] | None = None
+) -> list[Route]:
+    """Returns the routes of the page; `progress`: how far the catalogue is filled."""
+
+    def span(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
+        return span_shown(memory, call, span_request(given), progress, dispatcher.questions)
+
+    def moment(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
+        return moment_shown(memory, call, moment_request(given))
+
+    def route(path: str, work: Callable[[QueryParams, Memory, Call], JsonObject]) -> Route:
+        async def answer(request: Request) -> Response:
+            client = request.client.host if request.client else None
+            reply = await dispatcher.look(partial(work, request.query_params), client)
+            return Response(reply.text, media_type="application/json", headers=_HEADERS)
+
+        return Route(path, answer, methods=["GET"])
+
+    return [route(SPAN_PATH, span), route(MOMENT_PATH, moment)]
+
+
+def span_request(given: QueryParams) -> SpanRequest:
+    """Returns what a query string asks of `/page/span`.
+
+    Raises:
+        InvalidArgumentsError: a number is none, a signal is none, or they are too many.
+    """
+    signals = given.getlist("signal")
+    if len(signals) > MOST_SIGNALS:
+        raise InvalidArgumentsError(f"{len(signals)} signals; at most {MOST_SIGNALS} are plotted")
+    last_s = _number(given, "last")
+    return SpanRequest(
+        start_s=_number(given, "start"),
+        end_s=_number(given, "end"),
+        last_s=LAST_S if last_s is None else last_s,
+        since_s=_number(given, "since"),
+        version=given.get("version", ""),
+        things=given.get("things") != "0",
+        status=given.get("status") != "0",
+        patient=given.get("patient") == "1",
+        signals=tuple(map(Signal.parse, signals)),
+    )
+
+
+def moment_request(given: QueryParams) -> MomentRequest:
+    """Returns what a query string asks of `/page/moment`.
+
+    Raises:
+        InvalidArgumentsError: a number is none, or the label is too long.
+    """
+    label = given.get("label", "")
+    if len(label) > _LONGEST_LABEL:
+        raise InvalidArgumentsError(f"label is longer than {_LONGEST_LABEL} characters")
+    return MomentRequest(
+        t_s=_number(given, "t"),
+        start_s=_number(given, "start"),
+        end_s=_number(given, "end"),
+        label=label,
+    )
+
+
+def _number(given: QueryParams, name: str) -> float | None:
+    text = given.get(name)
+    if text is None:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InvalidArgumentsError(f"{name} must be a number of seconds, not {text[:40]!r}")
+    return number

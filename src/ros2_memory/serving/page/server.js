@@ -1,0 +1,39 @@
+/* What the page asks of the server: its own two addresses, and tools over /mcp. */
+
+const TOKEN = "ros2-memory.token";
+let token = sessionStorage.getItem(TOKEN) || "";
+
+class Locked extends Error {}
+
+async function fetched(path, given = {}) {
+  const headers = { ...given.headers };
+  if (token) headers.Authorization = "Bearer " + token;
+  const response = await fetch(path, { ...given, headers, cache: "no-store", credentials: "omit" });
+  if (response.status === 401) throw new Locked(await response.text());
+  if (!response.ok) throw new Error(`${response.status}: ${await response.text()}`);
+  return response.json();
+}
+
+/* Returns an answer of one of the page's own addresses; one that says why there is none is thrown. */
+async function asked(path, query, signal) {
+  const reply = await fetched(`${path}?${new URLSearchParams(query)}`, { signal });
+  if (reply.error) throw new Error(reply.detail || reply.error);
+  return reply;
+}
+
+async function rpc(method, params) {
+  const reply = await fetched("/mcp", { method: "POST",
+    headers: { "Content-Type": "application/json",
+      "Accept": "application/json, text/event-stream" },
+    body: JSON.stringify({ jsonrpc: "2.0", id: 1, method, params }) });
+  if (reply.error) throw new Error(reply.error.message);
+  return reply.result;
+}
+async function call(name, given = {}) {
+  const result = await rpc("tools/call", { name, arguments: given });
+  return JSON.parse(result.content[0].text);
+}
+function keepToken(given) {
+  token = given;
+  sessionStorage.setItem(TOKEN, given);
+}

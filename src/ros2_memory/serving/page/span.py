@@ -1,0 +1,422 @@
+"""The first look of the page: where the robot drove in a span, what it saw, and what happened.
+
+Gathered from the queries behind the tools, and bounded however long the span is. A live page asks
+only for what is new since its last look.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.motion.robot_track import RobotTrack
+from ros2_memory.core.errors import (
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import Circle, Polygon, Rectangle
+from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.history.view import TimeRange, View
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.saved_moments import list_moments
+from ros2_memory.insights.status import memory_status
+from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.queries import data_time_range
+from ros2_memory.serving.page.signals import Signal, signal_in
+from ros2_memory.things.find import find_things
+from ros2_memory.tools.reply_json import degrees, moment, render, rounded
+from ros2_memory.tools.reply_json_memory import time_range
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.regions import Place
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.results import DataTimeRange, Event, Thing
+    from ros2_memory.serving.backfill import Progress
+    from ros2_memory.serving.question_log import KeptQuestion, QuestionLog
+    from ros2_memory.tools.reply_size import JsonObject
+
+MOST_POINTS: Final = 2_000
+MOST_EVENTS: Final = 300
+MOST_THINGS: Final = 200
+MOST_GAPS: Final = 500
+LAST_S: Final = 3600.0
+MOST_QUESTIONS: Final = 30
+
+_EXTREMES: Final = 5  # of a bin: the first pose, and those farthest west, east, south and north
+_QUICK_S: Final = 0.8
+_PART_S: Final = 8.0
+"""How long each part of an answer may take; of a patient one the latter. The page shows what there
+is, and asks again for the rest."""
+_NEWEST_NS: Final[Ns] = 600 * NS_PER_S
+
+
+class Shown(NamedTuple):
+    """A part of an answer, and what could not be said of it."""
+
+    part: JsonObject
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpanRequest:
+    """What a page asks for.
+
+    Attributes:
+        start_s: Unix seconds of the begin of the span; with `end_s`, else the last `last_s`.
+        end_s: of its end.
+        last_s: seconds before the newest data.
+        since_s: only what is newer is returned of the path and the events.
+        version: of the answer that the page has; nothing is looked up where it is current.
+        things: whether things are looked up.
+        status: whether the state of the memory is; without it only how far it reaches.
+        patient: whether the answer may take long; else what takes long is left out.
+        signals: numbers to be plotted.
+    """
+
+    start_s: float | None = None
+    end_s: float | None = None
+    last_s: float = LAST_S
+    since_s: float | None = None
+    version: str = ""
+    things: bool = True
+    status: bool = True
+    patient: bool = False
+    signals: tuple[Signal, ...] = ()
+
+    def window(self, earliest: Ns, latest: Ns) -> TimeWindow:
+        """Returns the span over a memory that begins and ends so; at least a second long.
+
+        Raises:
+            InvalidArgumentsError: the bounds are no numbers, or reversed.
+        """
+        if self.start_s is not None and self.end_s is not None:
+            return TimeWindow.from_unix(self.start_s, self.end_s)
+        length = max(ns_from_unix(self.last_s), NS_PER_S)
+        return TimeWindow(max(latest - length, min(earliest, latest - NS_PER_S)), latest + 1)
+
+
+def span_shown(
+    memory: Memory,
+    call: Call,
+    request: SpanRequest,
+    progress: Callable[[], Progress] | None = None,
+    questions: QuestionLog | None = None,
+) -> JsonObject:
+    """Returns what the page shows of a span.
+
+    `progress`: how far the catalogue is filled; `questions`: the latest ones, if these are kept.
+
+    Raises:
+        InvalidArgumentsError: the span is none, or a signal is not recorded.
+        QueryTimeoutError: the call's time is over.
+    """
+    filling = None if progress is None else progress()
+    snapshot = memory.index.snapshot(_reach(memory))
+    version = _version(snapshot, filling, 0 if questions is None else questions.count)
+    if version == request.version:
+        return {"version": version, "unchanged": True, "now": moment(_now(memory, snapshot))}
+    earliest, latest = snapshot.dating.earliest, snapshot.dating.latest
+    shown: JsonObject = {
+        "version": version,
+        "now": moment(_now(memory, snapshot)),
+        "latest": moment(latest),
+        "catalogue": None
+        if filling is None or not filling.waiting
+        else {"closed": filling.closed, "waiting": filling.waiting},
+    }
+    if questions is not None and questions.is_on:
+        shown["questions"] = [_question(each) for each in questions.newest(MOST_QUESTIONS)]
+    if request.status:
+        ranged = data_time_range(memory, call)
+        shown["range"] = {**time_range(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
+        shown["status"] = render(memory_status(memory, call))
+    if earliest is None or latest is None:
+        return shown
+    window = request.window(earliest, latest)
+    fresh = window
+    if request.since_s is not None:
+        since = min(max(ns_from_unix(request.since_s), window.start), window.stop - 1)
+        fresh = TimeWindow(since, window.stop)
+    shown |= {"start": _s(window.start), "end": _s(window.stop - 1), "since": _s(fresh.start)}
+    notes: list[str] = []
+    parts: dict[str, Callable[[Call], Shown]] = {
+        "path": lambda call: _path(memory, call, fresh, latest),
+        "events": lambda call: _events(memory, call, fresh),
+        "things": lambda call: _things(memory, call, window),
+        "moments": lambda call: _moments(memory, call),
+    }
+    if not request.things:
+        del parts["things"]
+    budget_s = _PART_S if request.patient else _QUICK_S
+    for name, part in parts.items():
+        try:
+            found = part(replace(call, deadline=call.deadline.within(budget_s)))
+        except QueryTimeoutError as error:
+            found = Shown({}, (f"the {name} are not known yet: {error}",))
+        shown |= found.part
+        notes += found.notes
+    if request.signals:
+        shown["signals"] = [
+            signal_in(memory, call, each, fresh, window) for each in request.signals
+        ]
+    shown["notes"] = [*dict.fromkeys(notes)]
+    return shown
+
+
+def _reach(memory: Memory) -> Ns | None:
+    """Returns a time past the newest bag of a robot that is on, so that the folder is scanned."""
+    return memory.clock.now() if memory.limits.now == "wall" else None
+
+
+def _now(memory: Memory, snapshot: Snapshot) -> Ns:
+    return memory.now(memory.clock.now(), snapshot.latest)
+
+
+def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> str:
+    """Returns another text whenever there is more to be shown."""
+    counts = (
+        snapshot.latest or 0,
+        len(snapshot.bags),
+        len(snapshot.damaged),
+        len(snapshot.unread),
+        0 if filling is None else filling.waiting,
+        questions,
+    )
+    return "-".join(map(str, counts))
+
+
+def _question(kept: KeptQuestion) -> JsonObject:
+    return {
+        "asked": _s(kept.asked),
+        "tool": kept.tool,
+        "arguments": kept.arguments,
+        "outcome": kept.outcome,
+        "ms": round(kept.duration_s * 1000, 1),
+        "answer": kept.answer,
+    }
+
+
+def _s(at: Ns) -> float:
+    """Returns Unix seconds to the millisecond: a pixel of the page is more."""
+    return round(unix_from_ns(at), 3)
+
+
+def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
+    """Returns the longest gaps in order, as pairs of times."""
+    longest = sorted(ranged.gaps, key=lambda each: each.start - each.end)[:MOST_GAPS]
+    return [[_s(each.start), _s(each.end)] for each in sorted(longest, key=lambda each: each.start)]
+
+
+def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
+    """Returns the path in the map, or in the frame of odometry, and where the robot was last."""
+    view = View(memory, call, window.stop)
+    places = robot_places(view, window)
+    if places is None:
+        return Shown({"path": None, "robot": None}, ("no topic with poses is recorded",))
+    tracks = RobotTracks(view, places.map_frame)
+    found = tracks.over(window)
+    track = cut(found.track, window)
+    newest = track
+    if window.stop <= latest or not len(track.times):
+        newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
+    kept = thinned(track.x, track.y, track.times)
+    path: JsonObject = {
+        "frame": places.map_frame,
+        "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
+        "x": np.round(track.x[kept], 2).tolist(),
+        "y": np.round(track.y[kept], 2).tolist(),
+        "yaw": [degrees(each) for each in track.heading[kept].tolist()],
+        "begins": _begins(track, kept),
+        "continues": bool(len(kept)) and not bool(track.begins[0]),
+        "whole": found.since is None,
+    }
+    named = _places(memory, places.map_frame)
+    shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
+    notes = [*view.notes.sentences()]
+    if found.since is not None:
+        notes.append("the path is not complete yet: older bags are still being read")
+    return Shown(shown, tuple(notes))
+
+
+def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
+    """Returns a track in a window: where it goes on beyond an end, with a point at that end.
+
+    Such a first point does not begin a piece.
+    """
+    times = track.times
+    first, last = np.searchsorted(times, (window.start, window.stop)).tolist()
+    at: list[Ns] = times[first:last].tolist()
+    begins: list[bool] = track.begins[first:last].tolist()
+    if 0 < first < len(times) and not track.begins[first] and window.start < times[first]:
+        at, begins = [window.start, *at], [False, *begins]
+    if 0 < last < len(times) and not track.begins[last] and at[-1:] != [window.stop - 1]:
+        at, begins = [*at, window.stop - 1], [*begins, False]
+    moments = np.array(at, np.int64)
+    # From the first vertex, so that numbers are small enough for a double to be exact.
+    since = times[0] if len(times) else 0
+    x, y, heading = (
+        np.interp(moments - since, times - since, column) if len(at) else column[:0]
+        for column in (track.x, track.y, track.heading)
+    )
+    return RobotTrack(moments, x, y, heading, np.array(begins, np.bool_), track.error_m)
+
+
+def thinned(
+    x: NDArray[np.float64], y: NDArray[np.float64], times: NDArray[np.int64]
+) -> NDArray[np.intp]:
+    """Returns the indices of at most `MOST_POINTS` points of a path, in order.
+
+    Of each of many equal times the first point is kept and the farthest to each side: what is left
+    out lies between points that are drawn. The last one is kept, too.
+    """
+    count = len(times)
+    if count <= MOST_POINTS:
+        return np.arange(count)
+    bins = (MOST_POINTS - 1) // _EXTREMES
+    edges = np.linspace(times[0], times[-1] + 1, bins + 1)
+    starts = np.searchsorted(times, edges[:-1])
+    lengths = np.diff(np.append(starts, count))
+    starts = starts[lengths > 0]
+    part = np.repeat(np.arange(len(starts)), lengths[lengths > 0])
+    kept = [starts, np.array([count - 1])]
+    for values in (x, -x, y, -y):
+        order = np.lexsort((values, part))
+        kept.append(order[starts])
+    return np.unique(np.concatenate(kept))
+
+
+def _begins(track: RobotTrack, kept: NDArray[np.intp]) -> list[JsonValue]:
+    """Returns the numbers of the kept points before which the robot was not seen for a while."""
+    if not len(kept):
+        return []
+    pieces = np.cumsum(track.begins)[kept]
+    return [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist()]
+
+
+def _last(track: RobotTrack) -> JsonObject | None:
+    if not len(track.times):
+        return None
+    return {
+        "t": _s(int(track.times[-1])),
+        "x": rounded(float(track.x[-1]), 3),
+        "y": rounded(float(track.y[-1]), 3),
+        "yaw": degrees(float(track.heading[-1])),
+    }
+
+
+def _places(memory: Memory, frame_id: str) -> list[JsonValue]:
+    """Returns the named places of a frame, each as a circle or as corners."""
+    return [_place(each) for each in memory.limits.places if each.frame_id == frame_id]
+
+
+def _place(place: Place) -> JsonObject:
+    match place.region:
+        case Circle(x, y, radius_m):
+            return {"name": place.name, "circle": [x, y, radius_m]}
+        case Rectangle(min_x, max_x, min_y, max_y):
+            corners = [(min_x, min_y), (max_x, min_y), (max_x, max_y), (min_x, max_y)]
+        case Polygon(corners=given):
+            corners = [*given]
+    return {"name": place.name, "corners": [[x, y] for x, y in corners]}
+
+
+def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
+    span = TimeRange(_s(window.start), _s(window.stop - 1) + 0.001)
+    told = recap(memory, call, span, most_events=MOST_EVENTS, with_changes=False)
+    shown: JsonObject = {
+        "events": [event_shown(each) for each in told.events],
+        "throughout": [*told.throughout],
+        "distance_m": None if told.distance_m is None else rounded(told.distance_m, 1),
+        "max_speed": None if told.max_speed is None else rounded(told.max_speed, 2),
+        "stood_s": None if told.stood is None else round(unix_from_ns(told.stood), 1),
+        "counts": dict(told.counts),
+    }
+    return Shown(shown, told.notes)
+
+
+def event_shown(event: Event) -> JsonObject:
+    """Returns an event as the page takes it."""
+    shown: JsonObject = {"kind": event.kind, "t": _s(event.start), "text": event.text}
+    if event.end is not None:
+        shown["end"] = _s(event.end)
+    if event.goes_on:
+        shown["goes_on"] = True
+    if event.point is not None:
+        shown["x"], shown["y"] = (rounded(each, 2) for each in event.point)
+    if event.place is not None:
+        shown["in"] = event.place
+    return shown
+
+
+def _moments(memory: Memory, call: Call) -> Shown:
+    try:
+        stored = list_moments(memory, call).moments
+    except EpisodicError as error:
+        return Shown({"moments": []}, (str(error),))
+    requests = [each.moment.request for each in stored]
+    return Shown(
+        {
+            "moments": [
+                {"start": _s(each.start), "end": _s(each.end), "label": each.label}
+                for each in requests
+            ]
+        }
+    )
+
+
+def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
+    """Returns the things that were seen in a window, and how long it took to find them."""
+    begun = time.perf_counter()
+    try:
+        found = find_things(
+            memory,
+            call,
+            start_s=_s(window.start),
+            end_s=_s(window.stop),
+            limit=MOST_THINGS,
+        )
+    except (NoDataError, InvalidArgumentsError) as error:
+        return Shown({"things": []}, (str(error),))
+    took_ms = round((time.perf_counter() - begun) * 1000)
+    return Shown(
+        {
+            "things": [_thing(each) for each in found.things],
+            "things_total": found.total,
+            "things_ms": took_ms,
+        },
+        found.notes,
+    )
+
+
+def _thing(thing: Thing) -> JsonObject:
+    shown: JsonObject = {
+        "label": thing.label,
+        "x": rounded(thing.place[0], 2),
+        "y": rounded(thing.place[1], 2),
+        "frame": thing.frame_id,
+        "first": _s(thing.first),
+        "last": _s(thing.last),
+        "times": thing.count,
+    }
+    if thing.inside is not None:
+        shown["in"] = thing.inside
+    if thing.moves:
+        shown["moves"] = True
+    if thing.best is not None:
+        shown["score"] = rounded(thing.best, 2)
+    if thing.still_there is not None:
+        shown["state"] = thing.still_there.state
+    return shown

@@ -1,0 +1,323 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from starlette.datastructures import QueryParams
+
+from ros2_memory.analysis.motion.robot_track import RobotTrack, track_of
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.telemetry import Answered
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.serving.backfill import Progress
+from ros2_memory.serving.page import span
+from ros2_memory.serving.page.moment import moment_shown
+from ros2_memory.serving.page.routes import moment_request, span_request
+from ros2_memory.serving.page.span import MOST_POINTS, cut, span_shown, thinned
+from ros2_memory.serving.question_log import QuestionLog
+from ros2_memory.tools.reply_size import to_json_text
+from tests.support.bags import detections, odom, write_mcap
+from tests.support.memories import memory_of, recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.history.context import Memory
+
+S = NS_PER_S
+BEGIN = 1_784_000_000 * S
+BEGIN_S = 1_784_000_000
+
+
+@pytest.fixture(scope="module")
+def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three bags of 20 s: it drives 1 m/s for 10 s, stands for 10 s, and sees a cup then.
+
+    Between the second and the third nothing is recorded for 100 s.
+    """
+    folder = tmp_path_factory.mktemp("page")
+    for number, begins in enumerate((0, 20, 140)):
+        messages = []
+        for n in range(200):
+            at_s = n / 10
+            moves = min(at_s, 10.0)
+            x, at = number * 10 + moves, BEGIN + begins * S + n * S // 10
+            messages.append(odom(at, x, 0.0, vx=1.0 if at_s < 10 else 0.0))
+            if at_s >= 10 and n % 5 == 0:
+                messages.append(detections(at, ["cup"]))
+        write_mcap(folder / f"rec_{number}" / f"rec_{number}_0.mcap", messages)
+    return folder
+
+
+@pytest.fixture(params=["plain", "catalogue"])
+def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
+    found = memory_of(bag_dir)
+    return recalling(found, bag_dir) if request.param == "catalogue" else found
+
+
+def shown(memory: Memory, query: str = "", **more: Any) -> dict[str, Any]:
+    """What the page receives, as JSON makes it."""
+    asked = span_request(QueryParams(query))
+    reply: dict[str, Any] = json.loads(to_json_text(span_shown(memory, Call(), asked, **more)))
+    return reply
+
+
+def moment(memory: Memory, query: str) -> dict[str, Any]:
+    reply = moment_shown(memory, Call(), moment_request(QueryParams(query)))
+    found: dict[str, Any] = json.loads(to_json_text(reply))
+    return found
+
+
+def test_a_first_look_has_all_that_the_page_draws(memory: Memory) -> None:
+    found = shown(memory, "last=1000")
+    assert found["range"]["gaps"] == [[BEGIN_S + 39.9, BEGIN_S + 140]]
+    assert found["path"]["frame"] == "odom"
+    after_gap = [at >= BEGIN_S + 140 for at in found["path"]["t"]].index(True)
+    assert found["path"]["begins"] == [0, after_gap]
+    assert found["path"]["whole"]
+    assert found["robot"]["x"] == 30.0
+    stops = [each for each in found["events"] if each["kind"] == "stop"]
+    assert [(each["x"], each["y"]) for each in stops] == [(10.0, 0.0), (20.0, 0.0), (30.0, 0.0)]
+    assert {each["text"] for each in found["events"] if each["kind"] == "thing"} == {"cup in view"}
+    assert found["distance_m"] == 30.0
+    assert found["catalogue"] is None
+    assert "questions" not in found
+
+
+def test_a_span_has_its_own_part_of_the_path_up_to_its_ends(memory: Memory) -> None:
+    found = shown(memory, f"start={BEGIN_S + 2}&end={BEGIN_S + 7}")
+    assert found["path"]["x"][0] == pytest.approx(2.0, abs=0.06)
+    assert found["path"]["x"][-1] == pytest.approx(7.0, abs=0.06)
+    assert found["path"]["continues"]
+    assert (found["start"], found["end"]) == (BEGIN_S + 2, BEGIN_S + 7)
+    assert found["robot"]["x"] == 30.0
+
+
+def test_what_is_new_since_a_look_joins_what_was_shown(memory: Memory) -> None:
+    whole = shown(memory, "last=1000")
+    since = BEGIN_S + 25
+    more = shown(memory, f"last=1000&since={since}&things=0&status=0&version={whole['version']}x")
+    assert not {"things", "status", "range"} & set(more)
+    assert more["latest"] == whole["range"]["latest"]
+    assert more["since"] == since
+    assert more["path"]["t"][0] == since
+    assert more["path"]["continues"]
+    later = [each for each in whole["path"]["t"] if each > since]
+    assert more["path"]["t"][1:] == later
+
+
+def test_nothing_is_looked_up_where_nothing_is_new(memory: Memory) -> None:
+    version = shown(memory)["version"]
+    assert set(shown(memory, f"version={version}")) == {"version", "unchanged", "now"}
+
+
+def test_an_empty_memory_says_so(tmp_path: Path) -> None:
+    found = shown(memory_of(tmp_path))
+    assert found["range"]["earliest"] is None
+    assert "path" not in found
+
+
+def test_named_places_are_those_of_the_frame(bag_dir: Path) -> None:
+    plain = memory_of(bag_dir)
+    places = (
+        Place("dock", "odom", Circle(0.0, 0.0, 1.0)),
+        Place("hall", "odom", Rectangle(1.0, 3.0, -1.0, 1.0)),
+        Place("moon", "map", Circle(0.0, 0.0, 1.0)),
+    )
+    found = shown(replace(plain, limits=replace(plain.limits, places=places)))
+    assert found["places"] == [
+        {"name": "dock", "circle": [0.0, 0.0, 1.0]},
+        {"name": "hall", "corners": [[1.0, -1.0], [3.0, -1.0], [3.0, 1.0], [1.0, 1.0]]},
+    ]
+
+
+def test_where_a_part_takes_too_long_the_others_are_shown(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(*_: object, **__: object) -> None:
+        raise QueryTimeoutError("it takes too long")
+
+    monkeypatch.setattr(span, "recap", slow)
+    found = shown(memory, "last=1000", progress=lambda: Progress(closed=3, waiting=2, refused=0))
+    assert found["catalogue"] == {"closed": 3, "waiting": 2}
+    assert "events" not in found
+    assert "the events are not known yet: it takes too long" in found["notes"]
+    assert found["path"]["x"][-1] == 30.0
+
+
+def test_numbers_come_in_bins_with_their_bounds(memory: Memory) -> None:
+    signal = "/odom:twist.twist.linear.x"
+    [found] = shown(memory, f"last=1000&signal={signal}")["signals"]
+    assert (found["topic"], found["field"]) == ("/odom", "twist.twist.linear.x")
+    assert min(found["low"]) == 0
+    assert max(found["high"]) == 1
+    assert all(low <= mean <= high for low, mean, high in zip(*bounds(found), strict=True))
+    assert found["t"] == sorted(found["t"])
+    [close] = shown(memory, f"start={BEGIN_S}&end={BEGIN_S + 9}&signal={signal}")["signals"]
+    assert close["mean"] == [1.0] * len(close["t"])
+    assert len(close["t"]) >= 80
+
+
+def bounds(signal: dict[str, Any]) -> tuple[list[float], list[float], list[float]]:
+    return signal["low"], signal["mean"], signal["high"]
+
+
+@pytest.mark.parametrize("signal", ["/odom:no.such.field", "/nowhere:x"])
+def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
+    memory: Memory, signal: str
+) -> None:
+    found = shown(memory, f"last=1000&signal={signal}&signal=/odom:pose.pose.position.x")
+    wrong, right = found["signals"]
+    assert wrong["error"]
+    assert max(right["high"]) == pytest.approx(30.0)
+
+
+def test_a_moment_has_the_robot_and_what_it_saw(memory: Memory) -> None:
+    found = moment(memory, f"t={BEGIN_S + 15}")
+    assert found["robot"]["x"] == 10.0
+    assert [each["label"] for each in found["seen"]] == ["cup"]
+    assert moment(memory, f"t={BEGIN_S + 5}")["seen"] == []
+
+
+def test_a_stretch_has_what_was_seen_and_happened_in_it(memory: Memory) -> None:
+    found = moment(memory, f"start={BEGIN_S + 9}&end={BEGIN_S + 19}")
+    assert [each["label"] for each in found["seen"]] == ["cup"]
+    assert {each["kind"] for each in found["events"]} == {"stop"}
+    assert found["distance_m"] == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_label_has_its_sightings_newest_first(memory: Memory) -> None:
+    found = moment(memory, f"label=cup&start={BEGIN_S}&end={BEGIN_S + 200}")
+    times = [each["last_seen"] for each in found["sightings"]]
+    assert len(times) == found["total"] == 3
+    assert times == sorted(times, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("query", "why"),
+    [
+        ("start=a&end=2", "start must be a number of seconds"),
+        ("last=nan", "last must be a number of seconds"),
+        ("signal=odom", "/topic:field"),
+        ("&".join(f"signal=/t:{n}" for n in range(9)), "at most 4"),
+    ],
+)
+def test_a_span_that_cannot_be_asked_is_refused_with_the_reason(query: str, why: str) -> None:
+    with pytest.raises(InvalidArgumentsError, match=why):
+        span_request(QueryParams(query))
+
+
+def test_a_moment_without_a_time_is_refused(memory: Memory) -> None:
+    with pytest.raises(InvalidArgumentsError, match="give t, or start and end"):
+        moment(memory, "label=cup")
+    with pytest.raises(InvalidArgumentsError, match="longer than"):
+        moment_request(QueryParams({"label": "x" * 201}))
+
+
+paths = st.lists(
+    st.tuples(st.integers(1, 20), st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=60
+)
+
+
+def columns(steps: list[tuple[int, float, float]]) -> tuple[NDArray[np.int64], Any, Any]:
+    times = BEGIN + np.cumsum([each[0] for each in steps]) * S
+    return times, np.array([each[1] for each in steps]), np.array([each[2] for each in steps])
+
+
+@given(paths, st.integers(-5, 400), st.integers(1, 400))
+def test_a_track_that_is_cut_is_where_the_whole_one_is(
+    steps: list[tuple[int, float, float]], start: int, length: int
+) -> None:
+    times, x, y = columns(steps)
+    track = track_of(times, x, y, np.zeros(len(times)))
+    window = TimeWindow(BEGIN + start * S, BEGIN + (start + length) * S)
+    found = cut(track, window)
+    assert np.all((found.times >= window.start) & (found.times < window.stop))
+    assert np.all(np.diff(found.times) > 0)
+    inside = (track.times >= window.start) & (track.times < window.stop)
+    assert set(track.times[inside]) <= set(found.times.tolist())
+    for at, found_x in zip(found.times.tolist(), found.x.tolist(), strict=True):
+        seconds = (track.times - BEGIN) / S
+        assert found_x == pytest.approx(np.interp((at - BEGIN) / S, seconds, track.x), abs=1e-5)
+    # It goes up to an end of the window only where the robot was seen on both sides of that.
+    if len(found.times) and not found.begins[0]:
+        assert found.times[0] == window.start
+
+
+@given(st.integers(0, 5_000), st.integers(0, 2**32 - 1))
+def test_a_thinned_path_is_bounded_and_reaches_as_far_to_every_side(count: int, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    x, y = random.normal(size=(2, count)).cumsum(axis=1)
+    times = BEGIN + np.cumsum(random.integers(1, 10**9, count))
+    kept = thinned(x, y, times)
+    assert len(kept) <= MOST_POINTS
+    assert all(one < other for one, other in pairwise(kept.tolist()))
+    if count:
+        assert {0, count - 1} <= set(kept.tolist())
+        for column in (x, y):
+            assert column[kept].min() == column.min()
+            assert column[kept].max() == column.max()
+
+
+def test_where_a_thinned_path_begins_anew_is_kept() -> None:
+    count = 20_000
+    times = BEGIN + np.arange(count) * S
+    begins = np.zeros(count, np.bool_)
+    begins[[0, 7_001]] = True
+    level = np.zeros(count)
+    track = RobotTrack(times, level, level, level, begins, 0.0)
+    kept = thinned(level, level, times)
+    [first, second] = span._begins(track, kept)
+    assert first == 0
+    assert isinstance(second, int)
+    assert kept[second - 1] < 7_001 <= kept[second]
+
+
+def answered(tool: str) -> Answered:
+    return Answered(tool, "ok", 0.25, 2, "id")
+
+
+def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
+    log = QuestionLog(3, wall=lambda: BEGIN)
+    for number in range(5):
+        log.add(f"tool_{number}", {"n": number}, answered(f"tool_{number}"), "x" * 10_000)
+    kept = log.newest(2)
+    assert [each.tool for each in kept] == ["tool_4", "tool_3"]
+    assert kept[0].asked == BEGIN - S // 4
+    assert kept[0].arguments == '{"n": 4}'
+    assert len(kept[0].answer) <= 2_000
+    assert log.count == 5
+
+
+def test_without_the_setting_no_question_is_kept() -> None:
+    log = QuestionLog(0)
+    log.add("tool", {}, answered("tool"), "{}")
+    assert log.newest(9) == ()
+    assert not log.is_on
+
+
+def test_kept_questions_are_shown_and_make_an_answer_new(bag_dir: Path) -> None:
+    memory, log = memory_of(bag_dir), QuestionLog(3, wall=lambda: BEGIN)
+    before = shown(memory, questions=log)
+    assert before["questions"] == []
+    log.add("recap", {"last_s": 60}, answered("recap"), '{"events": []}')
+    [kept] = shown(memory, f"version={before['version']}", questions=log)["questions"]
+    assert kept == {
+        "asked": BEGIN_S - 0.25,
+        "tool": "recap",
+        "arguments": '{"last_s": 60}',
+        "outcome": "ok",
+        "ms": 250.0,
+        "answer": '{"events": []}',
+    }
