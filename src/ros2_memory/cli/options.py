@@ -201,8 +201,14 @@ def require_recorder(settings: Settings) -> None:
     """Checks that this deployment records: only then may a command have bags deleted.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: it does not, or it looks at one recording alone: then it would not know what
+            others hold of what is deleted.
     """
+    if settings.data.recording is not None:
+        raise ConfigError(
+            f"data.recording={settings.data.recording}: what deletes looks at all recordings; give "
+            "data.recording=null, and --start and --end for a part of them"
+        )
     if isinstance(settings.recorder, NullRecorderNode):
         raise ConfigError(
             "recorder=none: bags that another program records are not deleted here; choose the "

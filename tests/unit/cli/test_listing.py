@@ -219,6 +219,12 @@ class TestRecordings:
         with closing(sqlite3.connect(catalogue)) as base:  # less the bag that had some of it
             assert base.execute("SELECT count(*) FROM bags").fetchone() == (1,)
 
+    def test_what_deletes_looks_at_all_of_them(self, folder: Path, capsys: Capture) -> None:
+        words = ["forget", "--last", "9000", "--yes", "deployment=robot", "data.recording=a"]
+        assert cli.main([*words, f"recording.bag_dir={folder}"]) == 2
+        assert "data.recording=null" in capsys.readouterr().err
+        assert (folder / "a" / "a_0.mcap").exists()
+
 
 class TestCat:
     def test_lines_for_people_have_a_time_that_can_be_pasted_back(
