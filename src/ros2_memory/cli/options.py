@@ -74,7 +74,7 @@ Overrides = Annotated[
 Words = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="[PATH] [key=value]...",
+        metavar="PATH|key=value",
         help="A bag or a folder of bags to look at, instead of recording.bag_dir; and settings, as "
         "for ros2-memory-server.",
     ),
@@ -156,7 +156,7 @@ def load_to_look(
 
 def _path_and_settings(words: Sequence[str]) -> tuple[Path | None, list[str]]:
     """Returns the one word that is a path, and the others."""
-    paths = [each for each in words if "=" not in each or Path(each).exists()]
+    paths = [each for each in words if _is_path(each)]
     if len(paths) > 1:
         raise InvalidArgumentsError(f"one file or folder at a time: {' and '.join(paths)}")
     if paths and not Path(paths[0]).exists():
@@ -165,6 +165,17 @@ def _path_and_settings(words: Sequence[str]) -> tuple[Path | None, list[str]]:
             "write a setting as key=value"
         )
     return (Path(paths[0]) if paths else None), [each for each in words if each not in paths]
+
+
+def _is_path(word: str) -> bool:
+    """Returns whether a word is a path: no setting has a slash in its name."""
+    key, equals, _ = word.partition("=")
+    if not equals or "/" in key:
+        return True
+    try:
+        return Path(word).exists()
+    except OSError:  # a long setting
+        return False
 
 
 def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:

@@ -60,8 +60,9 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
             lists[key] = rows
         elif key == "notes" and isinstance(each, list):
             for note in each:
-                local = _TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), str(note))
-                lines.add_row("note", Text(escape(local)))
+                lines.add_row("note", Text(_with_local_times(str(note))))
+        elif key == "detail" and isinstance(each, str):  # why there is no answer
+            lines.add_row(key, Text(_with_local_times(each)))
         else:
             lines.add_row(Text(escape(key)), Text(_format_line(key, each, now)))
     if lines.row_count:
@@ -69,6 +70,10 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
     for key, rows in lists.items():
         console.print(Text(f"\n{escape(key)}", style="bold"))
         _print_rows(console, rows)
+
+
+def _with_local_times(sentence: str) -> str:
+    return escape(_TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), sentence))
 
 
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:

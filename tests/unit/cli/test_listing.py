@@ -83,6 +83,7 @@ class TestPaths:
         ("name", "words"),
         [
             ("gone", "no such file or folder"),
+            ("gone=5", "no such file or folder"),
             ("notes.txt", "is no bag"),
             ("a b", "one file or fol"),
         ],

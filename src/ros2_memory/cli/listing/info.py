@@ -71,6 +71,9 @@ def topics(
         print_reply(stdout_console(), reply)
     else:
         print_line(f"nothing is recorded in {settings.recording.bag_dir}")
+        snapshot = memory.index.snapshot()
+        for each in (*snapshot.damaged, *snapshot.unread):
+            print_line(f"  {each.path.name}: {each.reason}")
     if not rows:
         raise typer.Exit(EXIT_NEGATIVE)
 
