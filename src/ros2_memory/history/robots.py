@@ -58,6 +58,13 @@ _MAKERS: Final[WeakKeyDictionary[Timeline, list[tuple[str, Sequence[BagFile]]]]]
 """Caches, for a timeline, the recordings of which frames are compared."""
 
 
+_RECENT_NS: Final[Ns] = 60 * NS_PER_S
+_DESCRIBED: Final[WeakKeyDictionary[SnapshotSource, tuple[Ns | None, tuple[str, ...]]]] = (
+    WeakKeyDictionary()
+)
+"""Caches when it was last looked whether robots are mixed, and what was found."""
+
+
 class Mixed(NamedTuple):
     """Two recordings that overlap in time, and a topic on which each has messages of its own.
 
@@ -137,8 +144,20 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     return tuple(found.values())
 
 
-def describe_mixed(memory: Memory, call: Call) -> Iterator[str]:
-    """Yields sentences where robots are plainly mixed into one history."""
+def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
+    """Returns sentences where robots are plainly mixed into one history, a minute old at most.
+
+    With a week of bags it takes 0.1 s to look anew, and the page asks every few seconds.
+    """
+    now = memory.clock.now()
+    at, known = _DESCRIBED.get(memory.index, (None, ()))
+    if at is None or abs(now - at) > _RECENT_NS:
+        known = tuple(_described(memory, call))
+        _DESCRIBED[memory.index] = (now, known)
+    return known
+
+
+def _described(memory: Memory, call: Call) -> Iterator[str]:
     mixed = [each for each in mixed_recordings(memory, call) if each.topic is not None]
     if mixed:
         names = sorted({name for each in mixed for name in each.pair.names})
