@@ -24,7 +24,7 @@ from ros2_memory.cli.options import (
     parse_window,
     print_line,
 )
-from ros2_memory.cli.output import progress_bar
+from ros2_memory.cli.output import progress_bar, with_local_times
 from ros2_memory.core.errors import (
     BagError,
     ConfigError,
@@ -113,7 +113,7 @@ def export(
     else:
         print_line(str(done))
     for note in view.notes.sentences():
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {with_local_times(note)}", err=True)
     if not view.notes.complete or lost_in(view.snapshot, window):
         raise typer.Exit(EXIT_NEGATIVE)
 

@@ -60,9 +60,9 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
             lists[key] = rows
         elif key == "notes" and isinstance(each, list):
             for note in each:
-                lines.add_row("note", Text(_with_local_times(str(note))))
+                lines.add_row("note", Text(with_local_times(str(note))))
         elif key == "detail" and isinstance(each, str):  # why there is no answer
-            lines.add_row(key, Text(_with_local_times(each)))
+            lines.add_row(key, Text(with_local_times(each)))
         else:
             lines.add_row(Text(escape(key)), Text(_format_line(key, each, now)))
     if lines.row_count:
@@ -72,7 +72,8 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
         _print_rows(console, rows)
 
 
-def _with_local_times(sentence: str) -> str:
+def with_local_times(sentence: str) -> str:
+    """Returns a sentence for a terminal, with times in this machine's zone."""
     return escape(_TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), sentence))
 
 

@@ -24,7 +24,7 @@ from ros2_memory.cli.options import (
     open_memory,
     parse_window,
 )
-from ros2_memory.cli.output import format_time, format_value
+from ros2_memory.cli.output import format_time, format_value, with_local_times
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed
@@ -96,7 +96,7 @@ def cat(
     sys.stdout.flush()
     note_unread(view, window)
     for note in view.notes.sentences():
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {with_local_times(note)}", err=True)
     if not count:
         typer.echo(
             f"no message of {name} lies in this time: ros2-memory topics says when", err=True
