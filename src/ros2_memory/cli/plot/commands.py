@@ -25,6 +25,7 @@ from ros2_memory.cli.options import (
     reported_errors,
     spinner,
 )
+from ros2_memory.cli.output import with_local_times
 from ros2_memory.cli.plot.scene import (
     MOST_TOPICS,
     Stop,
@@ -229,4 +230,4 @@ def _finish(picture: "Picture", out: Path, notes: Sequence[str], *, as_json: boo
     picture.save(out)
     print_line(json.dumps({"path": str(out), "notes": [*notes]}) if as_json else str(out))
     for note in () if as_json else notes:
-        typer.echo(f"note: {note}", err=True)
+        typer.echo(f"note: {with_local_times(note)}", err=True)
