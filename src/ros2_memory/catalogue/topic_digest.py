@@ -145,8 +145,8 @@ class TopicCollector:
 
     def add(self, record: Record) -> None:
         """Takes the next message."""
-        self._keep(record)
-        self._ends = (record if self._ends is None else self._ends[0], record)
+        if self._kept is not None:
+            self._keep(self._kept, record)
         self._batch.append(record)
         self._batch_bytes += len(record.payload)
         if self._batch_bytes > _BATCH_BYTES:
@@ -168,14 +168,12 @@ class TopicCollector:
             undecodable=tuple(undecodable.items()),
         )
 
-    def _keep(self, record: Record) -> None:
-        if self._kept is None:
-            return
+    def _keep(self, kept: list[Record], record: Record) -> None:
         self._kept_bytes += len(record.payload)
-        if len(self._kept) == MAX_STORED or self._kept_bytes > MAX_STORED_BYTES:
+        if len(kept) == MAX_STORED or self._kept_bytes > MAX_STORED_BYTES:
             self._kept = None
         else:
-            self._kept.append(record)
+            kept.append(record)
 
     def _edges(self) -> EdgeDigest | None:
         if self._pairs is None:
@@ -196,6 +194,8 @@ class TopicCollector:
     def _decode_batch(self) -> None:
         """Decodes the waiting messages, and takes their poses and states in order."""
         batch, self._batch, self._batch_bytes = self._batch, [], 0
+        if batch:
+            self._ends = (batch[0] if self._ends is None else self._ends[0], batch[-1])
         to, events = self._map, self._events
         sights = None if to is None else to.sights
         map_poses = to if self._map_poses else None

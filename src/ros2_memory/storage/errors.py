@@ -77,11 +77,10 @@ def raise_if_lost(path: Path, item: T | LostError) -> T:
         BagContradictionError: the indexes of `path` contradict its messages.
         BagError: messages of `path` are lost.
     """
-    if isinstance(item, ContradictionError):
-        raise BagContradictionError(str(path), str(item), (item.first, item.last))
-    if isinstance(item, LostError):
-        raise BagError(str(path), str(item), (item.first, item.last))
-    return item
+    if not isinstance(item, LostError):
+        return item
+    error = BagContradictionError if isinstance(item, ContradictionError) else BagError
+    raise error(str(path), str(item), (item.first, item.last))
 
 
 class reading:  # noqa: N801 - reads as the function that it would be

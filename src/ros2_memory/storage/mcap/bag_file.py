@@ -62,7 +62,7 @@ from ros2_memory.storage.mcap.records import (
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
 from ros2_memory.storage.mcap.walk import file_records
-from ros2_memory.storage.zstd_bag import uncompressed_payload
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -577,5 +577,6 @@ def _record(
     channel = channels.get(number)
     if channel is None:
         raise UnreadableError("damaged: a message is not of the channel that its index says")
-    payload = uncompressed_payload(channel, payload, max_bytes)
+    if payload.startswith(FRAME_MAGIC):
+        payload = uncompressed_payload(channel, payload, max_bytes)
     return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)
