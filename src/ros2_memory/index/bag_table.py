@@ -6,7 +6,7 @@ paths: where it was recorded, and hard links in saved moments. Of all these one 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -79,6 +79,7 @@ class BagTable:
         known: returns, by path, closed files that were read earlier: they are not read again while
             they are unchanged.
         only: the name of the one recording that counts; see `scan.Tree`.
+        packs: whether the summaries of bags that will not change are packed.
     """
 
     def __init__(
@@ -88,7 +89,9 @@ class BagTable:
         *,
         known: Callable[[], Mapping[str, BagFile]] | None,
         only: str | None = None,
+        packs: bool = False,
     ) -> None:
+        self._packs = packs
         self._reader = reader
         self._known = known
         self._tree = Tree(bag_dir, only)
@@ -124,7 +127,8 @@ class BagTable:
         self._timeline = self._timeline.changed(removed, added)
         self._settle(context)
         is_new = bool(changed or restored) or not scanned.is_like(self._scanned)
-        self._scanned = scanned
+        # Without the stamps, of which the first scan has one for each file.
+        self._scanned = replace(scanned, stamps={}, gone=set())
         return TableChange(removed, added, is_new)
 
     def snapshot(self, now: Ns) -> Snapshot:
@@ -244,6 +248,8 @@ class BagTable:
 
     def _add_unchanged(self, path: str, found: Classification) -> None:
         if found.bag is not None:
+            if self._packs:
+                found.bag.summary.pack()
             self._unchanged.add(found.bag, self._files.pop(path).stamp.inode)
 
     def _examine(

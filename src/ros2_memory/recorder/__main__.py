@@ -7,6 +7,7 @@ recording.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import signal
 import sys
 import time
@@ -47,8 +48,10 @@ FAILED: Final = 1
 INTERRUPTED: Final = 130
 TICK_S: Final = 0.2
 RECOVER_EVERY_S: Final = 60.0
-CACHE_MB: Final = 2
+CACHE_MB: Final = 1
 """Every bag is read once: a cache of chunks would only take memory."""
+_MALLOPT: Final = {-8: 1, -3: 1 << 16, -1: 1 << 16}
+"""M_ARENA_MAX, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of the GNU C library."""
 ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -68,6 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             _log.info("nothing_to_record", reason="recorder=none: bags come from elsewhere")
             return 0
         try:
+            _return_freed_memory()
             _record(settings)
         except ConfigError:
             raise
@@ -79,6 +83,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             # It came while the bag directory was put in order, which can be interrupted.
             return INTERRUPTED
     return 0
+
+
+def _return_freed_memory() -> None:
+    """Has the C library give back what is freed; by default it keeps some MB for each thread."""
+    with suppress(OSError, AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        for option, value in _MALLOPT.items():
+            mallopt(option, value)
 
 
 def _record(settings: Settings) -> None:

@@ -160,7 +160,9 @@ class IndexManager:
     # The methods below run under the lock.
 
     def _new_table(self) -> BagTable:
-        return BagTable(self.bag_dir, self._reader, known=self._known, only=self._only)
+        # Who deletes bags looks at few of them; who answers looks at all of them.
+        packs = self._collector is not None
+        return BagTable(self.bag_dir, self._reader, known=self._known, only=self._only, packs=packs)
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         with _gc_paused() if self.published is None else nullcontext():

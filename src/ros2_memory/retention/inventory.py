@@ -26,11 +26,11 @@ from ros2_memory.bag_dir.layout import (
     other_form,
 )
 from ros2_memory.core.directories import known_identity
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags, size_of
-from ros2_memory.retention.policy import RetentionStock, Span, StoredBag, StoredFile
+from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -46,7 +46,7 @@ OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
 """Data derived from bags, and the logs of `ros2`."""
 COMPLETE_AFTER_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that has not changed for so long is complete."""
-_BLOCK: Final = 4096
+_UNDATED: Final = (MAX_NS, MIN_NS)
 
 
 class Deletable(Enum):
@@ -130,7 +130,7 @@ class Inventory:
         bags: list[StoredBag] = []
         others = self._own_bytes()
         occupied: set[str] = set()
-        foreign: set[StoredFile] = set()
+        foreign: dict[tuple[int, int], int] = {}
         named = {str(self._root / name) for name in known.named}
         owned: dict[str, bool] = {}
         if self._own is not None:
@@ -145,7 +145,7 @@ class Inventory:
             # A recording is listed as own some moments after its directory appears.
             ours = own or bag.recording in named or is_carried(Path(path))
             if not ours and deletable is not Deletable.SAVED:
-                foreign.update(bag.files)
+                foreign.update((each.inode, each.size) for each in bag.files)
                 continue
             unnamed = deletable is Deletable.IF_UNNAMED and bag.recording not in named
             if own and (deletable is Deletable.YES or unnamed) and path not in remaining:
@@ -159,10 +159,9 @@ class Inventory:
         sidecars = {each: self._folder(each, known.now).size for each in emptied}
         occupied.update(bag.recording for bag in bags)
         others += sum(self._folder(each, known.now).size for each in occupied - emptied)
-        elsewhere = sum({file.inode: file.size for file in foreign}.values())
         saved = self._saved(known)
         return RetentionStock(
-            bags, known.now, sidecars, others, saved=saved, foreign_bytes=elsewhere
+            bags, known.now, sidecars, others, saved=saved, foreign_bytes=sum(foreign.values())
         )
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:
@@ -179,20 +178,15 @@ class Inventory:
         rows = self._unchanged
         for bag, inode in known.unchanged.rows():
             stored = rows.get(bag.file)
-            if stored is None or (
-                stored.files[0].inode[1],
-                stored.files[0].size,
-                stored.written,
-            ) != (
+            if stored is None or (stored.inode, stored.size, stored.written) != (
                 inode,
                 bag.size,
                 bag.mtime_ns,
             ):
                 recording = sys.intern(bag.file.rpartition("/")[0])
                 device = self._folder(recording, known.now).device
-                file = StoredFile((device, inode), bag.size, _on_disk(bag.size))
-                span = self._span(bag)
-                stored = StoredBag(bag.file, recording, span, bag.mtime_ns, (file,))
+                span, file = self._span(bag), (device, inode, bag.size)
+                stored = StoredBag(bag.file, recording, *span, bag.mtime_ns, *file)
                 rows[bag.file] = stored
             yield (Deletable.NO if bag.file.endswith(CARRY_FILE) else Deletable.YES), stored
 
@@ -225,34 +219,37 @@ class Inventory:
         except OSError:
             device = -1
         stamps = {known.files[path].stamp.inode: known.files[path].stamp for path in known.saved}
-        return tuple(
-            StoredFile((device, inode), stamp.size, _on_disk(stamp.size))
-            for inode, stamp in stamps.items()
-        )
+        return tuple(_file(device, stamp) for stamp in stamps.values())
 
     def _stored(self, path: str, classification: Classification, known: KnownBags) -> StoredBag:
         recording = sys.intern(path.rpartition("/")[0])
         device = self._folder(recording, known.now).device
         other = other_form(path)
-        forms = (path, other) if other in known.hidden and other in known.files else (path,)
-        stamps = [known.files[form].stamp for form in forms]
-        files = (
-            StoredFile((device, each.inode), each.size, _on_disk(each.size)) for each in stamps
+        bag, stamp = classification.bag, known.files[path].stamp
+        second = known.files.get(other) if other in known.hidden else None
+        return StoredBag(
+            path,
+            recording,
+            *(_UNDATED if bag is None else self._span(bag)),
+            stamp.mtime_ns,
+            device,
+            stamp.inode,
+            stamp.size,
+            None if second is None else _file(device, second.stamp),
         )
-        span = None if classification.bag is None else self._span(classification.bag)
-        return StoredBag(path, recording, span, stamps[0].mtime_ns, tuple(files))
 
-    def _span(self, bag: BagFile) -> Span | None:
+    def _span(self, bag: BagFile) -> tuple[Ns, Ns]:
+        """Returns the log times of the first and last message that dates a bag (inclusive)."""
         spans = [
             (topic.first, topic.last)
             for topic in bag.summary.topics
             if not self._is_received_again(topic)
         ]
         if not spans:
-            return None
+            return _UNDATED
         start, end = min(first for first, _ in spans), max(last for _, last in spans)
         # The bag's own numbers where they are equal, which take no memory.
-        return Span(bag.start if start == bag.start else start, bag.end if end == bag.end else end)
+        return bag.start if start == bag.start else start, bag.end if end == bag.end else end
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
         """Whether all messages of a topic in a bag may be repeated by each recording."""
@@ -298,5 +295,5 @@ class Inventory:
         return sum(map(size_of, own))
 
 
-def _on_disk(size: int) -> int:
-    return -(-size // _BLOCK) * _BLOCK
+def _file(device: int, stamp: Stamp) -> StoredFile:
+    return StoredFile((device, stamp.inode), stamp.size)

@@ -137,13 +137,13 @@ class Carrier:
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
         """Returns those of the bags that contain messages of a latched topic."""
-        found: dict[str, BagFile] = {}
         wanted = {str(path) for path in paths}
-        everything = TimeWindow.everything()
-        for topic in self.topics(snapshot):
-            extents = snapshot.timeline.extents(topic, everything)
-            found.update((bag.file, bag) for bag, *_ in extents if bag.file in wanted)
-        return tuple(found.values())
+        topics = self.topics(snapshot)
+        return tuple(
+            bag
+            for bag in snapshot.bags
+            if bag.file in wanted and not bag.summary.schema.positions.keys().isdisjoint(topics)
+        )
 
     def carry(
         self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path] = ()
@@ -161,14 +161,14 @@ class Carrier:
         if not with_messages:
             return None
         topics = self.topics(snapshot)
-        gone = {*to_delete} - {*saved}
-        kept = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
+        gone = {str(path) for path in {*to_delete} - {*saved}}
+        kept = [bag for bag in snapshot.bags if bag.file not in gone and not _is_carried(bag)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
         }
         origins = dict(carried)
-        remaining = {self._folder(bag.path) for bag in kept}
+        remaining = {self._folder(each) for each in {bag.recording for bag in kept}}
         for bag in with_messages:
             origins.update(self._read(snapshot, bag, topics))
         wanted = worth_carrying(
@@ -199,7 +199,7 @@ class Carrier:
 
         Of a frequent topic only the newest: the earlier ones are superseded.
         """
-        folder = self._folder(bag.path)
+        folder = self._folder(bag.recording)
         here = [topic for topic in topics if bag.summary.of(topic)]
         frequent = {topic for topic in here if self._is_frequent(snapshot, topic, bag.recording)}
         for record in self._records(bag.path, [topic for topic in here if topic not in frequent]):
@@ -224,10 +224,10 @@ class Carrier:
             return False
         return not snapshot.timeline.pace(topic, recording).is_rare
 
-    def _folder(self, bag: Path) -> str:
-        """Returns the directory of a bag's recording, relative to the bag directory."""
+    def _folder(self, recording: Path) -> str:
+        """Returns the directory of a recording, relative to the bag directory."""
         bag_dir = self.path.parent.parent
-        return os.path.relpath(HardLinks(bag_dir).recorded_as(str(bag.parent)), bag_dir)
+        return os.path.relpath(HardLinks(bag_dir).recorded_as(str(recording)), bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
         """Yields the messages of these topics.
@@ -284,8 +284,10 @@ class Carrier:
         found: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
         for topic in topics:
             seen: set[Path] = set()
-            for bag, *_ in snapshot.timeline.extents(topic, TimeWindow.everything()):
-                if bag.recording in seen or bag.path in to_delete or is_carried(bag.path):
+            for bag in snapshot.bags:
+                if topic not in bag.summary.schema.positions or bag.recording in seen:
+                    continue
+                if bag.path in to_delete or _is_carried(bag):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
@@ -347,11 +349,14 @@ def _merged_origin(
     return replace(own, recordings=(first, *sorted({*others, *copies} - {first})))
 
 
+def _is_carried(bag: BagFile) -> bool:
+    return bag.file.endswith(CARRY_FILE) and is_carried(bag.path)
+
+
 def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:
-    """Returns a function: whether any of these bags was recorded in `[start, stop)`."""
-    spans = sorted((bag.start, bag.end) for bag in bags)
-    starts = [start for start, _ in spans]
-    reach = list(accumulate((end for _, end in spans), max))
+    """Returns a function: whether any of these bags, in order, was recorded in `[start, stop)`."""
+    starts = [bag.start for bag in bags]
+    reach = list(accumulate((bag.end for bag in bags), max))
 
     def recorded_in(start: Ns, stop: Ns) -> bool:
         begun = bisect_left(starts, stop)

@@ -22,6 +22,8 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import islice
+from operator import attrgetter, eq
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -30,6 +32,7 @@ from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+_BLOCK: Final = 4096
 GB: Final = 10**9
 """Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
 SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
@@ -52,34 +55,52 @@ class RetentionLimits:
 class StoredFile(NamedTuple):
     """One file of a bag. Files that share an inode (device and number) count once.
 
-    `size` is what the budget counts, `disk` what deleting it frees.
+    `size` is what the budget counts.
     """
 
     inode: tuple[int, int]
     size: int
-    disk: int
 
-
-class Span(NamedTuple):
-    """The log times of the first and the last message (inclusive)."""
-
-    start: Ns
-    end: Ns
+    @property
+    def disk(self) -> int:
+        """What deleting it frees, in bytes."""
+        return -(-self.size // _BLOCK) * _BLOCK
 
 
 class StoredBag(NamedTuple):
-    """A bag that may be deleted. A tuple, since a week has 60,000, judged every few seconds.
+    """A bag that may be deleted. One flat tuple, since a week has 60,000, judged every few seconds.
 
-    `span` leaves latched topics out, since each recording receives those again; it is None for a
-    bag that contains nothing else. `written` is when its file was last modified; `recording` is
-    the directory that it lies in.
+    `start` and `end` are the log times of its first and last message (inclusive). They leave
+    latched topics out, since each recording receives those again: a bag that contains nothing else
+    ends before it starts. `written` is when its file was last modified; `recording` is the
+    directory that it lies in. `device` to `size` are its file, see `StoredFile`; `second` is its
+    other form, if that lies there as well.
     """
 
     path: str
     recording: str
-    span: Span | None
+    start: Ns
+    end: Ns
     written: Ns
-    files: tuple[StoredFile, ...]
+    device: int
+    inode: int
+    size: int
+    second: StoredFile | None = None
+
+    @property
+    def has_dates(self) -> bool:
+        """Whether it has messages by which it can be dated."""
+        return self.start <= self.end
+
+    @property
+    def file(self) -> StoredFile:
+        """Its file."""
+        return StoredFile((self.device, self.inode), self.size)
+
+    @property
+    def files(self) -> tuple[StoredFile, ...]:
+        """All forms of it."""
+        return (self.file,) if self.second is None else (self.file, self.second)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,16 +208,20 @@ class _Plan:
     """Counts what is left when some bags are deleted."""
 
     def __init__(self, stock: RetentionStock) -> None:
-        files = [each for bag in stock.bags for each in bag.files]
-        sizes = {each.inode: each.size for each in files}
-        self.shared = len(sizes) < len(files)
         # A file of a moment stays when every other name of it is deleted.
         self._saved = {each.inode for each in stock.saved}
-        sizes.update((each.inode, each.size) for each in stock.saved)
-        self._links = Counter(each.inode for each in files) if self.shared else Counter()
+        self.shared = _may_share(stock)
+        self._links: Counter[tuple[int, int]] = Counter()
+        if self.shared:
+            self._links.update(each.inode for bag in stock.bags for each in bag.files)
+            sizes = {each.inode: each.size for bag in stock.bags for each in bag.files}
+            sizes.update((each.inode, each.size) for each in stock.saved)
+            total = sum(sizes.values())
+        else:
+            total = sum(each.size for each in stock.saved) + sum(bag.size for bag in stock.bags)
         self._bags_in = Counter(bag.recording for bag in stock.bags)
         self._sidecars = stock.sidecars
-        self.total = stock.other_bytes + sum(sizes.values()) + sum(stock.sidecars.values())
+        self.total = stock.other_bytes + total + sum(stock.sidecars.values())
         self.free = stock.free_bytes
 
     def delete(self, bag: StoredBag) -> None:
@@ -225,7 +250,19 @@ class _Plan:
             self.free += disk
 
 
-_Era: TypeAlias = "list[tuple[Span, StoredBag]]"
+def _may_share(stock: RetentionStock) -> bool:
+    """Returns whether several names may lead to one file: by the numbers of their inodes.
+
+    Most often none do, and finding that out takes little memory.
+    """
+    inodes = [bag.inode for bag in stock.bags]
+    inodes += [each.inode[1] for each in stock.saved]
+    inodes.sort()
+    several = any(bag.second is not None for bag in stock.bags)
+    return several or any(map(eq, inodes, islice(inodes, 1, None)))
+
+
+_Era: TypeAlias = "list[StoredBag]"
 
 
 def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
@@ -233,26 +270,22 @@ def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
     latest = stock.now + FUTURE_NS
     dated = [
-        (bag.span, bag)
+        bag
         for bag in stock.bags
-        if bag.span is not None
-        and bag.span.start >= FIRST_BAGS_NS
-        and bag.span.end <= latest
-        and bag.span.end - bag.span.start <= longest
+        if FIRST_BAGS_NS <= bag.start <= bag.end <= latest and bag.end - bag.start <= longest
     ]
     if not dated:
         return []
-    reach, end = min(span.start for span, _ in dated), max(span.end for span, _ in dated)
+    reach, end = min(bag.start for bag in dated), max(bag.end for bag in dated)
     if end - reach <= longest:
         return [dated]
-    dated.sort()
+    dated.sort(key=attrgetter("start"))
     eras: list[_Era] = [[]]
-    for each in dated:
-        span, _ = each
-        if span.start - reach > longest:
+    for bag in dated:
+        if bag.start - reach > longest:
             eras.append([])
-        eras[-1].append(each)
-        reach = max(reach, span.end)
+        eras[-1].append(bag)
+        reach = max(reach, bag.end)
     return eras
 
 
@@ -269,13 +302,12 @@ def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> se
     An undated bag belongs to the present era if it was written in it, else to none.
     """
     aged: set[str] = set()
-    dated = {bag.path for era in eras for _, bag in era}
     for era in eras:
-        oldest = max(span.end for span, _ in era) - max_age_ns
-        aged.update(bag.path for span, bag in era if span.end < oldest)
+        oldest = max(bag.end for bag in era) - max_age_ns
+        aged.update(bag.path for bag in era if bag.end < oldest)
         if era is eras[-1]:
-            begun = min(span.start for span, _ in era)
-            undated = (bag for bag in bags if bag.path not in dated)
+            begun = min(bag.start for bag in era)
+            undated = _without(bags, *eras)
             aged.update(bag.path for bag in undated if begun <= bag.written < oldest)
     return aged
 
@@ -288,16 +320,29 @@ def _oldest_first(
     A bag that shares a file counts as old as the newest that does: deleting it earlier frees
     nothing.
     """
-    keys = {bag.path: _written(bag, stock.now, limits) for bag in stock.bags}
-    keys.update((bag.path, (span.end, span.end)) for span, bag in present)
+    odd = _without(stock.bags, present)
+    keys = {bag.path: _written(bag, stock.now, limits) for bag in odd}
     if shared:
+        keys.update((bag.path, (bag.end, bag.end)) for bag in present)
         newest: dict[tuple[int, int], tuple[Ns, Ns]] = {}
         for bag in stock.bags:
             key = keys[bag.path]
             for each in bag.files:
                 newest[each.inode] = max(key, newest.get(each.inode, key))
         keys = {bag.path: max(newest[each.inode] for each in bag.files) for bag in stock.bags}
-    return sorted(stock.bags, key=lambda bag: (keys[bag.path], bag.path))
+    # One key after the other, the last one first: pairs of them would take much memory.
+    order = sorted(stock.bags, key=attrgetter("path"))
+    for part in (1, 0):
+        order.sort(key=lambda bag: keys[bag.path][part] if bag.path in keys else bag.end)
+    return order
+
+
+def _without(bags: Sequence[StoredBag], *eras: _Era) -> Sequence[StoredBag]:
+    """Returns the bags that are in none of some eras."""
+    if len(bags) == sum(map(len, eras)):
+        return ()
+    there = {bag.path for era in eras for bag in era}
+    return [bag for bag in bags if bag.path not in there]
 
 
 def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
@@ -315,8 +360,8 @@ def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
 def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
     """Returns the bag that stays: the newest dated one, else the last written with messages."""
     if eras:
-        return max(eras[-1], key=lambda each: (each[0].end, each[1].path))[1]
-    candidates = [bag for bag in order if bag.span is not None] or order
+        return max(eras[-1], key=attrgetter("end", "path"))
+    candidates = [bag for bag in order if bag.has_dates] or order
     return candidates[-1] if candidates else None
 
 

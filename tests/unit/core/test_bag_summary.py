@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,6 +46,28 @@ def test_a_summary_spans_its_topics_and_each_topic_its_types(
         ends = min(each.first for each in alike), max(each.last for each in alike)
         assert summary.span_of([name, "/nowhere"]) == ends
     assert summary.of("/nowhere") == ()
+
+
+near = st.integers(0, 2**41)
+
+
+@given(several, moments, st.lists(near, min_size=24, max_size=24))
+def test_packing_changes_nothing_but_the_size(
+    given_topics: tuple[TopicSummary, ...], start: int, offsets: list[int]
+) -> None:
+    ends = zip(offsets[::2], offsets[1::2], strict=True)
+    start = min(start, MAX_NS - 2**41)
+    alike = tuple(
+        replace(each, first=start + min(end), last=start + max(end))
+        for each, end in zip(given_topics, ends, strict=False)
+    )
+    for topics_of in (given_topics, alike):
+        summary = BagSummary(topics_of)
+        for _ in range(2):
+            summary.pack()
+            assert summary == BagSummary(topics_of)
+            assert summary.topics == topics_of
+            assert [summary.at(number) for number in range(len(topics_of))] == list(topics_of)
 
 
 @given(several, several)

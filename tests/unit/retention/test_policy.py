@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.policy import (
     RetentionLimits,
     RetentionStock,
-    Span,
     StoredBag,
     StoredFile,
     plan_deletions,
@@ -24,6 +24,7 @@ HOUR = 3600 * S
 DAY = 24 * HOUR
 NOW = 1_790_000_000 * S
 PLENTY = 10**15
+BLOCK = 4096
 LIMITS = RetentionLimits(max_total_bytes=PLENTY, max_age_ns=168 * HOUR)
 
 
@@ -38,12 +39,16 @@ def bag(
     inode: int | None = None,
 ) -> StoredBag:
     """A bag whose last message is at `end`; without messages where that is None."""
-    span = None if end is None else Span(end - length, end)
+    span = (MAX_NS, MIN_NS) if end is None else (end - length, end)
     at = written if written is not None else end or NOW
     number = zlib.crc32(name.encode()) if inode is None else inode
-    return StoredBag(
-        f"{recording}/{name}", recording, span, at, (StoredFile((1, number), size, size),)
-    )
+    return StoredBag(f"{recording}/{name}", recording, *span, at, 1, number, size)
+
+
+def another_name(of: StoredBag, file: StoredFile) -> StoredBag:
+    """The bag, if its name led to another file."""
+    device, inode = file.inode
+    return of._replace(device=device, inode=inode, size=file.size)
 
 
 def stock(
@@ -187,16 +192,17 @@ class TestBudget:
         assert names(expired(held, budget(54))) == ["a"]
 
     def test_free_space_that_is_missing_is_made_and_no_more(self) -> None:
-        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=100)
-        assert expired(stock(*hourly(10), free_bytes=100), limits) == ()
-        assert names(expired(stock(*hourly(10), free_bytes=85), limits)) == ["h9", "h8"]
+        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=10 * BLOCK)
+        assert expired(stock(*hourly(10), free_bytes=10 * BLOCK), limits) == ()
+        bags = stock(*hourly(10), free_bytes=8 * BLOCK + 1)
+        assert names(expired(bags, limits)) == ["h9", "h8"]
         assert expired(stock(*hourly(10), free_bytes=None), limits) == ()
 
     def test_for_free_space_that_cannot_be_reached_nothing_is_deleted(self) -> None:
-        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=100)
+        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=9 * BLOCK + 10)
         found = plan_deletions(stock(*hourly(10), free_bytes=9), limits)
-        assert (found.to_delete, found.fits, found.most_free) == ((), False, 99)
-        found = plan_deletions(stock(*hourly(170), free_bytes=-2000), limits)
+        assert (found.to_delete, found.fits, found.most_free) == ((), False, 9 * BLOCK + 9)
+        found = plan_deletions(stock(*hourly(170), free_bytes=-200 * BLOCK), limits)
         assert (names(found.to_delete), found.fits) == (["h169"], False)
 
 
@@ -246,14 +252,14 @@ def stocks(draw: st.DrawFn) -> RetentionStock:
             length=draw(st.sampled_from([S, 10 * S, 300 * DAY])),
         )
         if bags and draw(st.integers(0, 9)) == 0:
-            made = made._replace(files=draw(st.sampled_from(sorted(bags.values()))).files)
+            made = another_name(made, draw(st.sampled_from(sorted(bags.values()))).file)
         bags[made.path] = made
     return RetentionStock(
         tuple(draw(st.permutations(list(bags.values())))),
         draw(st.sampled_from([NOW, 5 * HOUR, NOW + 900 * DAY])),
         sidecars=draw(st.dictionaries(st.sampled_from("ABC"), st.integers(0, 20))),
         other_bytes=draw(st.integers(0, 50)),
-        free_bytes=draw(st.none() | st.integers(0, 100)),
+        free_bytes=draw(st.none() | st.integers(0, 10 * BLOCK)),
         recorded_since=draw(
             st.dictionaries(st.sampled_from("ABC"), st.integers(0, 200).map(lambda h: h * HOUR))
         ),
@@ -265,7 +271,7 @@ all_limits = st.builds(
     RetentionLimits,
     st.integers(0, 400),
     st.sampled_from([HOUR, 100 * HOUR, 168 * HOUR, 10**6 * DAY]),
-    st.integers(0, 200),
+    st.integers(0, 20 * BLOCK),
 )
 
 
@@ -321,7 +327,7 @@ class TestAlways:
     ) -> None:
         left = without(held, expired(held, limits)).bags
         assert bool(left) == bool(held.bags)
-        assert any(each.span for each in left) == any(each.span for each in held.bags)
+        assert any(each.has_dates for each in left) == any(each.has_dates for each in held.bags)
 
     @given(stocks(), all_limits)
     def test_no_more_is_deleted_than_needed(
@@ -364,8 +370,7 @@ class TestAlways:
         ]
         held = replace(held, now=NOW)
         more = replace(held, bags=(*held.bags, *odd))
-        dated = [each for each in held.bags if each.span is not None]
-        if dated and any(NOW - 400 * HOUR <= (each.span or (0, 0))[1] <= NOW for each in dated):
+        if any(NOW - 400 * HOUR <= each.end <= NOW for each in held.bags):
             assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
 
 
@@ -381,7 +386,7 @@ class TestMoments:
         assert (names(found.to_delete), found.total_bytes, found.fits) == (["h1"], 40, True)
 
     def test_what_lies_in_moments_alone_counts_too(self) -> None:
-        kept = (StoredFile((1, 5), 15, 15),)
+        kept = (StoredFile((1, 5), 15),)
         limits = replace(LIMITS, max_total_bytes=30)
         found = plan_deletions(replace(stock(*hourly(2)), saved=kept), limits)
         assert (names(found.to_delete), found.total_bytes, found.fits) == (["h1"], 35, True)
@@ -407,10 +412,10 @@ class TestMoments:
         self, drawn: list[tuple[int, int]], kept: set[int], most: int
     ) -> None:
         def file(inode: int) -> StoredFile:
-            return StoredFile((1, inode), 10 + inode, 10 + inode)
+            return StoredFile((1, inode), 10 + inode)
 
         bags = [
-            bag(f"b{n}", NOW - hours * HOUR)._replace(files=(file(inode),))
+            another_name(bag(f"b{n}", NOW - hours * HOUR), file(inode))
             for n, (hours, inode) in enumerate(drawn)
         ]
         limits = replace(LIMITS, max_total_bytes=most)

@@ -14,9 +14,7 @@ from ros2_memory.retention.policy import (
     SHORTEST_PAUSE_NS,
     RetentionLimits,
     RetentionStock,
-    Span,
     StoredBag,
-    StoredFile,
     ages,
     plan_deletions,
 )
@@ -38,12 +36,11 @@ def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, 
 
 def hourly(count: int, *, until: int) -> list[StoredBag]:
     ends = (until - ago * HOUR for ago in reversed(range(count)))
-    return [bag(f"rec_{n}", n, Span(at - 10 * S, at)) for n, at in enumerate(ends)]
+    return [bag(f"rec_{n}", n, at - 10 * S, at) for n, at in enumerate(ends)]
 
 
-def bag(recording: str, inode: int, span: Span) -> StoredBag:
-    files = (StoredFile((1, inode), 10, 10),)
-    return StoredBag(f"{recording}/b", recording, span, span.end, files)
+def bag(recording: str, inode: int, start: int, end: int) -> StoredBag:
+    return StoredBag(f"{recording}/b", recording, start, end, end, 1, inode, 10)
 
 
 class TestAForwardStep:
@@ -53,7 +50,7 @@ class TestAForwardStep:
 
     def stock(self, *, synchronised: bool, recorded_h: int = 0) -> RetentionStock:
         before = hourly(160, until=T0)[::2]
-        after = bag("new", 999, Span(T0 + 150 * HOUR, T0 + 150 * HOUR + S))
+        after = bag("new", 999, T0 + 150 * HOUR, T0 + 150 * HOUR + S)
         since = {each.recording: recorded_h * HOUR for each in before}
         now = T0 + 150 * HOUR + 2 * S
         bags = (*before, after)
@@ -88,12 +85,12 @@ def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:
     """
     longest = max(max_age, SHORTEST_PAUSE_NS)
     dated = [
-        (bag.span.start, bag.span.end, bag)
+        (bag.start, bag.end, bag)
         for bag in bags
-        if bag.span is not None
-        and bag.span.start >= FIRST_BAGS_NS
-        and bag.span.end <= now + FUTURE_NS
-        and bag.span.end - bag.span.start <= longest
+        if bag.has_dates
+        and bag.start >= FIRST_BAGS_NS
+        and bag.end <= now + FUTURE_NS
+        and bag.end - bag.start <= longest
     ]
     newest: dict[str, int] = {}
     for _, end, bag in dated:
@@ -150,8 +147,8 @@ class Life:
             self.lived_s += 60.0
             self.bytes_written += 10
             self.recorded.note([name], self.bytes_written, self.monotonic_s)
-            span = Span(min(start, self.wall), max(start, self.wall))
-            made = bag(name, self.recordings, span)._replace(written=self.wall)
+            first, last = sorted((start, self.wall))
+            made = bag(name, self.recordings, first, last)._replace(written=self.wall)
             self.bags.append(made)
             self.ended_s[made.path] = self.lived_s
 

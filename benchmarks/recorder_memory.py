@@ -1,0 +1,169 @@
+"""`python -m benchmarks.recorder_memory`: the memory of the recorder's daemon with a week of bags.
+
+The daemon itself, over 60,480 bags of its own that fill its budget, so that each split that closes
+has it delete the oldest. It supervises the real `ros2 bag record` where `--setup` names its setup
+file, else the tests' stand-in for it; the memory of that child is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from mcap.writer import CompressionType, Writer
+from tests.support import stub_ros2
+
+from benchmarks.bags import QOS, SPLIT_NS, SPLITS_OF_A_RECORDING, WEEK
+from benchmarks.footprint import resident_mb
+from benchmarks.report import machine
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.directories import identity_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+MOST_MB: Final = 150.0
+_DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks" / "recorder_memory"
+_TOPICS: Final = 12
+_MESSAGES: Final = 3
+"""Of each topic in a bag: the daemon's memory depends on how many topics there are, not on this."""
+_LATCHED: Final = "/tf_static"
+_PASSES: Final = 3
+"""Deletions that are waited for."""
+_PATIENCE_S: Final = 600.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Prints the peak; the exit code is 1 where it is above `MOST_MB`."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.recorder_memory", description=__doc__
+    )
+    parser.add_argument("--bags", type=int, default=WEEK, help="splits of 10 s")
+    parser.add_argument("--setup", type=Path, help="a ROS setup file with ros2 bag record")
+    parser.add_argument("--dir", type=Path, default=_DIR, help="where the bags lie meanwhile")
+    asked = parser.parse_args(argv)
+    shutil.rmtree(asked.dir, ignore_errors=True)
+    asked.dir.mkdir(parents=True)
+    try:
+        size = _make_week(asked.dir / "bags", asked.bags)
+        print(
+            f"{asked.bags} bags of {_TOPICS} topics, {size / 1e6:.0f} MB\n{machine()}", flush=True
+        )
+        peak = _peak_mb(asked.dir, size, asked.setup)
+    finally:
+        shutil.rmtree(asked.dir, ignore_errors=True)
+    print("ok" if peak <= MOST_MB else f"MISSED: at most {MOST_MB:g} MB")
+    return int(peak > MOST_MB)
+
+
+def _make_week(bag_dir: Path, bags: int) -> int:
+    """Makes bags that end now, listed as the recorder's own; returns their bytes."""
+    start = time.time_ns() - bags * SPLIT_NS
+    numbers = range(0, bags, SPLITS_OF_A_RECORDING)
+    with ProcessPoolExecutor() as pool:
+        sizes = [*pool.map(partial(_record, bag_dir, start, bags), numbers, chunksize=8)]
+    identities = {each.name: identity_of(each) for each in bag_dir.iterdir()}
+    OwnRecordings(bag_dir).adopt({name: each for name, each in identities.items() if each})
+    return sum(sizes)
+
+
+def _record(bag_dir: Path, start: int, bags: int, first: int) -> int:
+    """Writes one recording from its first bag on; returns its bytes."""
+    began = start + first * SPLIT_NS
+    stamp = time.strftime("%Y%m%d_%H%M%S", time.gmtime(began / 1e9))
+    folder = bag_dir / f"rec_{stamp}"
+    folder.mkdir(parents=True)
+    size = 0
+    for nth in range(min(SPLITS_OF_A_RECORDING, bags - first)):
+        path = folder / f"{folder.name}_{nth}.mcap"
+        at = began + nth * SPLIT_NS
+        _write(path, at, with_latched=not nth)
+        size += path.stat().st_size
+        os.utime(path, ns=(at + SPLIT_NS, at + SPLIT_NS))
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n", encoding="utf-8")
+    os.utime(folder, ns=(began, began))
+    return size
+
+
+def _write(path: Path, start: int, *, with_latched: bool) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start("ros2", "benchmark")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        topics = [f"/robot/sensors/topic_{number}" for number in range(_TOPICS - 1)]
+        for number, topic in enumerate([*topics, _LATCHED]):
+            latched = topic == _LATCHED
+            qos = QOS.format(durability="transient_local" if latched else "volatile")
+            channel = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos})
+            if latched and not with_latched:
+                continue
+            for nth in range(1 if latched else _MESSAGES):
+                at = start + number * 1_000_003 + nth * SPLIT_NS // _MESSAGES
+                writer.add_message(channel, at, b"\0\1\0\0\2\0\0\0x\0", at)
+        writer.finish()
+
+
+def _peak_mb(folder: Path, size: int, setup: Path | None) -> float:
+    topics = folder / "topics.yaml"
+    topics.write_text("topics: [/odom, /tf]\n", encoding="utf-8")
+    programs = folder / "bin"
+    programs.mkdir()
+    stub_ros2.install(programs / "ros2")
+    overrides = [
+        f"recording.bag_dir={folder / 'bags'}",
+        f"recording.topics_file={topics}",
+        "recording.split_duration_s=2",
+        "retention.min_free_gb=0",
+        "retention.max_age_h=400",
+        f"retention.max_total_gb={size / 1e9}",
+        *([] if setup is None else [f"recorder.setup_files=[{setup}]"]),
+    ]
+    environment = {**os.environ, "STUB_PERIOD_MS": "100"}
+    if setup is None:
+        environment["PATH"] = f"{programs}:{environment['PATH']}"
+    log = folder / "log"
+    argv = [sys.executable, "-m", "ros2_memory.recorder", *overrides]
+    with log.open("wb") as stream:
+        process = subprocess.Popen(argv, env=environment, stderr=stream, stdin=subprocess.DEVNULL)
+        try:
+            _await_deletions(process, log)
+            figures = [resident_mb(each, str(process.pid)) for each in ("VmRSS", "VmHWM")]
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(timeout=60)
+    resident, peak = figures
+    print(f"recorder daemon: peak {peak:.0f} MB, resident {resident:.0f} MB")
+    return peak
+
+
+def _await_deletions(process: subprocess.Popen[bytes], log: Path) -> None:
+    """Waits until the daemon has deleted bags several times.
+
+    Raises:
+        RuntimeError: it ended, or does not delete any.
+    """
+    given_up = time.monotonic() + _PATIENCE_S
+    while time.monotonic() < given_up and process.poll() is None:
+        lines = log.read_text(encoding="utf-8").splitlines()
+        events = [json.loads(line) for line in lines if line.startswith("{")]
+        names = [each["event"] for each in events if each.get("bags", 1)]
+        if "recorder_started" in names:
+            begun = names.index("recorder_started")
+            if names[begun:].count("retention_applied") >= _PASSES:
+                return
+        time.sleep(0.5)
+    raise RuntimeError(f"the recorder did not delete {_PASSES} times:\n{log.read_text()[-2000:]}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
