@@ -3,7 +3,7 @@
 const POLL_MS = 2000;
 const FILLING_MS = 4000;
 const REST_MS = 200;
-const OVERLAP_S = 60;  // of the newest events, some go on
+const OVERLAP_S = 15;  // of the newest events, some go on
 const STATUS_MS = 60000;
 const MOST_DUTY = 100;  // things are looked up in at most a hundredth of the time
 
@@ -208,7 +208,8 @@ function showKey() {
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
   at("map-key").replaceChildren(one("path", view.distance_m === null || view.distance_m === undefined
     ? "path" : `path, ${far(view.distance_m)}`), one("now", "robot now"),
-  one("robot", "at the time pointed at"), one("stood", `stops, ${map.stops.length}`),
+  one("robot", "at the time pointed at"),
+  ...(view.isWhole ? [one("stood", `stops, ${map.stops.length}`)] : []),
   one("seen", `things, ${map.things.length}${more}`),
   ...((view.places || []).length ? [one("place", "places")] : []),
   ...(view.path ? [el("span", {}, "frame ", bdi(view.path.frame))] : []),

@@ -58,10 +58,10 @@ function showSightings(host, answer, point) {
     return pair(link(clock(each.last_seen), () => point(each.last_seen)),
       `${place}${each.in ? ` in ${each.in}` : ""}`);
   });
-  const total = answer.total === null ? "more" : answer.total;
+  const total = answer.total === null ? "there are more" : `${answer.total} in all`;
   host.replaceChildren(
     soft(answer.total === rows.length ? `${counted(rows.length, "sighting")}, newest first.`
-      : `The newest ${rows.length} of ${total} sightings.`),
+      : `The newest ${rows.length} sightings, ${total}.`),
     ...listing(rows, 10), ...notesOf(answer.notes));
 }
 /* What is known of now without another question. */

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -78,7 +79,8 @@ class SpanRequest:
         start_s: Unix seconds of the begin of the span; with `end_s`, else the last `last_s`.
         end_s: of its end.
         last_s: seconds before the newest data.
-        since_s: only what is newer is returned of the path and the events.
+        since_s: only what is newer is returned of the path and the events, and of the bag that it
+            is in.
         version: of the answer that the page has; nothing is looked up where it is current.
         things: whether things are looked up.
         status: whether the state of the memory is; without it only how far it reaches.
@@ -149,7 +151,10 @@ def span_shown(
     fresh = window
     if request.since_s is not None:
         since = min(max(ns_from_unix(request.since_s), window.start), window.stop - 1)
-        fresh = TimeWindow(since, window.stop)
+        # From the begin of a bag: digests answer for whole bags, and others are read.
+        bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
+        begins = min((each.start for each in bags), default=since)
+        fresh = TimeWindow(max(begins, window.start), window.stop)
     shown |= {"start": _s(window.start), "end": _s(window.stop - 1), "since": _s(fresh.start)}
     notes: list[str] = []
     parts: dict[str, Callable[[Call], Shown]] = {
@@ -227,7 +232,8 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     if places is None:
         return Shown({"path": None, "robot": None}, ("no topic with poses is recorded",))
     tracks = RobotTracks(view, places.map_frame)
-    found = tracks.over(window)
+    # With what was just before, to know whether the path goes on from there.
+    found = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
     track = cut(found.track, window)
     newest = track
     if window.stop <= latest or not len(track.times):
