@@ -18,6 +18,7 @@ let asking = null;  // cancels the running look
 let isLooking = false;
 let thingsAt = 0;
 let statusAt = 0;
+let pause = FILLING_MS;
 let lookedAt = 0;
 let lookLater = 0;
 let restLater = 0;
@@ -367,7 +368,10 @@ async function follow() {
   const { view } = state;
   if (view.catalogue && Date.now() - lookedAt < FILLING_MS) return;
   const isWhole = !view.catalogue && view.isWhole;
-  if (isWhole || Date.now() - lookedAt > FILLING_MS) await look(isWhole, !isWhole);
+  if (isWhole) { pause = FILLING_MS; await look(true); return; }
+  if (Date.now() - lookedAt < pause) return;
+  pause = view.catalogue ? FILLING_MS : 2 * pause;  // what takes too long is asked for less and less
+  await look(false, !view.catalogue);
 }
 readAddress();
 look();
