@@ -320,6 +320,9 @@ def test_without_a_bag_directory_it_says_so(chromium: Browser, scratch: Path) ->
         assert "does not exist" in chromium.text("#state")
         assert "nothing is recorded" in chromium.text("#summary")
         assert chromium.run("return document.getElementById('memory').hidden")
+        # It looks again by itself.
+        drive(scratch / "nowhere", "one", time.time_ns() - 60 * NS_PER_S, 20)
+        chromium.awaits("return !document.getElementById('memory').hidden")
 
 
 def test_what_was_recorded_is_shown_as_text_and_never_runs(page: Browser) -> None:

@@ -366,7 +366,7 @@ document.addEventListener("visibilitychange", () => { if (!document.hidden && st
 async function follow() {
   if (document.hidden || isLooking || !state.view || !at("locked").hidden) return;
   const { view } = state;
-  if (view.catalogue && Date.now() - lookedAt < FILLING_MS) return;
+  if (view.range.earliest === null) { await look(); return; }
   const isWhole = !view.catalogue && view.isWhole;
   if (isWhole) { pause = FILLING_MS; await look(true); return; }
   if (Date.now() - lookedAt < pause) return;
