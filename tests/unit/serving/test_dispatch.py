@@ -110,8 +110,9 @@ async def test_tools_are_listed_as_read_only_and_with_nothing_that_says_nothing(
         listed = (await client.list_tools()).tools
     assert [each.name for each in listed] == ["quick", "slow"]
     hints = [each.annotations and each.annotations.model_dump(exclude_none=True) for each in listed]
-    # What is read-only has no other hints; each is paid for by every planner that lists it.
-    assert hints == [{"read_only_hint": True}, {"read_only_hint": True, "title": "Slow (blocking)"}]
+    # What is read-only cannot destroy; each hint is paid for by every planner that lists it.
+    assert hints == 2 * [{"read_only_hint": True, "open_world_hint": False}]
+    assert [each.title for each in listed] == ["Quick", "Slow (blocking)"]
 
 
 async def test_the_server_says_its_name_its_version_and_how_to_ask() -> None:
