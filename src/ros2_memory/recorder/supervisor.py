@@ -366,7 +366,8 @@ class Supervisor:
                 "topics_not_recorded",
                 f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
                 "type of all or some of these: name the workspace that defines it in "
-                "recorder.setup_files",
+                "recorder.setup_files. It names one topic of each type: of those that a glob "
+                "selects, others of the same type are not recorded either",
                 recording=current.name,
             )
 

@@ -240,3 +240,4 @@ def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> 
         world.run(30)
     (reported,) = events(logs, "topics_not_recorded")
     assert "not recorded: /arm, /grip;" in reported["reason"]
+    assert "of those that a glob selects, others of the same type" in reported["reason"]
