@@ -171,7 +171,8 @@ class McapFile:
         compression, data = "", content
         if self._layout.zstd_level is not None:
             packed = zstandard.ZstdCompressor(level=self._layout.zstd_level).compress(content)
-            if len(content) >= _LEAST_RATIO * len(packed):
+            is_worth_it = len(content) >= _WORTH_COMPRESSING
+            if is_worth_it and len(content) >= _LEAST_RATIO * len(packed):
                 compression, data = "zstd", packed
         times = [time for entries in self._index.values() for time, _ in entries]
         begin, end = min(times), max(times)
