@@ -144,14 +144,17 @@ class Typestores:
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""
         found: Typesdict = {}
-        finished: set[str] = set()
+        visited: set[str] = set()
         members = unrolled = 0
-
         # Depth first: the trail to a type is what names a definition that contains itself.
-        def visit(name: str, trail: tuple[str, ...]) -> None:
-            nonlocal members, unrolled
+        todo: list[tuple[str, tuple[str, ...]]] = [(root, ())]
+        while todo:
+            name, trail = todo.pop()
             if name in trail:
                 raise _UnusableError(f"its definition contains itself: {' > '.join(trail)}")
+            if name in visited:
+                continue
+            visited.add(name)
             if len(trail) > MAX_NESTING:
                 raise _UnusableError(f"its definition nests more than {MAX_NESTING} levels deep")
             if name not in found:
@@ -160,20 +163,16 @@ class Typestores:
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 found.update(definition)
-            for _, field in found[name][1]:
-                unrolled += _unrolled(field)
-                if unrolled > MAX_UNROLLED:
-                    raise _UnusableError(
-                        f"its fixed arrays of strings and messages hold more than {MAX_UNROLLED}"
-                        " elements"
-                    )
-                nested = _nested_type(field)
-                if nested is not None and nested not in finished:
-                    visit(nested, (*trail, name))
-            finished.add(name)
-
-        visit(root, ())
-        return {name: found[name] for name in finished}
+            fields = [field for _, field in found[name][1]]
+            unrolled += sum(map(_unrolled, fields))
+            if unrolled > MAX_UNROLLED:
+                raise _UnusableError(
+                    f"its fixed arrays of strings and messages hold more than {MAX_UNROLLED}"
+                    " elements"
+                )
+            nested = dict.fromkeys(filter(None, map(_nested_type, fields)))
+            todo += [(each, (*trail, name)) for each in reversed(nested)]
+        return {name: found[name] for name in visited}
 
     def _definition(
         self, name: str, in_bag: Mapping[str, _Section], trail: tuple[str, ...]

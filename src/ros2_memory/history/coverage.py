@@ -22,7 +22,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
-from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
 from ros2_memory.bag_dir.lost_file import read_losses
 from ros2_memory.bag_dir.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
@@ -72,8 +72,9 @@ def note_unread(
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
     bag_dir = view.memory.index.bag_dir
-    for sentence in (*describe_lost(bag_dir, window), *describe_excluded(bag_dir, window)):
-        view.notes.add(sentence)
+    if (bag_dir / OWN_FOLDER).is_dir():
+        for sentence in (*describe_lost(bag_dir, window), *describe_excluded(bag_dir, window)):
+            view.notes.add(sentence)
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.

@@ -6,7 +6,7 @@ A query looks at few topics of many bags, so the numbers of their summaries are 
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache, partial, reduce
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -342,7 +342,7 @@ class _Columns:
         rows: dict[int, list[int]] = {}
         for row, bag in enumerate(bags):
             rows.setdefault(id(bag.summary.schema), []).append(row)
-        self.groups = tuple(_group([bags[row] for row in each], each) for each in rows.values())
+        self.groups = tuple(map(partial(_group, bags), rows.values()))
         self._columns: dict[str, _Column | None] = {}
 
     def of(self, topic: str) -> _Column | None:
@@ -365,9 +365,9 @@ class _Columns:
 
 
 def _group(bags: Sequence[BagFile], rows: Sequence[int]) -> _SchemaGroup:
-    schema = bags[0].summary.schema
-    data = b"".join([bag.summary.numbers for bag in bags])
-    numbers = np.frombuffer(data, "<i8").reshape(len(bags), len(schema.topics), 3)
+    schema = bags[rows[0]].summary.schema
+    data = b"".join([bags[row].summary.numbers for row in rows])
+    numbers = np.frombuffer(data, "<i8").reshape(len(rows), len(schema.topics), 3)
     return _SchemaGroup(schema, np.array(rows, np.intp), numbers)
 
 

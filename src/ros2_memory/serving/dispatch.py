@@ -145,7 +145,7 @@ class Dispatcher:
                     call.stages.as_ms(),
                 )
                 self._report(done, name, given)
-                if not for_page:
+                if self.questions.is_on and not for_page:
                     self.questions.add(name, given, done, text)
         return reply
 

@@ -48,8 +48,6 @@ class QuestionLog:
 
     def add(self, name: str, arguments: Mapping[str, object], done: Answered, answer: str) -> None:
         """Adds a call that is over, and drops the oldest one too many. Long texts are cut."""
-        if not self.is_on:
-            return
         asked = self._wall() - ns_from_unix(done.duration_s)
         given = abbreviate(arguments, LONGEST_QUESTION)
         cut = shortened(answer, LONGEST_ANSWER)
