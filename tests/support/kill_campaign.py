@@ -218,7 +218,9 @@ def _kill(
         killed = recorder.kill_child(chance)
     else:
         killed = recorder.kill(with_children=kind == "both")
-    chosen = chance.choice(closed) if closed else None
+    # A float of seconds does not tell messages apart that were logged within a microsecond.
+    asked_for = [each for each in closed if is_alone(each, closed)]
+    chosen = chance.choice(asked_for) if asked_for else None
     questions: list[tuple[str, dict[str, Any]]] = [("list_recorded_topics", {})]
     if chosen is not None:
         questions.append(("get_position_at", {"timestamp": chosen.log_time / NS_PER_S}))
@@ -267,6 +269,11 @@ def _bytes_of(files: Sequence[Path]) -> int:
             for record in reader.records(path, topics, TimeWindow.everything()):
                 total += len(record.payload) + RECORD_OVERHEAD_BYTES
     return total
+
+
+def is_alone(tick: Tick, among: Sequence[Tick]) -> bool:
+    """Whether no other message was logged within a millisecond of this one."""
+    return sum(abs(each.log_time - tick.log_time) < NS_PER_S // 1000 for each in among) == 1
 
 
 def place_is_right(fault: Fault) -> bool:
