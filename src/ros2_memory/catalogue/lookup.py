@@ -96,6 +96,7 @@ class SegmentDigests:
         self._bounds: dict[str, FieldBounds] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
+        self._relatched: dict[str, dict[int, bool]] = {}
         self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
         self._derived: dict[str, object] = {}
 
@@ -149,6 +150,17 @@ class SegmentDigests:
         if not self.whole or len(edges) < len(self._entries_with(topic)):
             return None
         return frozenset(pair for edge in edges.values() for pair in edge.pairs)
+
+    def relatched(self, topic: str) -> Mapping[int, bool]:
+        """Returns whether another recording may have received a message of the topic before.
+
+        For each entry that has the topic.
+        """
+        return self._cached(
+            self._relatched,
+            topic,
+            lambda: self.catalogue.relatched(topic, self._entries_with(topic)),
+        )
 
     def messages(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
         """Returns all messages of the topic, for each entry that stores them.

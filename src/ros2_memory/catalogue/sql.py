@@ -47,6 +47,7 @@ STANDSTILLS: Final = "rests"
 STORY: Final = "story"
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
+RELATCHED: Final = "relatched"
 TRACK: Final = "track"
 SIGHTS: Final = "sights"
 RANGES: Final = "ranges"
@@ -218,13 +219,14 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
     edges, poses = topic.edges, topic.poses
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 10)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 11)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
             None if edges is None else edges.first_stamp,
             None if edges is None else edges.last_stamp,
             topic.kept is not None,
+            topic.relatched,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
             *_ranges(connection, number, topic),
             packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),

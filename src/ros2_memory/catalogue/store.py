@@ -34,6 +34,7 @@ from ros2_memory.catalogue.sql import (
     OWN_CONFIG,
     POSES,
     RANGES,
+    RELATCHED,
     SIGHTS,
     STANDSTILLS,
     STORY,
@@ -265,6 +266,10 @@ class Catalogue(CatalogueDatabase):
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns, by message type, why messages of the topic cannot be decoded; mostly nothing."""
         return self._of_topic(topic, numbers, UNDECODABLE, lambda row: dict(json.loads(row[1])))
+
+    def relatched(self, topic: str, numbers: Sequence[int]) -> dict[int, bool]:
+        """Returns whether another recording may have received a message of the topic before."""
+        return self._of_topic(topic, numbers, RELATCHED, lambda row: bool(row[1]))
 
     def _of_topic(
         self,

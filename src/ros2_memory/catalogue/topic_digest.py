@@ -68,6 +68,7 @@ class TopicDigest:
         events: on the topic; None where no message can be decoded.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
+        relatched: whether another recording may have received one of its messages before.
         fields: the range of each field with numbers; None where they are not known.
         undecodable: by type, why none of its messages can be decoded; mostly empty.
     """
@@ -81,6 +82,7 @@ class TopicDigest:
     kept: tuple[Record, ...] | None
     fields: Mapping[str, FieldRange] | None = None
     undecodable: tuple[tuple[str, str], ...] = ()
+    relatched: bool = False
 
 
 class _Sample(NamedTuple):
@@ -130,6 +132,7 @@ class TopicCollector:
         self._extractor = extractor
         self._templates = templates
         self._latched = latched
+        self._relatched = False
         self._zone_map = ZoneMapBuilder()
         self._fields = FieldRangesBuilder()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
@@ -147,6 +150,8 @@ class TopicCollector:
         """Takes the next message."""
         if self._kept is not None:
             self._keep(self._kept, record)
+        if self._latched and not self._relatched:
+            self._relatched = record.may_be_relatched
         self._batch.append(record)
         self._batch_bytes += len(record.payload)
         if self._batch_bytes > _BATCH_BYTES:
@@ -166,6 +171,7 @@ class TopicCollector:
             kept=tuple(self._kept) if self._kept is not None and few else None,
             fields=self._fields.ranges(),
             undecodable=tuple(undecodable.items()),
+            relatched=self._relatched,
         )
 
     def _keep(self, kept: list[Record], record: Record) -> None:

@@ -116,7 +116,7 @@ class SegmentFold(Generic[T, R]):
             return self._fold(view, topic, share, window, reading)[:2]
         inner = [edge for edge in self.edges if share.first < edge <= share.last]
         # The type of a name is one: `name` is part of it.
-        name = f"{self.name} {topic} {inner} {share.begins_in} {share.ends_in}"
+        name = f"{self.name} {topic} {inner} {share.key}"
         for_all: list[R | None] = digests.derived(name, list)
         for_this = digests.derived(f"{name} {self.question}", list) if self.question else for_all
         known = for_all or for_this

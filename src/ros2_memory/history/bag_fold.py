@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import groupby
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from itertools import count, groupby
+from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary
 
 from ros2_memory.core.model import TimeWindow
@@ -31,7 +31,9 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 _Crossings: TypeAlias = "dict[tuple[str, Segment], tuple[BagSpan, ...]]"
-_CROSSINGS: WeakKeyDictionary[Timeline, _Crossings] = WeakKeyDictionary()
+_CROSSINGS: Final[WeakKeyDictionary[Timeline, _Crossings]] = WeakKeyDictionary()
+_NUMBERS: Final[WeakKeyDictionary[Timeline, int]] = WeakKeyDictionary()
+_COUNTER: Final = count()
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Share:
         last: of the last one of all groups.
         begins_in: its bags that belong to a group of the segment before.
         ends_in: bags of the next segment that belong to its last group.
-        alone: whether these bags alone decide what is in them.
+        timeline: names the timeline where bags of other segments decide what is in these.
     """
 
     segment: Segment
@@ -52,11 +54,16 @@ class Share:
     last: Ns
     begins_in: tuple[str, ...] = ()
     ends_in: tuple[str, ...] = ()
-    alone: bool = True
+    timeline: str = ""
+
+    @property
+    def key(self) -> str:
+        """All that what is in the groups depends on besides the bags of the segment."""
+        return f"{self.begins_in} {self.ends_in} {self.timeline}"
 
     def is_covered_by(self, window: TimeWindow) -> bool:
-        """Returns whether all groups lie in a window, and no other bag matters to them."""
-        return self.alone and window.covers(self.first, self.last)
+        """Returns whether all groups lie in a window."""
+        return window.covers(self.first, self.last)
 
     def inside(self, window: TimeWindow) -> TimeWindow:
         """Returns the part of a window that holds the groups.
@@ -78,15 +85,10 @@ class Share:
 
 def shares_of(view: View, topic: str, window: TimeWindow) -> list[Share]:
     """Returns the shares of all segments with a topic in a window, in order."""
-    if view.stream.may_be_relatched([topic]):
-        # Any bag may hold the original of a duplicate in any other.
-        bags = view.stream.overlapping_bags([topic], window)
-        if not bags:
-            return []
-        segment = view.snapshot.timeline.segment_of(bags[0].bag)
-        return [Share(segment, bags[0].first, max(each.last for each in bags), alone=False)]
+    timeline = view.snapshot.timeline
+    number = _NUMBERS.setdefault(timeline, next(_COUNTER))
     shares: list[Share] = []
-    for segment in view.snapshot.timeline.segments:
+    for segment in timeline.segments:
         span = segment.spans.get(topic)
         if span is None or not window.overlaps(*span):
             continue
@@ -99,7 +101,21 @@ def shares_of(view: View, topic: str, window: TimeWindow) -> list[Share]:
             shares.append(Share(segment, *span, begins_in=names))
         else:
             shares.append(Share(segment, *span))
+        if _may_hold_relatched(view, topic, segment):
+            # Any bag may hold the original of a duplicate in these, and in the group before.
+            which = f"timeline {number}"
+            shares[-1] = replace(shares[-1], timeline=which)
+            if crossing:
+                shares[-2] = replace(shares[-2], timeline=which)
     return shares
+
+
+def _may_hold_relatched(view: View, topic: str, segment: Segment) -> bool:
+    if not view.stream.may_be_relatched([topic]):
+        return False
+    digests = view.bags.digests_of(segment)
+    known = {} if digests is None else digests.relatched(topic)
+    return len(known) < len(segment.bags_with(topic)) or any(known.values())
 
 
 def _crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:
@@ -169,7 +185,7 @@ class Fold(Generic[T, R]):
             stored = StoredDigests(view, topic, self.kind, share.inside(window))
             known = None
             if digests is not None and share.is_covered_by(window):
-                name = f"{topic} {share.begins_in} {share.ends_in}"
+                name = f"{topic} {share.key}"
                 groups = partial(share.groups, view, topic, window)
                 known = self._reduced(digests, name, stored, groups)
             if known is not None:
@@ -177,7 +193,7 @@ class Fold(Generic[T, R]):
                 continue
             for is_whole, run in groupby(share.groups(view, topic, window), _is_whole):
                 if is_whole:
-                    spans += self._whole(digests, topic, stored, [*run])
+                    spans += self._whole(digests, f"{topic} {share.timeline}", stored, [*run])
                     continue
                 found = [self.add(group.messages()) for group in run]
                 spans += [span for span in found if span is not None]
@@ -186,7 +202,7 @@ class Fold(Generic[T, R]):
     def _whole(
         self,
         digests: SegmentDigests | None,
-        topic: str,
+        name: str,
         stored: StoredDigests[T],
         run: Sequence[Group],
     ) -> Iterator[Span]:
@@ -194,7 +210,7 @@ class Fold(Generic[T, R]):
         known = None
         if digests is not None and len(run) > 1:
             # Bags of other segments decide which bags are one group.
-            name = f"{topic} {run[0].bags[0].bag.file} {[len(each.bags) for each in run]}"
+            name = f"{name} {run[0].bags[0].bag.file} {[len(each.bags) for each in run]}"
             known = self._reduced(digests, name, stored, partial(iter, run))
         if known is None:
             found = [self._digest(stored, group) for group in run]

@@ -12,7 +12,8 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar, cast
+from weakref import WeakKeyDictionary
 
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
@@ -26,12 +27,14 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.merged_stream import MergedStream
     from ros2_memory.history.view import View
+    from ros2_memory.index.timeline import Timeline
 
 T = TypeVar("T")
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
 
+_RELATCHED: Final[WeakKeyDictionary[Timeline, dict[object, object]]] = WeakKeyDictionary()
 _ONE_BY_ONE: Final = 8
 """Groups of several bags whose digests are looked up one by one; then all are read."""
 
@@ -133,8 +136,6 @@ class Group:
 def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Group]:
     """Returns the groups of bags that hold messages of the topic in the window, in order."""
     bags = stream.overlapping_bags([topic], window)
-    if stream.may_be_relatched([topic]) and bags:
-        return [Group(stream, topic, window, bags, may_be_relatched=True)]
     groups: list[list[BagSpan]] = []
     latest: dict[Path, Ns] = {}
     for each in bags:
@@ -153,7 +154,17 @@ def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Grou
         else:
             groups.append([each])
         latest[recording] = each.last if before is None else max(before, each.last)
-    return [Group(stream, topic, window, group) for group in groups]
+    relatched = stream.relatched_bags(topic, bags)
+    return [
+        Group(
+            stream,
+            topic,
+            window,
+            group,
+            may_be_relatched=any(each.bag.file in relatched for each in group),
+        )
+        for group in groups
+    ]
 
 
 def _belongs(first: Ns, recording: Path, latest: Mapping[Path, Ns]) -> bool:
@@ -198,11 +209,12 @@ class StoredDigests(Generic[T]):
         self._known: Mapping[int, T] = {}
         self._asked = 0
         self._answers: Mapping[tuple[int, ...], str] | None = None
+        self._relatched = _RELATCHED.setdefault(view.snapshot.timeline, {})
 
     def of(self, group: Group) -> tuple[T, Span] | None:
         """Returns a group's digest and the times of its first and last message, if stored."""
         if group.may_be_relatched:
-            return None
+            return cast("dict[object, tuple[T, Span]]", self._relatched).get(self._key(group))
         if len(group.bags) > 1:
             return self._of_several(group)
         [span] = group.bags
@@ -248,11 +260,18 @@ class StoredDigests(Generic[T]):
     def store(self, group: Group, digest: T, span: Span) -> None:
         """Stores the digest of bags that hold duplicates of each other, for the next question.
 
-        The catalogue's own entries are of single bags.
+        The catalogue's own entries are of single bags. Where bags outside of the group matter, it
+        lasts until a bag comes or goes.
         """
-        if len(group.bags) > 1 and not group.may_be_relatched:
+        if group.may_be_relatched:
+            if self._view.bags.notes.complete:
+                self._relatched[self._key(group)] = (digest, span)
+        elif len(group.bags) > 1:
             answer = json.dumps([self._kind.encode(digest).hex(), *span])
             self._view.bags.cache_answer(self._question, group.bags, answer)
+
+    def _key(self, group: Group) -> tuple[str, tuple[str, ...]]:
+        return self._question, tuple(each.bag.file for each in group.bags)
 
     def _decode(self, answer: str) -> tuple[T, Span]:
         digest, first, last = json.loads(answer)

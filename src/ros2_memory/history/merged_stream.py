@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import heapq
 from bisect import bisect_left, bisect_right
-from collections import Counter, deque
+from collections import deque
 from functools import partial
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S
+from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
     COPY_HORIZON_NS,
     BagSpan,
@@ -38,11 +38,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.index.segment import Segment
 
-RELATCHED_NS: Final[Ns] = NS_PER_S
-"""A latched message logged so long after it was published may have been received before."""
-_MAX_SEARCHES: Final = 8
-"""After so many single searches on a topic, one pass finds the first copies of all its messages."""
-
 
 class MergedStream:
     """Reads all bags of one call together."""
@@ -51,7 +46,7 @@ class MergedStream:
         self.bags = bags
         self._timeline = bags.snapshot.timeline
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
-        self._searches: Counter[str] = Counter()
+        self._searched: dict[str, Spans] = {}
 
     def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
         """Returns the bags that hold messages of these topics in the window, in order.
@@ -178,39 +173,51 @@ class MergedStream:
             for topic in topics
         )
 
+    def relatched_bags(self, topic: str, among: Iterable[BagSpan]) -> set[str]:
+        """Returns the bags in which a message may be that another recording received before.
+
+        The catalogue knows it of the bags with an entry.
+        """
+        found: set[str] = set()
+        if self.may_be_relatched([topic]):
+            for _, _, bag in among:
+                entry = self.bags.entry(bag)
+                if entry is None or entry[0].relatched(topic).get(entry[1], True):
+                    found.add(bag.file)
+        return found
+
     def find_first_copy(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        if _is_late(found) and self.may_be_relatched([found.record.channel.topic]):
-            record = found.record
-            self._find_first_copies(record.channel.topic, _since_published(found), copy_key(record))
+        topic = found.record.channel.topic
+        if found.record.may_be_relatched and self.may_be_relatched([topic]):
+            self._find_first_copies(topic, _since_published(found), found.time + 1)
 
     def _is_relatched(self, found: StoredMessage) -> bool:
         record = found.record
-        if not _is_late(found):
+        if not record.may_be_relatched:
             return False
-        topic, key = record.channel.topic, copy_key(record)
-        if key not in self._first_copies:
-            self._searches[topic] += 1
-            if self._searches[topic] > _MAX_SEARCHES:
-                self._find_first_copies(topic, TimeWindow.everything())
-            else:
-                self._find_first_copies(topic, _since_published(found), key)
-        first = self._first_copies.get(key, (found.time, found.bag.recording))
+        self._find_first_copies(record.channel.topic, _since_published(found), found.bag.end + 1)
+        first = self._first_copies.get(copy_key(record), (found.time, found.bag.recording))
         return found.time > first[0] and found.bag.recording != first[1]
 
-    def _find_first_copies(self, topic: str, window: TimeWindow, only: Copy | None = None) -> None:
-        """Records where the messages in a window were received first; of `only` one if given.
+    def _find_first_copies(self, topic: str, window: TimeWindow, ahead: Ns) -> None:
+        """Records where the messages in a window were received first.
 
-        One pass for all of a topic replaces one for each of many: where publish times mean nothing,
-        such as those of a simulated clock.
+        Late messages come many at once: the first search goes on up to `ahead`, and back by its own
+        length again, so that a few serve all.
         """
-        bags = self.overlapping_bags([topic], window)
-        for each in self.merged(bags, [topic], window, newest_first=False):
-            key = copy_key(each.record)
-            if only is None or key == only:
-                self._first_copies.setdefault(key, (each.time, each.bag.recording))
-            if key == only:
-                return
+        searched = self._searched.setdefault(topic, [])
+        if not without([(window.start, window.stop)], searched):
+            return
+        back = max(window.start - (window.stop - window.start), MIN_NS)
+        missing = without([(back, max(window.stop, min(ahead, MAX_NS)))], searched)
+        for start, stop in missing:
+            part = TimeWindow(start, stop)
+            bags = self.overlapping_bags([topic], part)
+            for each in self.merged(bags, [topic], part, newest_first=False, since=window.start):
+                key, first = copy_key(each.record), (each.time, each.bag.recording)
+                self._first_copies[key] = min(first, self._first_copies.get(key, first))
+        self._searched[topic] = united([*searched, *missing])
 
     def merged(
         self,
@@ -254,11 +261,6 @@ class MergedStream:
                 _, rank, found, source = heapq.heappop(heap)
                 yield found
                 push(rank, source)
-
-
-def _is_late(found: StoredMessage) -> bool:
-    record = found.record
-    return record.channel.latched and found.time - record.publish_time > RELATCHED_NS
 
 
 def _since_published(found: StoredMessage) -> TimeWindow:

@@ -107,12 +107,17 @@ class View:
 
     def _census(self, topic: str) -> dict[str, Census]:
         everything = TimeWindow.everything()
-        if self.stream.may_be_relatched([topic]):
-            return _counted(self.stream.messages([topic], everything))
         counted = {
             type_name: Census(*stated)
             for type_name, stated in self.snapshot.timeline.totals(topic).items()
         }
+        if self.stream.may_be_relatched([topic]):
+            newest = self.stream.newest(topic, everything)
+            if len(counted) != 1 or newest is None:
+                return _counted(self.stream.messages([topic], everything))
+            [(type_name, known)] = counted.items()
+            count = sum(group.count() for group in groups_of(self.stream, topic, everything))
+            return {type_name: Census(known.first, newest.time, count)}
         for span in self.stream.duplicate_spans(topic, everything):
             for type_name, (stored, once) in self._overlap_census(topic, TimeWindow(*span)).items():
                 known = counted[type_name]

@@ -205,7 +205,7 @@ def _collect(
     candidates = search.candidates(window.stop)
     before = window.stop
     try:
-        parts = _parts(view, search.topics, candidates.windows(), window)
+        parts = _parts(candidates.windows(), window)
         for part, topics in scope.narrowed(parts):
             found.end_silent(part.stop)
             _end_in_gap(view, found, TimeWindow(part.stop, max(before, part.stop)))
@@ -332,13 +332,9 @@ class _Sightings:
 
 
 def _parts(
-    view: View, topics: Sequence[str], windows: Iterator[SearchWindow], window: TimeWindow
+    windows: Iterator[SearchWindow], window: TimeWindow
 ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
     """Yields the parts of a window in which topics can have matches, and these, newest first."""
-    if view.stream.may_be_relatched(topics):
-        # A sighting may be ended by the duplicate of a message in a bag that is ruled out.
-        yield window, topics
-        return
     for each in windows:
         if each.window.stop <= window.start:
             return
@@ -352,8 +348,11 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     if gap.empty:
         return False
     held = view.stream.overlapping_bags([topic], gap)
+    relatched = view.stream.relatched_bags(topic, held)
     if len({each.bag.recording for each in held}) == 1 and any(
-        gap.contains(each.first) or gap.contains(each.last) for each in held
+        gap.contains(each.first) or gap.contains(each.last)
+        for each in held
+        if each.bag.file not in relatched
     ):
         return True
     return bool(held) and view.stream.first([topic], gap) is not None

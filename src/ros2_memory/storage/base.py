@@ -17,6 +17,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -24,9 +25,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
 
 
+RELATCHED_NS: Final[Ns] = NS_PER_S
+"""A latched message logged so long after it was published may have been received before."""
 ROS2_PROFILE: Final = "ros2"
 """The profile of every rosbag2 file; other readers of ROS 2 bags refuse every other."""
 
@@ -86,6 +88,11 @@ class Record(NamedTuple):
     log_time: Ns
     publish_time: Ns
     payload: bytes
+
+    @property
+    def may_be_relatched(self) -> bool:
+        """Whether another recording may have received this very message before."""
+        return self.channel.latched and self.log_time - self.publish_time > RELATCHED_NS
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.history import merged_stream
 from ros2_memory.retention import latched_carry
 from ros2_memory.retention.latched_carry import Latched, MessageIdentity, worth_carrying
+from ros2_memory.storage import base as storage_base
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,4 +66,4 @@ def during(moment: int) -> Callable[[int, int], bool]:
 
 
 def test_what_may_have_been_received_before_is_what_questions_take_for_it() -> None:
-    assert latched_carry.RECEIVED_AGAIN_NS <= merged_stream.RELATCHED_NS
+    assert latched_carry.RECEIVED_AGAIN_NS <= storage_base.RELATCHED_NS
