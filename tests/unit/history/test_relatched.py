@@ -54,7 +54,7 @@ def write_recordings(root: Path, draw: random.Random) -> list[Stored]:
         if draw.random() < 0.3 and again:  # a publisher that was lost for a while
             was, said = draw.choice(again)
             messages.append((at + S, was, said))
-        at = max(at, max(each[0] for each in messages))
+        at = max(at, *(each[0] for each in messages))
         for log_time, was, said in sorted(messages):
             stored.append((log_time, was, said, number))
         write_splits(root / f"rec{number}", sorted(messages), start, at)
