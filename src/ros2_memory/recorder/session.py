@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.recorder.process.command import MESSAGES_LOST
 from ros2_memory.recorder.process.output import LineKind, parse_line
 from ros2_memory.storage.base import Closing
@@ -40,9 +41,9 @@ _REPORTED: Final = frozenset(LineKind) - {LineKind.OTHER, LineKind.FLUSHING}
 class SplitChanges:
     """What changed since the last observation.
 
-    `closed` names splits, and `empty` all those that are empty though a newer one was seen. `gone`:
-    the directory existed and does not any more. `faults` are sentences about what could not be
-    read.
+    `closed` names splits in the order in which they were recorded, and `empty` all those that are
+    empty though a newer one was seen. `gone`: the directory existed and does not any more. `faults`
+    are sentences about what could not be read.
     """
 
     closed: tuple[str, ...] = ()
@@ -56,6 +57,7 @@ class _Split:
     first_seen_s: float
     size: int = 0
     closed: bool = False
+    start: Ns = MAX_NS
 
 
 @dataclass(slots=True)
@@ -91,7 +93,8 @@ class Splits:
             split = self._files.setdefault(name, _Split(now_s))
             split.size = max(split.size, size)
         faults: list[str] = []
-        closed = tuple(name for name in sizes if self._has_closed(name, faults))
+        closed = [name for name in sizes if self._has_closed(name, faults)]
+        closed.sort(key=lambda name: (self._files[name].start, name))
         newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
         overdue = now_s - newest_s >= EMPTY_GRACE_S
         empty = tuple(
@@ -99,7 +102,7 @@ class Splits:
             for name, size in sizes.items()
             if overdue and not size and newest_s > self._files[name].first_seen_s
         )
-        return SplitChanges(closed, empty, faults=tuple(faults))
+        return SplitChanges(tuple(closed), empty, faults=tuple(faults))
 
     @property
     def bytes_written(self) -> int:
@@ -143,6 +146,8 @@ class Splits:
         except OSError as error:
             faults.append(f"{path}: {error.strerror or error}")
             return split.closed
+        if not summary.empty:
+            split.start = summary.start
         self.received.update(topic.topic for topic in summary.topics)
         self.messages += summary.count
         return True

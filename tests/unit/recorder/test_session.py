@@ -42,6 +42,14 @@ def test_a_split_is_reported_once_when_it_closes(splits: Splits) -> None:
     assert splits.names() == {"rec_1_0.mcap", "rec_1_1.mcap"}
 
 
+def test_splits_that_close_at_once_are_reported_in_the_order_of_recording(splits: Splits) -> None:
+    """A directory lists its files in any order, and names are numbered without leading zeros."""
+    for number in reversed(range(14)):
+        at = T0 + number * 10**9
+        write_mcap(splits.directory / f"rec_1_{number}.mcap", [boolean(at, True, "/a")])
+    assert splits.observe(0).closed == tuple(f"rec_1_{number}.mcap" for number in range(14))
+
+
 def test_what_was_heard_is_counted_over_closed_splits_alone(splits: Splits) -> None:
     write(splits, 0, "/a", "/a", "/b")
     write(splits, 1, "/c", finish=False)
