@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.duplicates import (
     COPY_HORIZON_NS,
     BagSpan,
@@ -188,29 +188,33 @@ class MergedStream:
 
     def find_first_copy(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        topic = found.record.channel.topic
+        topic, window = found.record.channel.topic, _since_published(found)
         if found.record.may_be_relatched and self.may_be_relatched([topic]):
-            self._find_first_copies(topic, _since_published(found), found.time + 1)
+            bags = self.overlapping_bags([topic], window)
+            copies = self.merged(bags, [topic], window, newest_first=False)
+            key = copy_key(found.record)
+            next((each for each in copies if copy_key(each.record) == key), None)
 
     def _is_relatched(self, found: StoredMessage) -> bool:
         record = found.record
         if not record.may_be_relatched:
             return False
-        self._find_first_copies(record.channel.topic, _since_published(found), found.bag.end + 1)
+        self._find_first_copies(found)
         first = self._first_copies.get(copy_key(record), (found.time, found.bag.recording))
         return found.time > first[0] and found.bag.recording != first[1]
 
-    def _find_first_copies(self, topic: str, window: TimeWindow, ahead: Ns) -> None:
-        """Records where the messages in a window were received first.
+    def _find_first_copies(self, late: StoredMessage) -> None:
+        """Records where messages were received first that a late one may have been received with.
 
-        Late messages come many at once: the first search goes on up to `ahead`, and back by its own
-        length again, so that a few serve all.
+        Late messages come many at once: the search goes on to the end of the bag, and back by its
+        own length again, so that a few serve all.
         """
+        topic, window = late.record.channel.topic, _since_published(late)
         searched = self._searched.setdefault(topic, [])
         if not without([(window.start, window.stop)], searched):
             return
         back = max(window.start - (window.stop - window.start), MIN_NS)
-        missing = without([(back, max(window.stop, min(ahead, MAX_NS)))], searched)
+        missing = without([(back, max(window.stop, late.bag.end + 1))], searched)
         for start, stop in missing:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
