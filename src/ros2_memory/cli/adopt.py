@@ -38,7 +38,7 @@ _INSTEAD = "move or mount the bags into the bag directory"
 def adopt(
     directories: Annotated[
         list[Path],
-        typer.Argument(metavar="DIR", help="Directories of bags, in the bag directory."),
+        typer.Argument(metavar="DIR", help="Folders of bags, inside the bag directory."),
     ],
     sets: Sets = None,
     as_json: AsJson = False,
@@ -46,9 +46,9 @@ def adopt(
 ) -> None:
     """Let the recorder delete bags that it did not make, as if it had made them.
 
-    Takes the bags in each directory and below it: copies, restored recordings, those of other
+    Adopts the bags in each folder and below it: copies, restored recordings, bags of other
     programs. From then on retention counts them in its budget and deletes them by its limits, and
-    `forget` deletes them too. Nothing is deleted or changed here.
+    `forget` deletes them too. adopt itself deletes and changes nothing.
     """
     settings = load_for(bag_dir, sets)
     require_recorder(settings)

@@ -38,105 +38,102 @@ class CommandEntry(NamedTuple):
 COMMANDS: Final[Mapping[str, CommandEntry]] = {
     "ask": CommandEntry(
         "ask.ask",
-        "ask any tool of the server, in process",
+        "call any tool of the server, without a server",
         {
-            0: "there is an answer, also that it was never so (null)",
-            1: "there is none: the reply is an error, which says why",
+            0: "the tool answered, also with null (never)",
+            1: "the tool returned an error, which gives the reason",
         },
     ),
     "topics": CommandEntry(
         "listing.info.topics",
         "every recorded topic, with its rate",
-        {0: "there are some", 1: "nothing is recorded"},
+        {0: "topics are listed", 1: "nothing is recorded"},
     ),
     "info": CommandEntry(
         "listing.info.info",
-        "what there is: how much, from when to when, gaps, damage, budget",
-        {0: "it was shown", 1: "there are no bags"},
+        "what is recorded: size, time range, gaps, damage, budget",
+        {0: "there are bags", 1: "there are none"},
     ),
     "recordings": CommandEntry(
         "listing.recordings.recordings",
-        "every recording: start, length, size, storage, whose",
-        {0: "there are some", 1: "there are none"},
+        "every recording: start, length, size, storage, maker",
+        {0: "recordings are listed", 1: "there are none"},
     ),
     "cat": CommandEntry(
         "listing.cat.cat",
         "the messages of a topic, as text, CSV or JSON lines",
         {
-            0: "there are some, and all were printed",
-            1: "there are none, or stderr says what could not be read",
+            0: "all messages were printed",
+            1: "there are none, or some could not be read (see stderr)",
         },
     ),
     "plot": CommandEntry(
         "plot.commands.plot",
-        "pictures: path, signal, timeline, recap of a day",
-        {0: "the picture is written", 2: "it is not, and stderr says why"},
+        "draw the path, a signal, the timeline or the recap of a day",
+        {0: "the picture is written", 2: "it is not (stderr gives the reason)"},
     ),
     "watch": CommandEntry(
         "watch.watch",
-        "what is being recorded just now",
-        {0: "it was ended, by --count or Ctrl-C, whatever it saw"},
+        "show live what is being recorded",
+        {0: "ended by --count or Ctrl-C, whatever it showed"},
     ),
     "doctor": CommandEntry(
         "doctor.doctor",
-        "look for what is wrong, and say what to do",
-        {0: "all is in order", 1: "something wants attention", 2: "something does not work"},
+        "find problems, and say how to fix them",
+        {0: "no problems", 1: "warnings", 2: "errors"},
     ),
     "export": CommandEntry(
         "export.export",
-        "a time window as MCAP or Parquet",
+        "copy a time window to MCAP or Parquet",
         {
-            0: "all of the window was copied",
-            1: "what could be read of it was; stderr says what could not",
+            0: "the whole window was copied",
+            1: "part of it could not be read (stderr names it)",
         },
     ),
     "forget": CommandEntry(
         "forget.forget",
-        "delete a time window, after asking",
+        "delete a time window, after confirmation",
         {
-            0: "all that lies in the window is deleted (with --dry-run: would be), or there is "
-            "nothing",
-            1: "something in the window stays and is named, or the question was answered with no",
+            0: "everything in the window is deleted (with --dry-run: would be), or it is empty",
+            1: "some of it stays and is named, or you answered no",
         },
     ),
     "adopt": CommandEntry(
         "adopt.adopt",
         "let the recorder delete bags that it did not make",
-        {0: "the bags are the recorder's own now, or were before", 1: "no bag files lie there"},
+        {0: "the recorder owns the bags now, or did before", 1: "there are no bag files"},
     ),
     "demo": CommandEntry(
         "app.demo",
-        "a simulated robot, asked questions with known answers",
-        {0: "all answers were right", 1: "one was wrong"},
+        "ask a simulated robot questions with known answers",
+        {0: "all answers were right", 1: "an answer was wrong"},
     ),
     "serve": CommandEntry(
         "serve.serve",
-        "answer questions over MCP, as ros2-memory-server",
-        {0: "it was ended", 1: "it cannot listen on the address"},
+        "answer questions over MCP, like ros2-memory-server",
+        {0: "the server was stopped", 1: "it cannot listen on the address"},
     ),
     "index": CommandEntry(
         "index.index",
-        "look into every bag once, so that answers take milliseconds",
-        {0: "every bag was looked into, or was found to be one that cannot be"},
+        "index every bag now, so that answers take milliseconds",
+        {0: "every bag that can be indexed is indexed"},
     ),
     "recover": CommandEntry(
         "recover.recover",
-        "repair MCAP files that were left unfinished",
+        "repair unfinished MCAP files",
         {0: "every file is whole", 1: "a file could not be repaired"},
     ),
-    "config": CommandEntry(
-        "config.config", "the configuration as it is composed", {0: "it was shown"}
-    ),
+    "config": CommandEntry("config.config", "show the configuration in force", {0: "it was shown"}),
 }
 COMMON_EXIT_CODES: Final[Mapping[int, str]] = {
-    2: "it could not run, and stderr says why",
-    INTERRUPTED: "it was interrupted before it was done",
+    2: "the command could not run (stderr gives the reason)",
+    INTERRUPTED: "interrupted before it finished",
 }
 """The exit codes of every command, unless its own entry gives a code another meaning."""
 
 app = typer.Typer(
     name="ros2-memory",
-    help="A robot's episodic memory: tools for people.",
+    help="A robot's episodic memory: ask, inspect, export and maintain its bags.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -148,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line (`sys.argv` unless given) and returns the exit code.
 
     0: done, and the answer is yes; 1: an answer was wrong or missing, or something was left undone;
-    2: it could not run, and stderr says why; 130: interrupted before it was done.
+    2: it could not run, and stderr says why; 130: interrupted before it finished.
     """
     try:
         with _as_keyboard_interrupt(signal.SIGTERM, signal.SIGHUP):
@@ -222,7 +219,10 @@ def _print_version(requested: bool) -> None:
 @app.callback()
 def _options_of_all(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show it.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
     ] = False,
 ) -> None:
     del version
@@ -230,30 +230,28 @@ def _options_of_all(
 
 def demo(
     once: Annotated[
-        bool, typer.Option("--once", help="Leave after the answers; exit code 1: one was wrong.")
+        bool, typer.Option("--once", help="Exit after the answers; code 1 if one was wrong.")
     ] = False,
     *,
-    port: Annotated[int, typer.Option(help="On 127.0.0.1; 0: any that is free.")] = 9203,
+    port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 picks a free one.")] = 9203,
     bag_dir: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR", help="A new or empty folder, kept (a temporary one, removed at the end)."
-        ),
+        typer.Option(metavar="DIR", help="Keep the bags in this new or empty folder."),
     ] = None,
     duration: Annotated[
         float,
-        typer.Option(metavar="S", help="Seconds of history when the questions are asked."),
+        typer.Option(metavar="S", help="Seconds to record before the questions."),
     ] = 120.0,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Show the server's log on stderr.")
     ] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="A line of JSON for each question, for programs.")
+        bool, typer.Option("--json", help="Print a line of JSON for each question.")
     ] = False,
 ) -> None:
-    """A simulated robot, its bags, the query server and a client that asks it questions.
+    """Simulate a robot, record it, and ask the server questions about it.
 
-    Every answer is held against what the robot did. Needs no ROS and no configuration.
+    Every answer is checked against what the robot did. Needs no ROS and no configuration.
     """
     # Imported here, so that no other command waits for the demo's libraries.
     from ros2_memory.cli.options import print_line  # noqa: PLC0415

@@ -56,13 +56,15 @@ def ask(
     tool: Annotated[
         str | None,
         typer.Argument(
-            metavar="TOOL", help="Its name; none: they are listed.", autocompletion=complete
+            metavar="TOOL",
+            help="The name of the tool. Without it, ask lists the tools.",
+            autocompletion=complete,
         ),
     ] = None,
     given: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="key=value|JSON", help="What the tool is asked; and settings (data.now=latest)."
+            metavar="key=value|JSON", help="Arguments of the tool, and settings (data.now=latest)."
         ),
     ] = None,
     *,
@@ -72,11 +74,11 @@ def ask(
     settings: Sets = None,
     verbose: Verbose = False,
 ) -> None:
-    """Ask any tool of the query server, without a server.
+    """Call any tool of the query server, without a server.
 
-    Values are JSON where they read as such (seconds_ago=10, value=true), else text; times and
-    durations also as people write them (start=14:05, seconds_ago=10m). With --json the reply is
-    exactly what an MCP client receives.
+    Values are read as JSON if they are JSON (seconds_ago=10, value=true), else as text. You can
+    write times and durations as start=14:05 or seconds_ago=10m. --json prints exactly what an MCP
+    client receives.
     """
     words = [*(given or ())]
     if tool is not None and _SETTING.fullmatch(tool):

@@ -25,7 +25,7 @@ from ros2_memory.core.model import JsonValue
 _MASK: Final = "********"
 
 config = typer.Typer(
-    help="The configuration, as the programs see it.", no_args_is_help=True, rich_markup_mode=None
+    help="The configuration that the programs use.", no_args_is_help=True, rich_markup_mode=None
 )
 
 
@@ -34,12 +34,12 @@ config = typer.Typer(
 def config_show(
     overrides: Overrides = None,
     bag_dir: BagDir = None,
-    sources: Annotated[bool, typer.Option("--sources", help="Say of each key who set it.")] = False,
+    sources: Annotated[bool, typer.Option("--sources", help="Show what set each key.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """The configuration as YAML, composed of files, environment and arguments; no secrets.
+    """Show the configuration as YAML, composed of files, environment and arguments; no secrets.
 
-    A comment shows whether there is a token for the server, never what it is.
+    A comment shows whether the server has a token, never the token itself.
     """
     settings, source = load_with_sources(bag_dir, overrides)
     if as_json:

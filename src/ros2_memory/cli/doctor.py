@@ -108,7 +108,7 @@ def doctor(
 ) -> None:
     """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
 
-    Each finding says what to do.
+    Each finding says how to fix it.
     """
     findings = [*_examine(bag_dir, words, recording, verbose=verbose)]
     worst = max(each.level for each in findings)

@@ -52,18 +52,19 @@ def export(
     mcap: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="An MCAP file to make, for Foxglove, ros2 bag and rosbags."
+            metavar="FILE", help="Write this MCAP file, for Foxglove, ros2 bag and rosbags."
         ),
     ] = None,
     parquet: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="A folder of Parquet, by recording and date, for DuckDB or Spark."
+            metavar="DIR",
+            help="Write Parquet to this folder, by recording and date, for DuckDB or Spark.",
         ),
     ] = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option(metavar="GLOB", help="Only these topics, such as /vision/*; repeatable."),
+        typer.Option(metavar="GLOB", help="Copy only these topics, such as /vision/*; repeatable."),
     ] = None,
     start: Start = None,
     end: End = None,
@@ -72,22 +73,24 @@ def export(
         bool,
         typer.Option(
             "--latched",
-            help="Also what latched messages held when the window begins: maps, static transforms.",
+            help="Also copy the latched messages valid at the start: maps, static transforms.",
         ),
     ] = False,
     robot: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Parquet by robot, too: one dataset for a fleet."),
+        typer.Option(
+            metavar="NAME", help="Partition Parquet by robot, too: one dataset for a fleet."
+        ),
     ] = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """Copy a time window out of the memory, each message once.
+    """Copy a time window to MCAP or Parquet, each message once.
 
-    MCAP has the original messages, definitions, log and publish times. Parquet has one row for a
-    message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet].
+    MCAP keeps the original messages, definitions, log and publish times. Parquet has one row for
+    each message: its fields as JSON, and its pose in columns. Parquet needs ros2-memory[parquet].
     """
     if (mcap is None) == (parquet is None):
         raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")

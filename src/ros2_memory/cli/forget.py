@@ -86,30 +86,32 @@ def forget(
     topic: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="GLOB", help="Only messages of these topics, out of all bags; repeatable."
+            metavar="GLOB", help="Delete only messages of these topics, from all bags; repeatable."
         ),
     ] = None,
     where: Annotated[
         str | None,
-        typer.Option(metavar="PLACE", help="Only messages of when the robot was in a named place."),
+        typer.Option(
+            metavar="PLACE", help="Delete only messages from when the robot was in a named place."
+        ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only say what would be deleted.")
+        bool, typer.Option("--dry-run", help="Show what would be deleted, and delete nothing.")
     ] = False,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     verbose: Verbose = False,
 ) -> None:
-    """Delete the closed bags that lie wholly inside a time window, after asking.
+    """Delete the closed bags that lie wholly inside a time window, after confirmation.
 
-    With --topic or --where, messages are taken out of the bags that hold them: every other message
-    stays as it is. An interrupted one is finished by the next `forget`, which says so.
+    With --topic or --where, forget removes messages from the bags instead, and every other message
+    stays as it is. If it is interrupted, the next `forget` finishes the work and says so.
 
-    What reaches beyond it stays, and so do what is being written and, unless
-    retention.foreign=delete, bags that this deployment's recorder did not make; all are named.
-    Latched messages (maps, static transforms) that later answers need are carried on. Only where
-    this deployment records.
+    Kept, and named: bags that reach beyond the window, bags being written, and bags that this
+    deployment's recorder did not make (unless retention.foreign=delete). Latched messages (maps,
+    static transforms) that later answers need are copied forward. Works only where this deployment
+    records.
     """
     collect_lines(as_json, is_answered=yes or dry_run)
     settings = load_for(bag_dir, overrides)

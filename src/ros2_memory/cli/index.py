@@ -51,10 +51,10 @@ def index(
     verbose: Verbose = False,
     for_server: Annotated[int | None, typer.Option(metavar="PID", hidden=True)] = None,
 ) -> None:
-    """Look into every bag once, so that questions about a week take milliseconds.
+    """Index every bag now, so that questions about a week take milliseconds.
 
-    Fills the catalogue of the bags at once, with the settings of the server. The server does the
-    same by itself, in the background; no answer depends on it.
+    Fills the catalogue of the bags, with the settings of the server. The server also does this in
+    the background; the catalogue changes how fast answers are, not what they say.
     """
     settings = load_for(bag_dir, overrides)
     if for_server is None:

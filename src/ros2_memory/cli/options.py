@@ -64,19 +64,19 @@ _PIPE_WIDTH: Final = 160
 BagDir = Annotated[
     Path | None,
     typer.Option(
-        "--bag-dir", metavar="DIR", help="The bags to look at, instead of recording.bag_dir."
+        "--bag-dir", metavar="DIR", help="Use the bags in this folder instead of recording.bag_dir."
     ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Argument(metavar="key=value", help="Settings, as for ros2-memory-server."),
+    typer.Argument(metavar="key=value", help="Settings, the same as for ros2-memory-server."),
 ]
 Words = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="PATH|key=value",
-        help="A bag or a folder of bags to look at, instead of recording.bag_dir; and settings, as "
-        "for ros2-memory-server.",
+        help="A bag or a folder of bags to use instead of recording.bag_dir; and settings, the "
+        "same as for ros2-memory-server.",
     ),
 ]
 Recording = Annotated[
@@ -84,28 +84,33 @@ Recording = Annotated[
     typer.Option(
         "--recording",
         metavar="NAME",
-        help="This recording alone: a name of `ros2-memory recordings`.",
+        help="Use this recording only, by a name that `ros2-memory recordings` lists.",
     ),
 ]
 Sets = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="key=value", help="A setting, as for ros2-memory-server."),
+    typer.Option(
+        "--set", metavar="key=value", help="A setting, the same as for ros2-memory-server."
+    ),
 ]
 Verbose = Annotated[
     bool,
-    typer.Option("--verbose", "-v", help="Show the log on stderr, from logging.level on."),
+    typer.Option("--verbose", "-v", help="Show the log on stderr, at logging.level."),
 ]
 _LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
-AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, for programs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Start = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help=f"From here on: {TIMES}; local time."),
+    typer.Option(metavar="TIME", help=f"Start time: {TIMES}; local time."),
 ]
-End = Annotated[str | None, typer.Option(metavar="TIME", help="Up to here, inclusive; likewise.")]
+End = Annotated[
+    str | None, typer.Option(metavar="TIME", help="End time, inclusive, in the same formats.")
+]
 Last = Annotated[
-    float | None, typer.Option(metavar="S", help="The last seconds, instead of a start and an end.")
+    float | None,
+    typer.Option(metavar="S", help="The last S seconds, instead of --start and --end."),
 ]
 
 

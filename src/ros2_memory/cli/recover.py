@@ -37,21 +37,21 @@ _MCAP: Final = ".mcap"
 
 def recover(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="An MCAP file, or a directory of recordings.")
+        Path, typer.Argument(metavar="PATH", help="An MCAP file, or a folder of recordings.")
     ],
     force: Annotated[
         bool,
         typer.Option(
             "--force",
-            help="Also files that changed in the last half minute; nothing must be writing them.",
+            help="Also repair files that changed in the last 30 s. Make sure nothing writes them.",
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repair MCAP files that a crash, a full disk or a pulled plug left unfinished.
+    """Repair MCAP files that a crash, a full disk or a power cut left unfinished.
 
-    Rewrites each from all that can be read of it, in place: the original stays until the whole one
-    has been read back and is on the disk. Files of 0 bytes are removed.
+    Rewrites each file in place from everything that can be read of it, and keeps the original until
+    the new file has been read back and is on the disk. Removes files of 0 bytes.
     """
     lines: list[str] = []
     outcome = recover_files(path, lines.append if as_json else print_line, force=force)

@@ -8,9 +8,9 @@ from ros2_memory.config_sources import quoted
 
 
 def serve(overrides: Overrides = None, bag_dir: BagDir = None) -> None:
-    """Answer questions over MCP: the same as ros2-memory-server.
+    """Answer questions over MCP, like ros2-memory-server.
 
-    Over stdio, or over HTTP with server.transport=sse. Ends with Ctrl-C, or when stdin ends.
+    Over stdio, or over HTTP with server.transport=sse. Stop it with Ctrl-C, or close stdin.
     """
     chosen = [] if bag_dir is None else [f"recording.bag_dir={quoted(str(bag_dir.absolute()))}"]
     program = [sys.executable, "-m", "ros2_memory.server", *(overrides or ()), *chosen]

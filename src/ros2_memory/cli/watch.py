@@ -134,20 +134,18 @@ class Observation:
 def watch(
     words: Words = None,
     *,
-    every: Annotated[float, typer.Option(metavar="S", help="Seconds between two looks.")] = 2.0,
-    count: Annotated[
-        int | None, typer.Option(metavar="N", help="Leave after so many looks.")
-    ] = None,
+    every: Annotated[float, typer.Option(metavar="S", help="Seconds between updates.")] = 2.0,
+    count: Annotated[int | None, typer.Option(metavar="N", help="Exit after N updates.")] = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """Watch what is being recorded: the recorder, the newest data, rates against the usual ones.
+    """Show live what is being recorded: the recorder, the newest data, rates compared with usual.
 
-    Ages count as in the tools' answers (data.now). Rates are judged only while data comes in.
-    On a terminal a table that is kept up to date, elsewhere a line for each look, or with --json
-    an object. Ends with Ctrl-C.
+    Ages count as in the tools' answers (data.now). Rates are checked only while new data arrives.
+    On a terminal, watch updates a table; elsewhere it prints a line for each update, or a JSON
+    object with --json. Stop it with Ctrl-C.
     """
     if not every > 0 or (count is not None and count < 1):
         raise InvalidArgumentsError("--every and --count must be more than 0")

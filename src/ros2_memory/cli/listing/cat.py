@@ -46,36 +46,42 @@ class Row(NamedTuple):
 
 
 def cat(
-    topic: Annotated[str, typer.Argument(metavar="TOPIC", help="Its name, such as /odom.")],
+    topic: Annotated[
+        str, typer.Argument(metavar="TOPIC", help="The name of the topic, such as /odom.")
+    ],
     words: Words = None,
     *,
     field: Annotated[
         list[str] | None,
-        typer.Option(metavar="PATH", help="Only this field, such as pose.covariance; repeatable."),
+        typer.Option(
+            metavar="PATH", help="Print only this field, such as pose.covariance; repeatable."
+        ),
     ] = None,
     start: Start = None,
     end: End = None,
     last: Last = None,
     limit: Annotated[
-        int | None, typer.Option("--limit", "-n", metavar="N", help="The first N messages alone.")
+        int | None,
+        typer.Option("--limit", "-n", metavar="N", help="Print only the first N messages."),
     ] = None,
     tail: Annotated[
-        int | None, typer.Option(metavar="N", help="The newest N messages alone.")
+        int | None, typer.Option(metavar="N", help="Print only the newest N messages.")
     ] = None,
     as_csv: Annotated[
-        bool, typer.Option("--csv", help="CSV: time in Unix seconds, a column for each field.")
+        bool,
+        typer.Option("--csv", help="Print CSV: time in Unix seconds, a column for each field."),
     ] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="JSON lines: time (Unix s), time_ns, value.")
+        bool, typer.Option("--json", help="Print JSON lines: time (Unix s), time_ns, value.")
     ] = False,
     bag_dir: BagDir = None,
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """The messages of a topic in a time window, each once, by log time.
+    """Print the messages of a topic in a time window, each once, by log time.
 
-    They have the fields that replies show (`describe_type`), and others by their --field. CSV and
-    JSON have numbers as they were recorded; lines for people are rounded, and shorten long arrays.
+    By default it prints the fields that the tools' replies show (`describe_type`); --field selects
+    others. CSV and JSON have the exact numbers; text rounds them and shortens long arrays.
     """
     if as_csv and as_json:
         raise InvalidArgumentsError("give --csv or --json, not both")

@@ -50,7 +50,7 @@ def topics(
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """Every recorded topic: type, messages, usual rate, when it was first and last heard.
+    """List every recorded topic: type, messages, usual rate, first and last message.
 
     The rate is that of the topic's newest hour, without the gaps between bags.
     """
@@ -116,7 +116,7 @@ def info(
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """What the memory covers: range, gaps, damaged files, the budget, and how long it lasts."""
+    """Show what is recorded: time range, gaps, damaged files, the budget and how long it lasts."""
     settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY, "server.tools=all"], recording)
     memory = open_memory(settings, verbose=verbose)
     dispatcher = build_dispatcher(settings, memory)
@@ -160,7 +160,7 @@ def info(
 
 
 def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
-    """Returns how much is recorded, as `ros2 bag info` tells it."""
+    """Returns how much is recorded, as `ros2 bag info` does."""
     bags = snapshot.bags
     kinds = sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})
     return {

@@ -44,10 +44,10 @@ def recordings(
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """Every recording of a folder: when it began, its length and size, and who made it.
+    """List every recording of a folder: start, length, size, and which program made it.
 
-    --recording NAME has the other commands look at one of them alone, and data.recording=NAME the
-    server.
+    To use one of them only, give --recording NAME to the other commands, or data.recording=NAME to
+    the server.
     """
     settings = load_to_look(bag_dir, words, recording)
     memory = open_memory(settings, verbose=verbose)

@@ -53,14 +53,19 @@ if TYPE_CHECKING:
 FORMATS: Final = (".svg", ".png", ".pdf")
 
 plot = typer.Typer(
-    help="Pictures: the driven path, numbers of a topic, what was recorded when, a day.",
+    help="Draw the driven path, a signal, what was recorded when, or a day.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 Out = Annotated[
     Path,
-    typer.Option("--out", "-o", metavar="FILE", help="The picture: .svg, .png or .pdf; replaced."),
+    typer.Option(
+        "--out",
+        "-o",
+        metavar="FILE",
+        help="Write the picture here: .svg, .png or .pdf; overwrites the file.",
+    ),
 ]
 
 
@@ -74,18 +79,22 @@ def plot_path(
     end: End = None,
     last: Last = None,
     topic: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="The poses; data.pose_topic unless given.")
+        str | None,
+        typer.Option(metavar="TOPIC", help="The topic of the poses (default: data.pose_topic)."),
     ] = None,
     frame: Annotated[
         str | None,
-        typer.Option(metavar="FRAME", help="data.map_frame, or the poses' own, unless given."),
+        typer.Option(
+            metavar="FRAME",
+            help="The frame to draw in (default: data.map_frame, or the frame of the poses).",
+        ),
     ] = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """The driven path on a plane, coloured by time, with named places and standstills."""
+    """Draw the driven path in 2D, coloured by time, with named places and standstills."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
@@ -102,13 +111,17 @@ def plot_path(
 @plot.command("signal", epilog=epilog("plot"))
 @reported_errors("plot signal")
 def plot_signal(
-    topic: Annotated[str, typer.Argument(metavar="TOPIC", help="Its name, such as /battery.")],
+    topic: Annotated[
+        str, typer.Argument(metavar="TOPIC", help="The name of the topic, such as /battery.")
+    ],
     words: Words = None,
     *,
     out: Out,
     field: Annotated[
         list[str] | None,
-        typer.Option(metavar="PATH", help="A numeric field; repeatable. All, unless given."),
+        typer.Option(
+            metavar="PATH", help="A numeric field; repeatable (default: all that change)."
+        ),
     ] = None,
     start: Start = None,
     end: End = None,
@@ -118,7 +131,7 @@ def plot_signal(
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """Numeric fields of a topic over time, each in a row of its own."""
+    """Draw numeric fields of a topic over time, one row for each field."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
@@ -147,7 +160,7 @@ def plot_timeline(
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """What was recorded when: gaps, silences, events, and each topic in a row of its own."""
+    """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
@@ -172,7 +185,7 @@ def plot_recap(
     day: Annotated[
         str | None,
         typer.Option(
-            metavar="TIME", help="A day: today, yesterday, 2026-11-20. The newest, unless given."
+            metavar="TIME", help="today, yesterday or a date, 2026-11-20 (default: the newest day)."
         ),
     ] = None,
     start: Start = None,
@@ -183,7 +196,7 @@ def plot_recap(
     recording: Recording = None,
     verbose: Verbose = False,
 ) -> None:
-    """A day in one picture: where the robot drove, what happened, what was recorded."""
+    """Draw a day in one picture: where the robot drove, what happened, what was recorded."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
