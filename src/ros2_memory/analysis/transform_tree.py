@@ -248,7 +248,7 @@ class FrameGraph:
     def _unknown(self, name: str) -> NoDataError:
         known = self.names()
         if not known:
-            detail = f"frame '{name}' is not known: no transform at all is recorded there"
+            detail = f"frame '{name}' is unknown: no transforms are recorded there"
         elif similar := _similar(name, known):
             detail = f"no transform names a frame '{name}'; similar: {listed(similar)}"
         else:
@@ -262,15 +262,15 @@ class FrameGraph:
         if source not in tree:
             others = listed(sorted(self._tree_of(source) - {source}), at_most=_MAX_NAMES)
             detail = (
-                f"frames '{target}' and '{source}' are not connected: '{target}' stands in the"
+                f"frames '{target}' and '{source}' are not connected: '{target}' is in the"
                 f" tree of '{roots[0]}', '{source}' in that of '{roots[1]}', and no recorded"
                 f" transform joins them; connected to '{source}': {others}"
             )
         else:
             detail = (
-                f"frames '{target}' and '{source}' were not connected at {_unix(time)}, since the"
-                f" tree changes its shape or closes into a loop; the newest known roots are"
-                f" '{roots[0]}' and '{roots[1]}'; ask for another time"
+                f"frames '{target}' and '{source}' were not connected at {_unix(time)}, because"
+                f" the tree changes or contains a loop; the newest known roots are"
+                f" '{roots[0]}' and '{roots[1]}'; ask about another time"
             )
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 

@@ -179,7 +179,7 @@ class BagDirReader(BagReader):
         text, folder = str(path), f"{str(self._bag_dir).rstrip(os.sep)}{os.sep}"
         names = text[len(folder) :].split("/")[:-1]
         if not text.startswith(folder) or os.pardir in names:
-            raise BagError(text, "it does not lie in the bag directory")
+            raise BagError(text, "it is not in the bag directory")
         for name in names:
             folder += name
             try:

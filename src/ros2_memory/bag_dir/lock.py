@@ -108,8 +108,8 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
             time.sleep(_POLL_S)
         except OSError as error:
             raise RecorderError(
-                f"{path} cannot be locked: {error.strerror}; recording.bag_dir must lie on a file "
-                "system with locks"
+                f"{path} cannot be locked: {error.strerror}; recording.bag_dir must be on a file "
+                "system that supports locks"
             ) from error
         else:
             return

@@ -68,7 +68,7 @@ _COMMANDS_OF_EXTRAS: Final = (
 )
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
 _NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
-_NOT_REPAIRED: Final = "copy them anew from where they were recorded, or delete them"
+_NOT_REPAIRED: Final = "copy them again from their source, or delete them"
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 
@@ -178,8 +178,8 @@ def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Findin
     else:
         yield _check_permissions(bag_dir, records=records)
     if (bag_dir / ERASING_FILE).exists():
-        seen = "an earlier `ros2-memory forget` was interrupted: part of what was to go is there"
-        yield _warning("bag_dir", seen, "`ros2-memory forget` finishes it, whatever it is to do")
+        seen = "an earlier `ros2-memory forget` was interrupted: some data to delete is still there"
+        yield _warning("bag_dir", seen, "run any `ros2-memory forget`: it finishes that first")
     if records:
         yield _check_disk(settings, bag_dir, foreign_bytes)
 
@@ -220,8 +220,8 @@ def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Findin
         )
     if free < limits.min_free_gb:
         do = (
-            f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete what "
-            "else lies on this disk"
+            f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
+            "other files on this disk"
         )
         return _error("disk", seen, do)
     if free - limits.min_free_gb < limits.max_total_gb - used:
@@ -250,7 +250,7 @@ def check_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
     do = "set the clock (timedatectl, chrony); bags keep the dates they were given"
     latest = snapshot.dating.latest
     if now < FIRST_BAGS_NS:
-        yield _error("clock", f"it says {iso_local(now)}: it was never set", do)
+        yield _error("clock", f"it shows {iso_local(now)}: it was never set", do)
     elif latest is not None and latest > now + FUTURE_NS:
         seen = f"the newest data is dated {unix_from_ns(latest - now):.0f} s after the present"
         yield _error("clock", seen, do)
@@ -287,10 +287,10 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
     if odd := odd_bags(snapshot):
         bags = counted(len(odd), "bag is not whole", "bags are not whole")
         names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
-        do = "what is readable of them answers; record or copy them anew for the rest"
+        do = "answers use the readable part; copy the bags again for the rest"
         yield _warning("bags", f"{bags}: {names}", do)
     for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
-        yield _warning("bags", sentence, "copy what is missing from where it was recorded")
+        yield _warning("bags", sentence, "copy the missing data from its source")
     # The reason names the key where a configured folder would help.
     missing = [each for each in covered.undecodable if _MSG_FOLDERS in each.reason]
     others = [each for each in covered.undecodable if _MSG_FOLDERS not in each.reason]
@@ -345,7 +345,7 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
             f"{path.parent.name}/{path.name} has no end and was written lately: until "
             f"{iso_local(until)} it counts as still being written"
         )
-        do = "if nobody writes it, as a copy, wait until then: what is whole of it answers"
+        do = "if no program writes it (a copy), wait until then: answers use its readable part"
         yield _warning("bags", seen, do)
 
 
@@ -375,23 +375,23 @@ def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
 def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.silent:
         do = (
-            "is their publisher running? Under another user it is heard over the network alone: "
-            "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the discovery range LOCALHOST "
-            "that does nothing, and docs/how-to/systemd.md says what does"
+            "is their publisher running? If it runs as another user, the recorder receives it only "
+            "over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the "
+            "discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
         )
         yield _warning("recorder", f"subscribed and never heard: {listed(heartbeat.silent)}", do)
     if heartbeat.age_held:
-        do = "have the clock synchronised: timedatectl set-ntp true, or chrony; the budget holds"
+        do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
         yield _warning("recorder", heartbeat.age_held, do)
     if heartbeat.held_back:
-        do = "free the disk, or correct the rule; docs/how-to/forget.md has what each key means"
+        do = "free the disk, or correct the rule; docs/how-to/forget.md explains each key"
         yield _warning("recorder", heartbeat.held_back, do)
     if heartbeat.last_error:
         seen = f"its last error: {heartbeat.last_error}"
         if heartbeat.restarts:
             times = counted(heartbeat.restarts, "time")
-            seen = f"it had to start ros2 bag record anew {times}; {seen}"
-        yield _warning("recorder", seen, "its log has more of it")
+            seen = f"it restarted ros2 bag record {times}; {seen}"
+        yield _warning("recorder", seen, "see its log")
 
 
 def check_ros(
@@ -498,7 +498,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     """Checks what the server's `/health` reports."""
     server = settings.server
     if server.transport == "stdio":
-        seen = "server.transport=stdio: each client starts its own, there is none to ask"
+        seen = "server.transport=stdio: each client starts its own server"
         yield _ok("server", seen)
         return
     address = f"{server.host} port {server.port}"
@@ -510,7 +510,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
         yield _error("server", f"nothing answers on {address}: {error}", do)
         return
     except (ValueError, EpisodicError) as error:
-        seen = f"what answers on {address} is another program: {error}"
+        seen = f"another program answers on {address}: {error}"
         yield _error("server", seen, "give the server another port: server.port")
         return
     duration_ms = (time.monotonic() - start) * 1000

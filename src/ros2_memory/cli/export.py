@@ -105,7 +105,7 @@ def export(
         within = view.stream.messages(topics, window)
         first = list(islice(within, 1))
         if earlier and not first:
-            view.notes.add("no message lies in the window: what latched ones held is all there is")
+            view.notes.add("no message is in the window: only earlier latched messages are copied")
         messages = _reported(chain(earlier, first, within), report)
         if mcap is not None:
             done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
@@ -219,7 +219,7 @@ def write_mcap(
         raise InvalidArgumentsError(f"{path} exists; name another file, or delete it first")
     first = next(messages, None)
     if first is None:
-        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message lies in the window")
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message is in the window")
     written = 0
 
     def records() -> Iterator[Record]:

@@ -117,7 +117,7 @@ def forget(
     settings = load_for(bag_dir, overrides)
     require_recorder(settings)
     if last is None and (start is None or end is None):
-        raise InvalidArgumentsError("say what to forget: --start and --end, or --last")
+        raise InvalidArgumentsError("give a time window: --start and --end, or --last")
     memory = open_memory(settings, verbose=verbose)
     snapshot = memory.index.snapshot()
     if snapshot.problem:
@@ -232,8 +232,8 @@ class _Taking:
             topics = {*known} - latched
             if latched and windows:
                 print_line(
-                    "latched messages stay, since they hold for later, too (name a topic to forget "
-                    f"it): {listed(sorted(latched))}"
+                    "latched messages stay, because they are valid later, too (name a topic to "
+                    f"forget it): {listed(sorted(latched))}"
                 )
         if self._recorder is not None and topics & latched:
             lines.append(
@@ -253,7 +253,7 @@ class _Taking:
         kept += survey.kept
         _print_kept(kept)
         if not survey.holders and not erasure.files:
-            print_line("no message of that lies in the window")
+            print_line("no such message is in the window")
             return bool(kept)
         size = sum(path.stat().st_size for path in {each.paths[0] for each in survey.holders})
         what = (

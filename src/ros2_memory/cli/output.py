@@ -36,6 +36,12 @@ _MIN_TEXT_WIDTH: Final = 16
 """Columns that a text keeps where a table is wider than the terminal."""
 _VECTOR_KEYS: Final = frozenset({"x", "y", "z", "w", "yaw_deg", "frame_id"})
 _TIME_IN_NOTE: Final = re.compile(r"\b\d{10}\.\d{3,9}\b")
+_COMMANDS: Final = {
+    "data_time_range": "`ros2-memory info`",
+    "list_recorded_topics": "`ros2-memory topics`",
+}
+"""What a person runs in place of a tool that a sentence names."""
+_TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
 
 
 def print_reply(console: Console, value: JsonValue, now: float | None = None) -> None:
@@ -64,7 +70,10 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
         elif key == "detail" and isinstance(each, str):  # why there is no answer
             lines.add_row(key, Text(with_local_times(each)))
         else:
-            lines.add_row(Text(escape(key)), Text(_format_line(key, each, now)))
+            line = _format_line(key, each, now)
+            lines.add_row(
+                Text(escape(key)), Text(with_commands(line) if key == "problems" else line)
+            )
     if lines.row_count:
         console.print(lines)
     for key, rows in lists.items():
@@ -73,8 +82,14 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
 
 
 def with_local_times(sentence: str) -> str:
-    """Returns a sentence for a terminal, with times in this machine's zone."""
-    return escape(_TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), sentence))
+    """Returns a sentence for a terminal, with times in this machine's zone, and commands."""
+    local = _TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), sentence)
+    return escape(with_commands(local))
+
+
+def with_commands(sentence: str) -> str:
+    """Returns a sentence with commands for the tools that it names, where there is one."""
+    return _TOOL_IN_NOTE.sub(lambda found: _COMMANDS[found[0]], sentence)
 
 
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:

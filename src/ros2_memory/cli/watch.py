@@ -28,7 +28,7 @@ from ros2_memory.cli.options import (
     print_line,
     stdout_console,
 )
-from ros2_memory.cli.output import escape, format_duration, format_time
+from ros2_memory.cli.output import escape, format_duration, format_time, with_commands
 from ros2_memory.core.errors import BagError, InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
@@ -110,7 +110,7 @@ class Observation:
         """Why answers may be incomplete."""
         missing = self.status.missing if self.status.live else ()
         unoffered = [f"offered by no publisher: {listed(missing)}"] if missing else []
-        return [escape(each) for each in (*unoffered, *self.status.problems)]
+        return [escape(with_commands(each)) for each in (*unoffered, *self.status.problems)]
 
     @property
     def newest(self) -> str:

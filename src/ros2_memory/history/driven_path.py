@@ -130,13 +130,13 @@ def length_notes(path: Trajectory) -> Iterator[str]:
         yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
     if path.is_noisy:
         yield (
-            f"the positions are noisy: step by step they sum up to {totals.path_sum_m:.2f} m; "
-            "distance_m is without what the noise adds"
+            f"the positions are noisy: all steps add up to {totals.path_sum_m:.2f} m; "
+            "distance_m leaves out what noise adds"
         )
     if totals.in_doubt:
         yield (
-            "the positions come more than 0.25 s apart, and noise or sharp turns are much of the "
-            "steps between them: distance_m may be too long, since noise cannot be taken off"
+            "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "
+            "of the steps: distance_m may be too long, because noise cannot be removed"
         )
     if totals.gaps:
         without = "without a valid pose" if path.invalid else "in which nothing was recorded"
@@ -151,8 +151,8 @@ def length_notes(path: Trajectory) -> Iterator[str]:
         )
     if totals.resets:
         yield (
-            f"odometry began anew {counted(len(totals.resets), 'time')}: "
-            "what led back to its origin is left out of distance and speed"
+            f"odometry restarted {counted(len(totals.resets), 'time')}: "
+            "the jumps back to its origin are left out of distance and speed"
         )
 
 

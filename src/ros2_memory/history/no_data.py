@@ -91,7 +91,7 @@ def resolve_pose_topic(
         elif what == "position" and (moving := _transform_topics(view)):
             detail += (
                 f", nor another with poses; transforms are on {listed(moving)}: get_transform_at "
-                "tells where one frame was in another, and list_frames names the frames"
+                "returns the pose of one frame in another, and list_frames lists the frames"
             )
         else:
             raise
@@ -173,7 +173,7 @@ def require_bags(view: View) -> None:
             else "the first split is still being written; ask again when it closes, in "
             f"{view.memory.limits.split_duration_s:g} s or less",
         )
-    why = [snapshot.problem or "no bag with messages lies in the bag directory"]
+    why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
         why.append(f"{counted(len(snapshot.damaged), 'damaged file')} set aside")
     if snapshot.unread:
@@ -192,14 +192,14 @@ def not_recorded(view: View, name: str) -> NoDataError:
     require_bags(view)
     snapshot = view.snapshot
     if name in snapshot.silent_topics or f"/{name}" in snapshot.silent_topics:
-        detail = f"{name} is declared in the bags, but not one message of it was recorded"
+        detail = f"{name} is declared in the bags, but no message of it was recorded"
     else:
         detail = f"no topic {name} is recorded"
     close = get_close_matches(name, snapshot.timeline.topics(), n=5, cutoff=0.6)
     if not close:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
         close = [topic for topic in snapshot.timeline.topics() if stem and stem in topic][:5]
-    hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
+    hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics lists all"
     error = NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}")
     return with_notes(view, TimeWindow.everything(), error)
 
@@ -331,12 +331,12 @@ def _advice(view: View, reason: NoDataReason) -> list[str]:
     earliest, latest = snapshot.earliest, snapshot.latest
     advice = []
     if earliest is not None and latest is not None:
-        advice.append(f"the memory reaches from {unix_text(earliest)} to {unix_text(latest)}")
+        advice.append(f"the memory covers {unix_text(earliest)} to {unix_text(latest)}")
     if reason is NoDataReason.NOT_CLOSED_YET:
         advice.append(
             f"ask about an earlier moment, or again in {ON_DISK_S} s"
             if _active_answers(view)
-            else "the split being written does not answer until it closes: ask about an earlier "
+            else "the split being written is not read until it closes: ask about an earlier "
             f"moment, or again in {view.memory.limits.split_duration_s:g} s"
         )
     return advice

@@ -164,8 +164,8 @@ def _described(memory: Memory, call: Call) -> Iterator[str]:
         first = mixed[0]
         yield (
             f"robots are mixed: {listed(names)} overlap in time (from "
-            f"{iso_local(first.pair.start)}), each with messages of its own on {first.topic}, and "
-            "are answered as one; data.recording narrows answers to one of them"
+            f"{iso_local(first.pair.start)}), each with messages of its own on {first.topic}, but "
+            "answers treat them as one robot; data.recording selects one recording"
         )
     contradictions = contradicting_frames(memory, call)
     if contradictions:
@@ -260,8 +260,8 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     if apart:
         names = sorted(each.name for each in apart)
         view.notes.add(
-            f"{len(names)} recordings hold messages of their own on {topic} at the same time, "
-            f"as of several robots, and the answer does not tell them apart: {listed(names)}"
+            f"{len(names)} recordings have messages of their own on {topic} at the same time, as "
+            f"from several robots, and the answer does not separate them: {listed(names)}"
         )
 
 

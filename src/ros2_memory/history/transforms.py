@@ -113,7 +113,7 @@ def transform_at(
     session, found = answers[0]
     if not all(alike(found.transform, each.transform) for _, each in answers):
         view.notes.add(
-            f"{len(answers)} sessions that were recorded then hold different transforms; "
+            f"{len(answers)} sessions recorded at that time have different transforms; "
             f"this is that of {sessions.names(session, at)}"
         )
     parts = sessions.parts_of(session)
@@ -441,7 +441,7 @@ def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDat
         return NoDataError(
             NoDataReason.OUTSIDE_RANGE,
             f"no moving transform has a header stamp within {seconds(TF_CACHE_NS)} of "
-            f"{unix_text(at)}; data.tf_clock has them looked up by header stamp, not by log time",
+            f"{unix_text(at)}; data.tf_clock selects transforms by header stamp, not by log time",
         )
     return _near_failure(failure, at) if failure.reason in _OF_ALL_TIMES else failure
 

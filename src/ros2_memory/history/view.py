@@ -219,7 +219,7 @@ def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, N
     earliest = view.snapshot.earliest
     begins = "" if earliest is None else f"; the memory begins at {unix_text(earliest)}"
     raise NoDataError(
-        NoDataReason.OUTSIDE_RANGE, f"no recorded time lies so far back (before 1678){begins}"
+        NoDataReason.OUTSIDE_RANGE, f"no recorded time is that far back (before 1678){begins}"
     )
 
 
@@ -263,7 +263,7 @@ def search_window(span: TimeRange, now: Ns) -> TimeWindow:
     start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
     end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
     if end < start:
-        raise InvalidArgumentsError(f"end ({end_s}) lies before start ({start_s})")
+        raise InvalidArgumentsError(f"end ({end_s}) is before start ({start_s})")
     return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
 
 

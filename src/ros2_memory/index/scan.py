@@ -37,8 +37,8 @@ LOST_AND_FOUND: Final = "lost+found"
 """A folder in the root of every ext4 file system, which only root may open."""
 
 _OTHER_DISK = (
-    "the bag directory lies on another disk than before, and no bag lies there: the disk of the "
-    "bags has been unmounted; they are found again when it is mounted"
+    "the bag directory is on another disk than before, and contains no bags: the disk of the bags "
+    "was unmounted; mount it again, and the bags are found again"
 )
 _OF_NAME: Final = r"(?:/.*|(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?)?"
 """What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
@@ -392,7 +392,7 @@ def _is_folder(link: Path) -> bool:
 def _problem(error: OSError) -> str:
     """Returns a sentence on a bag directory that cannot be listed."""
     if isinstance(error, FileNotFoundError):
-        return "the bag directory does not exist; it is looked for again with every scan"
+        return "the bag directory does not exist; every scan looks for it again"
     if isinstance(error, NotADirectoryError):
         return "the bag directory is a file, not a directory: correct recording.bag_dir"
     return f"the bag directory cannot be read: {error.strerror or error}"

@@ -171,8 +171,8 @@ def _ways_apart(
         return _WaysApart()
     if not placement.is_map and not _is_one_session(view, windows):
         view.notes.add(
-            f"where the robot stood and drove is not compared: {frame} begins anew whenever it is "
-            "started, and no transforms lead to a map"
+            f"standstills and paths are not compared: the origin of {frame} changes with every "
+            "start, and no transforms lead to a map"
         )
         return _WaysApart()
     region, places = None if where is None else where.region, view.memory.limits.places

@@ -23,7 +23,7 @@ MAX_MESSAGES: Final = 4_000
 MAX_NUMBERS: Final = 400_000
 """How much one question reads: minutes of odometry, an hour of a slow topic."""
 
-TOO_MANY: Final = "there is too much in the window to tell extremes: ask for a shorter one"
+TOO_MANY: Final = "the window has too many messages to compute extremes: ask for a shorter one"
 
 _LARGEST: Final = sys.float_info.max
 _SUMMARY: Final = frozenset({"bytes", "numbers"})

@@ -65,7 +65,7 @@ _CHANGE_CHARS: Final = 30
 """What the reply adds to a change's text."""
 
 _STANDSTILLS_UNKNOWN: Final = (
-    "the positions are too noisy, or too few, to tell when the robot stood: stood_s is null"
+    "the positions are too noisy, or too few, to detect standstills: stood_s is null"
 )
 _PLURALS: Final = {
     "gap": "gaps",
@@ -463,5 +463,5 @@ def _most_important(
             for kind in _KINDS
             if left_out[kind]
         )
-        view.notes.add(f"left out, since they are too many: {named}; ask for a shorter time")
+        view.notes.add(f"left out, because there are too many: {named}; ask for a shorter time")
     return sorted(shown, key=lambda each: (each.start, _KINDS.index(each.kind)))

@@ -61,8 +61,8 @@ def remember_moment(
         slot.close()
     if outcome is None:
         raise RefusedError(
-            f"the recorder did not answer within {ANSWER_TIMEOUT_S:g} s; memory_status tells "
-            "whether it keeps the moment all the same, else ask again"
+            f"the recorder did not answer within {ANSWER_TIMEOUT_S:g} s; memory_status shows "
+            "whether it keeps the moment anyway; if not, ask again"
         )
     if outcome.moment is None:
         raise RefusedError(outcome.refused or "the recorder does not say why")
@@ -164,7 +164,7 @@ def _require_recorder(memory: Memory) -> None:
     heartbeat = memory.index.heartbeat()
     if heartbeat is None or not heartbeat.is_live(memory.clock.now()) or heartbeat.state in _ENDED:
         raise RefusedError(
-            "the recorder, which alone keeps moments, is not running: start ros2-memory-recorder, "
+            "only the recorder keeps moments, and it is not running: start ros2-memory-recorder, "
             "then ask again"
         )
 

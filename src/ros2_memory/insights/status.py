@@ -94,7 +94,7 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield snapshot.problem
     if snapshot.damaged:
         damaged = counted(len(snapshot.damaged), "damaged bag file")
-        yield f"{damaged}; data_time_range lists what does not answer"
+        yield f"{damaged}; data_time_range lists them"
     if snapshot.dating.note:
         yield snapshot.dating.note
     if heartbeat is None or heartbeat.state is RecorderState.STOPPED:

@@ -115,7 +115,7 @@ def note_limits(view: View, topic: str, events: TopicEvents) -> None:
         messages = counted(events.undecodable, "message")
         view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
     if events.left_out:
-        view.notes.add(f"{topic} changes too often to tell each: {events.left_out} more")
+        view.notes.add(f"{topic} changes too often to list each change: {events.left_out} more")
     if events.beyond:
         view.notes.add(
             f"{topic} has too many booleans or things in one message: {events.beyond} more are "

@@ -66,7 +66,7 @@ class Metrics(Observer):
         self._registry = CollectorRegistry(auto_describe=False)
         self._answers = Counter(
             "ros2_memory_answers",
-            "Tool calls that are over, by what became of them.",
+            "Finished tool calls, by outcome.",
             ("tool", "outcome", "reason"),
             registry=self._registry,
         )
@@ -170,21 +170,21 @@ def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
     )
     yield GaugeMetricFamily(
         "ros2_memory_index_age_seconds",
-        "Since the bag directory was last looked through.",
+        "Time since the last scan of the bag directory.",
         unix_from_ns(now - snapshot.scanned_at),
     )
     latest = snapshot.dating.latest
     if latest is not None:
         yield GaugeMetricFamily(
             "ros2_memory_newest_data_age_seconds",
-            "Since the newest message in a bag.",
+            "Time since the newest message in a bag.",
             unix_from_ns(now - latest),
         )
 
 
 def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator[Metric]:
     yield GaugeMetricFamily(
-        "ros2_memory_recorder_live", "Whether the recorder is there.", int(heartbeat.is_live(now))
+        "ros2_memory_recorder_live", "Whether the recorder is alive.", int(heartbeat.is_live(now))
     )
     yield _by_state(
         "ros2_memory_recorder_state",
@@ -198,12 +198,12 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     )
     yield GaugeMetricFamily(
         "ros2_memory_recorder_heartbeat_age_seconds",
-        "Since the recorder last reported.",
+        "Time since the recorder last reported.",
         unix_from_ns(now - heartbeat.updated),
     )
     yield GaugeMetricFamily(
         "ros2_memory_recorder_silent_topics",
-        "Topics that are subscribed to and brought no message.",
+        "Subscribed topics without a message.",
         len(heartbeat.silent),
     )
     lost = GaugeMetricFamily(
@@ -216,12 +216,12 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     yield lost
     yield CounterMetricFamily(
         "ros2_memory_recorder_written_bytes",
-        "What the recorder has written since it started.",
+        "Bytes that the recorder has written since it started.",
         heartbeat.bytes_written,
     )
     yield CounterMetricFamily(
         "ros2_memory_recorder_restarts",
-        "How often another process was found to be the recorder; looked at when scraped.",
+        "Changes of the recorder's process, as seen by scrapes.",
         restarts,
     )
 

@@ -262,7 +262,7 @@ def driven_way(view: View, topic: str, window: TimeWindow) -> DrivenWay | None:
     if folded.since is not None:
         view.notes.complete = False
         view.notes.add(
-            f"the way is known back to {unix_text(folded.since)}: out of time before older "
+            f"the path is known back to {unix_text(folded.since)}: out of time before older "
             "bags without a digest were read"
         )
     parts = [each for each in folded.parts if len(each.way.times)]

@@ -193,8 +193,8 @@ def map_placement(
     if frame_id not in (None, placement.frame_id):
         known = " or ".join(dict.fromkeys((placement.frame_id, pose_frame)))
         raise InvalidArgumentsError(
-            f"frame_id was {abbreviate(frame_id)}; places are told in {known}, and "
-            "get_transform_at leads from any other frame"
+            f"frame_id was {abbreviate(frame_id)}; places are in {known}; "
+            "get_transform_at converts from other frames"
         )
     return placement
 

@@ -245,12 +245,12 @@ def _note_doubts(view: View, known: _Known, window: TimeWindow) -> None:
     note_unread(view, window, nothing=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
-            f"the newest pose, of {unix_text(newest)}, is too old to know whether the robot is "
-            "there now: departed is that pose"
+            f"the newest pose, at {unix_text(newest)}, is too old to know whether the robot is "
+            "there now: departed is the time of that pose"
         )
     if any(visit.restarts for visit in shown):
         view.notes.add(
-            "visits with restarts_since are of before odometry began anew: "
+            "visits with restarts_since are from before odometry restarted: "
             "the same coordinates may have been another place"
         )
 

@@ -246,8 +246,8 @@ class Housekeeping(Housekeeper):
         bags = counted(self._collected.held, "bag is", "bags are")
         limit = f"{self._max_age_h:g} h"
         return (
-            f"{bags} older than {limit} (retention.max_age_h) by the dates, and kept: the clock is "
-            "not known to be right. They go when it is synchronised with a time server "
+            f"{bags} older than {limit} (retention.max_age_h) by date, and kept: the clock is not "
+            "known to be right. They are deleted when it is synchronised with a time server "
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
 
@@ -403,7 +403,7 @@ class Housekeeping(Housekeeper):
             _log.error(
                 "budget_not_held",
                 total_bytes=collected.total_bytes,
-                reason="what is left may not be deleted: open bags, damaged ones, the newest; "
+                reason="the remaining bags may not be deleted: open, damaged or newest ones; "
                 "raise retention.max_total_gb or look for damaged files",
             )
         self._over_budget = not collected.fits

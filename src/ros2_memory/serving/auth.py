@@ -264,7 +264,7 @@ def take_token(env: MutableMapping[str, str], *, host: str, loopback: bool) -> S
     if token is None and not loopback:
         raise ConfigError(
             f"{VARIABLE}: missing; server.host is {host!r}, which other machines can reach, so "
-            f"clients must show a token: {_HOW} and give it as {VARIABLE}, in a file that "
+            f"clients must send a token: {_HOW} and give it as {VARIABLE}, in a file that "
             f"{FILE_VARIABLE} names, or by LoadCredential={CREDENTIAL}:PATH in a systemd unit; "
             "or listen on 127.0.0.1, where none is needed"
         )

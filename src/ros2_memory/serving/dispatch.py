@@ -227,8 +227,8 @@ class Dispatcher:
         """Returns why there is no answer when the time of a call is up."""
         if wait.ended_s is None:
             return BusyError(
-                f"{name} waited {self._call_timeout_s:g} s behind other questions and was not "
-                "begun; ask again, and fewer at once"
+                f"{name} waited {self._call_timeout_s:g} s behind other calls and was not "
+                "started; ask again, with fewer at once"
             )
         return QueryTimeoutError(
             f"{name} needs more than {self._call_timeout_s:g} s{wait.note()}; "
@@ -291,7 +291,7 @@ class _Wait:
         waited = 0.0 if self.ended_s is None else self.ended_s - self._begun_s
         if waited < _REPORTED_WAIT_S:
             return ""
-        return f" (it waited {waited:.1f} s of its time behind other questions)"
+        return f" (it waited {waited:.1f} s of its time behind other calls)"
 
 
 def excess_in_arguments(given: Mapping[str, object]) -> str | None:

@@ -187,6 +187,6 @@ def max_decompressed_bytes(compressed: int) -> int:
 def too_large(what: str, max_bytes: int) -> str:
     """Returns the reason why something is not read."""
     return (
-        f"{what} is larger than the {max_bytes >> 20} MiB allowed; where that is right, raise"
+        f"{what} is larger than the {max_bytes >> 20} MiB allowed; if that is right, raise"
         " reader.max_chunk_mb"
     )

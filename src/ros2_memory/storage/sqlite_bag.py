@@ -410,7 +410,7 @@ def copy_with_journal(path: Path, folder: Path, reserve: Callable[[int], None]) 
         guard(base, MAX_CHUNK_MB << 20, copy.stat().st_size)
         base.execute("PRAGMA journal_mode=DELETE").fetchall()
         base.execute("SELECT name FROM sqlite_master LIMIT 1").fetchall()
-    return copy, "its writer did not finish it: a journal lay beside it and was played back"
+    return copy, "its writer did not finish it: its journal was replayed"
 
 
 def guard(base: sqlite3.Connection, max_value_bytes: int, size: int) -> None:

@@ -306,8 +306,8 @@ def _notes(
     sights = known.estimate.sights
     if len(known.frames) > 1 + bool(known.frames[0]):
         yield (
-            "where there is no map, the places of each run of odometry are kept apart: a thing may "
-            "be listed once for each"
+            "without a map, each run of odometry has coordinates of its own: a thing may be listed "
+            "once for each run"
         )
     if label is None or asked is None:
         return
@@ -321,8 +321,8 @@ def _notes(
     names = sorted(set(known.estimate.names.values()))
     if seen:
         yield (
-            f"it was detected {counted(seen, 'time')} in all, but in this window and region not so "
-            "that it is a thing of its own: find_matches lists single detections"
+            f"it was detected {counted(seen, 'time')} in all, but in this window and region it "
+            "does not count as a thing: find_matches lists single detections"
         )
     elif names:
         close = [each for each in names if asked in each or each in asked]

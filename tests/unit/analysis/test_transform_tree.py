@@ -303,14 +303,14 @@ def test_an_unknown_frame_in_itself_is_unknown_too() -> None:
 def test_without_any_transform_every_frame_is_unknown() -> None:
     refused = refusal(FrameGraph([]), "odom", "base", 5)
     assert refused.reason is NoDataReason.FRAME_UNKNOWN
-    assert "no transform at all" in refused.detail
+    assert "no transforms are recorded" in refused.detail
 
 
 def test_frames_of_two_trees_are_refused_with_their_roots() -> None:
     graph = FrameGraph([*moving(), edge("map", "goal", 5), edge("goal", "tip", 5)])
     refused = refusal(graph, "tip", "base", 102 * S)
     assert refused.reason is NoDataReason.FRAMES_NOT_CONNECTED
-    assert "'tip' stands in the tree of 'map', 'base' in that of 'odom'" in refused.detail
+    assert "'tip' is in the tree of 'map', 'base' in that of 'odom'" in refused.detail
     assert "connected to 'base': odom" in refused.detail
 
 

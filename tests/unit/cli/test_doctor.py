@@ -182,7 +182,7 @@ def test_recover_is_not_advised_for_files_that_it_refuses(robot: Path, capsys: C
     code, wrong = examined(capsys)
     assert code == 1
     assert "recover" not in wrong["bags"][0]["do"]
-    assert wrong["bags"][0]["do"].startswith("copy them anew")
+    assert wrong["bags"][0]["do"].startswith("copy them again")
     assert "letter_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
     whole = (robot / "rec" / "rec_0.mcap").read_bytes()
     lay(robot, "cut", whole[: len(whole) // 2])
@@ -362,7 +362,7 @@ def test_a_topic_that_nobody_offers_and_restarts_are_reported(robot: Path, capsy
     seen = [each["seen"] for each in wrong["topics"]]
     assert [each.split()[0] for each in seen] == ["/odom", "/gone"]
     assert all("no publisher has offered it since the recorder started" in each for each in seen)
-    assert "start ros2 bag record anew 1 time; its last error" in wrong["recorder"][0]["seen"]
+    assert "it restarted ros2 bag record 1 time; its last error" in wrong["recorder"][0]["seen"]
 
 
 class TestExtras:

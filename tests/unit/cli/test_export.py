@@ -192,7 +192,7 @@ class TestMcap:
         words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--start", after, "--latched"]
         assert cli.main([*words, "--end", str(T0 / NS_PER_S + 6000)]) == 0
         assert {row[0] for row in read(tmp_path / "out.mcap")} == {"/tf_static"}
-        assert "no message lies in the window" in capsys.readouterr().err
+        assert "no message is in the window" in capsys.readouterr().err
 
     def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
         out = tmp_path / "out.mcap"

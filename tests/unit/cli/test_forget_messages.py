@@ -371,7 +371,7 @@ def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> N
 def test_what_has_gone_can_be_forgotten_again(bag_dir: Path, capsys: Capture) -> None:
     assert forget(0, 100, "--topic", CAMERA) == 0
     assert forget(0, 100, "--topic", CAMERA) == 0
-    assert "no message of that lies in the window" in capsys.readouterr().out
+    assert "no such message is in the window" in capsys.readouterr().out
 
 
 def test_a_dry_run_changes_nothing(bag_dir: Path, capsys: Capture) -> None:

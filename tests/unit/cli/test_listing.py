@@ -103,6 +103,17 @@ class TestPaths:
             assert (code, len(shown.splitlines())) == (1, 1)
             assert str(tmp_path / "empty") in shown
 
+    def test_where_an_error_names_a_tool_people_read_the_command(
+        self, folder: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        (tmp_path / "empty").mkdir()
+        for topic, path, command in (("/odom", "empty", "info"), ("/nothing", "a", "topics")):
+            assert cli.main(["cat", topic, str(folder / path)]) == 2
+            shown = capsys.readouterr().err
+            assert f"; `ros2-memory {command}` lists" in shown
+            assert "data_time_range" not in shown
+            assert "list_recorded_topics" not in shown
+
     def test_bags_of_others_need_no_recorder_and_no_preset(
         self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
     ) -> None:

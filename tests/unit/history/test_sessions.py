@@ -326,8 +326,8 @@ def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> Non
         position(memory, Call(), at),
         find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
     ):
-        [note] = [note for note in answer.notes if "as of several robots" in note]
-        assert note.startswith("2 recordings hold messages of their own on /odom")
+        [note] = [note for note in answer.notes if "as from several robots" in note]
+        assert note.startswith("2 recordings have messages of their own on /odom")
         assert note.endswith(": r1, r2")
 
 

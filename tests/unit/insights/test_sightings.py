@@ -355,7 +355,7 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
 
 def test_a_search_that_ends_before_it_began_is_refused(tmp_path: Path) -> None:
     memory = spoken(tmp_path, (1, "cup"))
-    with pytest.raises(InvalidArgumentsError, match="lies before start"):
+    with pytest.raises(InvalidArgumentsError, match="is before start"):
         find_matches(memory, Call(), "/x", "contains", "cup", start_s=5.0, end_s=4.0)
 
 

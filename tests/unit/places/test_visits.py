@@ -200,7 +200,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_pat
     memory = remembering(tmp_path, first + second)
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert [each.restarts for each in answer.visits] == [0, 1]
-    assert any("odometry began anew" in note for note in answer.notes)
+    assert any("odometry restarted" in note for note in answer.notes)
     recalled = recalling(replace(memory), tmp_path)
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 

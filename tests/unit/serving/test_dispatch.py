@@ -347,7 +347,7 @@ async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_
     assert sorted(each["error"] for each in sent) == ["busy", "busy", "timeout", "timeout"]
     [detail] = {each["detail"] for each in sent if each["error"] == "busy"}
     assert detail == (
-        "slow waited 0.05 s behind other questions and was not begun; ask again, and fewer at once"
+        "slow waited 0.05 s behind other calls and was not started; ask again, with fewer at once"
     )
     assert held.begun == BLOCKING_AT_ONCE
     assert dispatcher.blocking.waiting == 0
@@ -370,7 +370,7 @@ async def test_a_timeout_after_a_wait_says_how_long_the_wait_was(
     late = tool("late", raising(QueryTimeoutError("too long", 5)))
     reply = await served(late).dispatcher.answer("late", {})
     sent = json.loads(reply.text)
-    assert sent["detail"] == "too long (it waited 0.0 s of its time behind other questions)"
+    assert sent["detail"] == "too long (it waited 0.0 s of its time behind other calls)"
     assert "searched_back_to" in sent
 
 

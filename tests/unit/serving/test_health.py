@@ -73,7 +73,7 @@ async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
     reply = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert reply["status"] == "degraded"
     assert reply["damaged"] == 1
-    assert reply["problems"] == ["1 damaged bag file; data_time_range lists what does not answer"]
+    assert reply["problems"] == ["1 damaged bag file; data_time_range lists them"]
     assert reply["damaged_files"] == [
         {
             "file": f"{tmp_path.name}/torn.mcap",

@@ -226,7 +226,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     write(tmp_path / "two", [each for one in later for each in one], name="second")
     reply = ask(tmp_path / "two", **EARLIER, **LATER)
     assert not reply.keys() & {"stood_at", "farthest_apart"}
-    assert any("begins anew" in note for note in reply["notes"])
+    assert any("changes with every start" in note for note in reply["notes"])
     write(tmp_path / "one", [each for one in (*stood, *later) for each in one])
     reply = ask(tmp_path / "one", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2

@@ -105,7 +105,8 @@ def cat(
         typer.echo(f"note: {with_local_times(note)}", err=True)
     if not count:
         typer.echo(
-            f"no message of {name} lies in this time: ros2-memory topics says when", err=True
+            f"no message of {name} in this time; `ros2-memory topics` shows when there are some",
+            err=True,
         )
     if not count or not view.notes.complete:
         raise typer.Exit(EXIT_NEGATIVE)
@@ -140,7 +141,7 @@ def _extracted(
         view.notes.complete = False
         what = counted(left_out, "message")
         view.notes.add(
-            f"{what} left out, since they cannot be decoded: `ros2-memory info` says why"
+            f"{what} left out, because they cannot be decoded: `ros2-memory info` shows why"
         )
 
 

@@ -151,7 +151,7 @@ def opened(memory: Memory, window: TimeWindow) -> Scene:
     if within.empty:
         raise NoDataError(
             NoDataReason.OUTSIDE_RANGE,
-            "nothing was recorded in this time: ros2-memory info says what there is",
+            "nothing was recorded in this time: `ros2-memory info` shows what is recorded",
         )
     return Scene(memory, view, within)
 
@@ -245,7 +245,7 @@ def signals_of(
     decoded = [(each, view.bags.decode(each)) for each in messages]
     readable = [(each, message) for each, message in decoded if message is not None]
     if not readable:
-        what = "can be decoded" if messages else "lies in this time"
+        what = "can be decoded" if messages else "is in this time"
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} {what}")
     first, message = readable[0]
     type_name = first.record.channel.type
@@ -385,7 +385,7 @@ def figures_of(told: Recap | None) -> str:
 def told_lines(told: Recap | None) -> Iterator[str]:
     """Yields each event in a line, with the time of day, and how long it took."""
     if told is None or not told.events:
-        yield "nothing happened that a recap tells of"
+        yield "no events"
         return
     for each in told.events:
         at = datetime.fromtimestamp(unix_from_ns(each.start)).astimezone()

@@ -383,7 +383,7 @@ def test_what_is_recorded_after_a_restart_of_odometry_is_a_way_of_its_own(
     for reply in replies(tmp_path, recalls=recalls):
         assert reply["distance_m"] == 20.0
         assert "gap_m" not in reply
-        assert [note for note in reply["notes"] if "odometry began anew 1 time" in note]
+        assert [note for note in reply["notes"] if "odometry restarted 1 time" in note]
 
 
 @each_way
@@ -410,7 +410,7 @@ def test_a_step_back_to_the_origin_that_nothing_near_it_is_like_is_a_reset(
     for reply in replies(tmp_path, recalls=recalls):
         assert reply["distance_m"] == pytest.approx(out_m + 10, rel=0.02 if noise_m else 1e-9)
         assert reply["max_speed"] == pytest.approx(1.0, rel=0.1)
-        assert [note for note in reply["notes"] if "odometry began anew 1 time" in note]
+        assert [note for note in reply["notes"] if "odometry restarted 1 time" in note]
 
 
 def fast(seconds: float, top: float, hertz: float) -> Points:
