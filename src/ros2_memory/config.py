@@ -102,19 +102,19 @@ def _dot_path(path: str) -> str:
 
 
 def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Checks that no spelling leads to two names; case, spacing and a plural distinguish none."""
+    """Checks that no spelling leads to two names; case, spacing and plurals do not count."""
     known: dict[str, tuple[str, str]] = {}
     for name, spellings in labels.items():
         for each in (name, *spellings):
             key = singular(plain(each))
             if not key:
-                raise ValueError(f"must not hold an empty spelling, as under {name!r}")
+                raise ValueError(f"must not contain an empty spelling, as under {name!r}")
             first, other = known.setdefault(key, (each, name))
             if other != name:
                 also = "" if first == each else f" (as {first!r})"
                 raise ValueError(
-                    f"must hold each spelling under one label: {each!r} is under {other!r}{also} "
-                    f"and {name!r}; case, spacing and a plural distinguish none"
+                    f"must list each spelling under one label: {each!r} is under {other!r}{also} "
+                    f"and {name!r}; case, spacing and plurals do not count"
                 )
     return labels
 

@@ -312,12 +312,16 @@ def _plain_idl(text: str) -> str:
         elif piece.startswith(("//", "/*")):
             kept.append(" ")
         elif piece == "(":
-            raise _UnusableError("its IDL holds an expression in parentheses, which is not read")
+            raise _UnusableError(
+                "its IDL contains an expression in parentheses, which is not supported"
+            )
         else:
             kept.append(piece)
     plain = _IDL_DIRECTIVE.sub("", "".join(kept))
     if "<<" in plain or _IDL_NESTED_SEQUENCE.search(plain):
-        raise _UnusableError("its IDL holds a shift or a sequence of sequences, which is not read")
+        raise _UnusableError(
+            "its IDL contains a shift or a sequence of sequences, which is not supported"
+        )
     return plain
 
 

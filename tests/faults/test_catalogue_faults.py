@@ -225,7 +225,7 @@ def test_a_catalogue_locked_at_the_start_is_gone_back_to(tmp_path: Path) -> None
         other.execute("PRAGMA locking_mode = EXCLUSIVE")
         other.execute("BEGIN EXCLUSIVE")
         assert told(memory) == right
-        assert trouble_of(filler) == "is kept in memory: another program holds its file"
+        assert trouble_of(filler) == "is kept in memory: another program has locked its file"
         fill_up(filler)
         passed[0] += RETRY_S
         filler.look_after()

@@ -144,4 +144,4 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
         assert not held.moment.pending
     out = capsys.readouterr()
     assert "Traceback" not in out.err
-    assert "still lists what was deleted" not in out.out
+    assert "still lists deleted bags" not in out.out

@@ -166,7 +166,7 @@ class TestLabels:
             ("labels: {mug: [tea_cup], cup: [Tea cup]}", "is under 'mug' (as 'tea_cup') and 'cup'"),
             ("labels: {mug: [cups], glass: [cup]}", "is under 'mug' (as 'cups') and 'glass'"),
             ("labels: {mug: [], Mugs: []}", "'Mugs' is under 'mug' (as 'mug') and 'Mugs'"),
-            ("labels: {sofa: [couches], seat: [Couch]}", "distinguish none"),
+            ("labels: {sofa: [couches], seat: [Couch]}", "plurals do not count"),
             ("labels: {mug: [cup], cup: []}", "'cup' is under 'mug' and 'cup'"),
             ("labels: {mug: cup}", "labels.mug: 'cup' is not allowed; must be a list"),
             ("labels: {mug: [3]}", "labels.mug.0: 3 is not allowed"),

@@ -378,7 +378,7 @@ class OwnRecordings:
                     return
                 with self._locked() as descriptor:
                     if descriptor is None:
-                        raise FileNotFoundError("the list of recordings has gone")
+                        raise FileNotFoundError("the list of recordings is missing")
                     append_lines(descriptor, _lines(entries))
                 self._list.entries.update(entries)
         except OSError as error:
@@ -437,7 +437,7 @@ class OwnRecordings:
             finally:
                 os.close(descriptor)
             if time.monotonic() >= give_up:
-                raise BlockingIOError(f"another program holds {self._path}")
+                raise BlockingIOError(f"another program has locked {self._path}")
             time.sleep(_POLL_S)
 
     def _failure(self, error: OSError, verb: str = "written") -> RecorderError:
@@ -448,8 +448,8 @@ class OwnRecordings:
 
 
 _NOT_CLAIMED: Final = (
-    "its recorder was killed before it noted which directory it had made, and what lies there does "
-    "not carry the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
+    "its recorder was killed before it listed the directory that it made, and the files there do "
+    "not contain the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
 )
 _ADVICE: Final = "they are kept until `ros2-memory adopt` takes them"
 
@@ -514,7 +514,7 @@ def _find_former(
             identity = identity_of(folder)
             reason = _why_not_former(folder, custom_data, is_named=folder.name in named)
         except OSError as error:
-            identity, reason = None, f"it cannot be looked into: {error.strerror or error}"
+            identity, reason = None, f"it cannot be read: {error.strerror or error}"
         if reason is not None:
             left[folder.name] = reason
         elif identity is not None:
@@ -532,18 +532,20 @@ def _why_not_former(folder: Path, custom_data: CustomDataOf, *, is_named: bool) 
     for path in _files_with_data(folder):
         embedded = custom_data(path)
         if embedded is None:
-            return f"{path.name} cannot be read as far as to know which bag directory it is of"
+            return (
+                f"{path.name} cannot be read far enough to show which bag directory it belongs to"
+            )
         if BAG_DIR_ID in embedded:
-            return f"{path.name} carries the id of a bag directory, of which the list is not here"
+            return f"{path.name} contains the id of a bag directory whose list is not here"
         if embedded and dict(embedded) != {RECORDED_BY: PROGRAM}:
-            return f"{path.name} carries what another program embedded"
+            return f"{path.name} contains data that another program embedded"
         if not (embedded or is_named):
             return (
                 f"{path.name} does not carry {RECORDED_BY}={PROGRAM}, and no recorder.json or "
                 "handover.json names the recording"
             )
         is_proven = True
-    return None if is_proven else "no file of it holds a byte"
+    return None if is_proven else "all of its files are empty"
 
 
 def _files_with_data(folder: Path) -> Iterator[Path]:

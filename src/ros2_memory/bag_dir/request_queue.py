@@ -206,5 +206,5 @@ def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:
     if request.number != number:
         raise ValueError("it has the number of another")
     if abs(now - request.asked) > STALE_NS:
-        raise ValueError("it was asked for too long ago, or in the future")
+        raise ValueError("its time is too long ago, or in the future")
     return request

@@ -365,7 +365,7 @@ def open_file(
             if is_busy(error):
                 tell = log.debug if again else log.warning
                 tell("catalogue_locked", path=str(path), instead="memory")
-                return "another program holds its file"
+                return "another program has locked its file"
             tell = log.debug if again else log.info
             tell("catalogue_place_refused", path=str(path), reason=str(error))
             reason = str(error.strerror if isinstance(error, OSError) else error)
@@ -528,7 +528,7 @@ def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
         connection.execute(f"PRAGMA user_version = {VERSION:d}")
     connection.execute("COMMIT")
     if tables and version != VERSION:
-        return f"it is of version {version}, and {VERSION} is what is known"
+        return f"it is of version {version}, and this program needs {VERSION}"
     # SQLite keeps the statement that declared a table; tables of its own are named sqlite_*.
     declared = "SELECT sql FROM sqlite_master WHERE type = 'table' AND name NOT GLOB 'sqlite_*'"
     statements = [str(sql) for (sql,) in connection.execute(declared).fetchall()]

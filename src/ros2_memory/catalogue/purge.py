@@ -52,7 +52,7 @@ def purge(file: Path, bags: Sequence[str]) -> None:
         if file.is_file() and not file.is_symlink():
             _purge(file, bags)
     except (OSError, sqlite3.Error, ValueError, LookupError) as error:
-        reason = f"the catalogue may still tell of what was deleted ({error}); delete the file"
+        reason = f"the catalogue may still contain deleted data ({error}); delete the file"
         raise BagError(str(file), f"{file.name}: {reason}") from error
 
 

@@ -238,7 +238,7 @@ class _Taking:
         if self._recorder is not None and topics & latched:
             lines.append(
                 f"{listed(sorted(topics & latched))}: latched messages, which the recorder carries "
-                f"on: {self._recorder}; stop it for a moment, and forget again"
+                f"on: {self._recorder}; stop the recorder, and forget again"
             )
             topics -= latched
         return Erasure.of(topics, windows, topics & latched), lines
@@ -445,8 +445,9 @@ def _delete(
             latched = {*carrier.with_latched(snapshot, {bag.path for bag in bags})}
             bags = [bag for bag in bags if bag not in latched]
             kept = [
-                f"{_name(bag.path, plan.bag_dir)}: it has latched messages, which nobody else may "
-                f"carry on beside a recorder: {recorder}; stop it for a moment, and forget again"
+                f"{_name(bag.path, plan.bag_dir)}: it has latched messages, which only the "
+                f"recorder may copy forward while it runs: {recorder}; stop the recorder, and "
+                "forget again"
                 for bag in sorted(latched)
             ]
         deleted, freed = _delete_files(plan.bag_dir, bags, kept)
@@ -525,7 +526,7 @@ def _correct_metadata(
     for recording in sorted({bag.recording for bag in deleted}):
         name = f"{_name(recording, plan.bag_dir)}/{METADATA_FILE}"
         if recording in open_recordings and not (recording / METADATA_FILE).exists():
-            yield f"{name} will list what was deleted: its recorder writes it at the end"
+            yield f"{name} will list deleted bags: the recorder writes it at the end"
             continue
         of_recording = {
             bag.path.name: counts.get(bag.path, Counter[str]())
@@ -536,11 +537,11 @@ def _correct_metadata(
             with directories.opened(plan.bag_dir, recording):
                 is_listed = take_out(recording, of_recording)
             if is_listed:
-                yield f"{name} lists what is left"
+                yield f"{name} lists the remaining bags"
         except FileNotFoundError:
             continue  # the recording was deleted, and its metadata.yaml with it
         except (OSError, ValueError) as error:
             yield (
-                f"{name} still lists what was deleted ({error}); rosbag2 opens the folder "
+                f"{name} still lists deleted bags ({error}); rosbag2 opens the folder "
                 f"after `ros2 bag reindex {recording}`"
             )

@@ -223,7 +223,7 @@ def require_recorder(settings: Settings) -> None:
     """
     if settings.data.recording is not None:
         raise ConfigError(
-            f"data.recording={settings.data.recording}: what deletes looks at all recordings; give "
+            f"data.recording={settings.data.recording}: deleting commands use all recordings; give "
             "data.recording=null, and --start and --end for a part of them"
         )
     if isinstance(settings.recorder, NullRecorderNode):

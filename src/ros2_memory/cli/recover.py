@@ -182,7 +182,7 @@ class _Recovery:
         path = folder / METADATA_FILE
         try:
             if self._repairer.correct_metadata(folder):
-                report(f"{path}: written anew, with what the files hold")
+                report(f"{path}: rewritten to match the files")
         except BagError as error:
             report(f"{path} NOT CORRECTED: {error.path}: {error.reason}")
         except (OSError, ValueError) as error:

@@ -297,7 +297,7 @@ class RecordingSessions:
             self._flush(session, session.splits.directory, changes.closed)
         for name in changes.empty:
             file = f"{session.name}/{name}"
-            sentence = f"{file} is empty although a newer split was begun"
+            sentence = f"{file} is empty although a newer split was started"
             self._events.fail_once("split_empty", file, sentence, recording=session.name)
         for fault in changes.faults:
             self._events.fail_once("unreadable", session.name, fault, recording=session.name)
@@ -364,7 +364,7 @@ class RecordingSessions:
         self._unsettled = left
 
     def _handle_vanished(self, session: RecordingSession) -> None:
-        sentence = f"the directory of recording {session.name} has gone; a new one is begun"
+        sentence = f"the directory of recording {session.name} is missing; a new recording starts"
         self._events.fail("recording_vanished", sentence, recording=session.name)
         self.restarts += 1
         if self.handover is not None and session is self.handover.new:

@@ -232,8 +232,8 @@ class Supervisor:
             self._events.fail(
                 "disk_gone",
                 f"recording is paused: the disk of {self._bag_dir} has been unmounted, and another "
-                "lies there; recording resumes by itself when it is mounted again (to record onto "
-                "the other one, start the recorder anew)",
+                "one is there; recording resumes when it is mounted again (to record onto the "
+                "other one, restart the recorder)",
             )
         elif was_away and not is_away:
             self._postpone("restart", self._backoff.failed(), now)
@@ -324,7 +324,7 @@ class Supervisor:
         if silent:
             sentence = (
                 f"{current.name} has stopped growing: the robot is silent, or its messages do not "
-                "arrive; what was recorded is closed"
+                "arrive; the recording is closed"
             )
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = silent and not over

@@ -113,8 +113,8 @@ def refuse_homes(bag_dir: Path) -> None:
     for home in (Path("/"), *sorted(homes)):
         if home.resolve().is_relative_to(root):
             raise RecorderError(
-                f"recording.clear_on_startup refuses to delete bags below {root}, which holds "
-                f"{home}; let recording.bag_dir be a directory of its own"
+                f"recording.clear_on_startup refuses to delete bags below {root}, which contains "
+                f"{home}; give recording.bag_dir a directory of its own"
             )
 
 

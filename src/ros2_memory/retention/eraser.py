@@ -147,7 +147,7 @@ class Eraser:
             except (BagError, OSError) as error:
                 if not any(map(self._may_change, paths)):
                     continue
-                found = f"what it holds is not known: {_reason_of(error)}"
+                found = f"its contents are unknown: {_reason_of(error)}"
             if isinstance(found, str):
                 kept.append(f"{self._name(paths[0])}: {found}")
             elif found is not None:
@@ -253,13 +253,13 @@ class Eraser:
             reason = "a crash left it open; ros2-memory recover closes it"
         # Nothing in such a file says that its writer has finished.
         elif path.suffix == ".db3" and inode in open_files():
-            reason = "a program has it open; forget again when none does"
+            reason = "a program has it open; close that, and forget again"
         elif summary.notes:
-            reason = f"it cannot be written anew whole: {'; '.join(summary.notes)}"
+            reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
         elif is_carried(path) and self._recorder is not None:
             reason = (
-                f"nobody else may change it beside a recorder: {self._recorder}; stop it for a "
-                "moment, and forget again"
+                f"only the recorder may change it while it runs: {self._recorder}; stop the "
+                "recorder, and forget again"
             )
         return reason
 
@@ -405,16 +405,16 @@ class Eraser:
             name = f"{self._name(recording)}/{METADATA_FILE}"
             if not (recording / METADATA_FILE).exists():
                 if recording.name in read_heartbeat(self._bag_dir).recordings:
-                    yield f"{name} will count what was deleted: its recorder writes it at the end"
+                    yield f"{name} will count deleted messages: the recorder writes it at the end"
                 continue
             try:
                 with directories.opened(self._bag_dir, recording):
                     if correct(recording, self._reader):
-                        yield f"{name} counts what is left"
+                        yield f"{name} counts the remaining messages"
             except (BagError, OSError, ValueError) as error:
                 yield (
-                    f"{name} still counts what was deleted ({error}); `ros2 bag reindex "
-                    f"{recording}` writes it anew"
+                    f"{name} still counts deleted messages ({error}); `ros2 bag reindex "
+                    f"{recording}` rewrites it"
                 )
 
     def _remove_leftover(self, path: Path) -> None:

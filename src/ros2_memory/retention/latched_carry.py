@@ -242,7 +242,7 @@ class Carrier:
             return
         except BagError as error:
             if path == self.path:
-                reason = f"{error.reason}; move it away to give up what it holds"
+                reason = f"{error.reason}; move it away to give up its messages"
                 raise BagError(str(path), reason) from error
             _log.warning("latched_not_read", path=str(path), reason=error.reason)
 

@@ -58,7 +58,7 @@ def rewritten(
         try:
             taken = writer.cut(here, beside, takes, lambda text: recounted(text, left_of))
             if taken != expected:
-                raise BagError(str(path), "it does not hold what it held just now")
+                raise BagError(str(path), "its contents changed meanwhile")
             beside.chmod(stat.S_IMODE(before.st_mode))
             with suppress(OSError):
                 os.chown(beside, before.st_uid, before.st_gid)

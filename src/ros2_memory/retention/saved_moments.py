@@ -437,12 +437,12 @@ def _file_of(bag: BagFile) -> tuple[int, int] | None:
 
 
 def _gone(name: str) -> str:
-    return f"{name} has gone, or another file of that name is kept"
+    return f"{name} is missing, or another file has its name"
 
 
 def _used_up(key: str) -> str:
     what = f"the share of moments ({key})" if key == _SHARE else key
-    return f"{what} was used up: not all of it is kept"
+    return f"{what} was used up: only part of the moment is kept"
 
 
 def _holes(moment: SavedMoment, need: NeededBags) -> tuple[str, ...]:

@@ -310,7 +310,7 @@ def excess_in_arguments(given: Mapping[str, object]) -> str | None:
                 continue
             left -= len(value)
             if left < 0:
-                return f"{name[:80]} holds more than {MAX_VALUES} values; a call needs a few"
+                return f"{name[:80]} has more than {MAX_VALUES} values; a call needs a few"
             if depth >= MAX_DEPTH:
                 return f"{name[:80]} is nested deeper than {MAX_DEPTH} levels"
             inner = value.values() if isinstance(value, dict) else value

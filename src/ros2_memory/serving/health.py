@@ -80,7 +80,7 @@ class Health:
         """
         with anyio.move_on_after(self._timeout_s), suppress(BusyError):
             return await self._queue.run(None, self._report)
-        return _status(self._version, ["the bag directory is being looked through"], {})
+        return _status(self._version, ["the bag directory is being scanned"], {})
 
 
 def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:

@@ -156,11 +156,11 @@ class Screening:
         known = [*self._problems.items()]
         if not known:
             refused = "; ".join([*self._refusals.values()])
-            return f"recording.exclude_when knows nothing: {refused}" if refused else None
+            return f"recording.exclude_when does not work: {refused}" if refused else None
         name, reason = known[-1]
         held = counted(len(known), "split is", "splits are")
         return (
-            f"{held} not served, since recording.exclude_when could not be applied: "
+            f"{held} not served, because recording.exclude_when could not be applied: "
             f"{name}: {reason}"
         )
 
@@ -410,9 +410,9 @@ class Screening:
                 self._state = read_screen_state(self._bag_dir) or ScreenState()
             except ValueError as error:
                 raise RecorderError(
-                    f"{self._bag_dir / SCREENED_FILE}: {error}; what was not screened yet is not "
-                    "known any more: delete the newest recordings, or let them be served, by "
-                    "deleting this file"
+                    f"{self._bag_dir / SCREENED_FILE}: {error}; which splits are still unscreened "
+                    "is not known any more: delete the newest recordings, or delete this file to "
+                    "have them served"
                 ) from error
         return self._state
 

@@ -187,7 +187,7 @@ class Triggers:
             try:
                 state = read_trigger_state(self._bag_dir)
             except ValueError as error:
-                problem = f"what the rules knew is lost: .episodic/triggers.json: {error}"
+                problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
                 _log.error("trigger_state_lost", reason=problem)
             if state is None:
                 state = self._begun(snapshot)
@@ -250,7 +250,7 @@ class Triggers:
         if not bags:
             return
         sentence = (
-            f"{counted(bags, 'bag')} that rules may have needed went for want of room "
+            f"{counted(bags, 'bag')} that rules may have needed were deleted to make room "
             "(retention.max_total_gb, min_free_gb)"
         )
         _log.warning("needed_bags_deleted", bags=bags, reason=sentence)

@@ -492,7 +492,7 @@ class TestVersionsBeforeTheList:
         assert (event["recordings"], event["log_level"]) == (1, "warning")
         [reason] = event["reasons"]
         assert reason.startswith(f"{A}: {A}_1.")
-        assert "cannot be read as far as" in reason
+        assert "cannot be read far enough" in reason
         assert "ros2-memory adopt" in event["advice"]
 
     @pytest.mark.parametrize("embedded", [None, OURS])

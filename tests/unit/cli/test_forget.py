@@ -142,7 +142,7 @@ def test_beside_a_recorder_bags_with_latched_messages_are_kept(
     finally:
         lock.release()
     assert bags(bag_dir) == ["rec_0.mcap", "rec_2.mcap", "rec_3.mcap"]
-    assert "stop it for a moment" in capsys.readouterr().out
+    assert "stop the recorder, and forget again" in capsys.readouterr().out
 
 
 def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, capsys: Capture) -> None:
@@ -317,7 +317,7 @@ class TestMetadata:
         assert forget(0, 15, "--yes") == 0
         info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
         assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
-        assert "rec_0/metadata.yaml lists what is left" in capsys.readouterr().out
+        assert "rec_0/metadata.yaml lists the remaining bags" in capsys.readouterr().out
 
     def test_where_that_cannot_be_it_says_so_and_what_to_do(
         self, metadata: Path, capsys: Capture
@@ -326,7 +326,7 @@ class TestMetadata:
         before = metadata.read_text()
         assert forget(0, 15, "--yes") == 0
         output = capsys.readouterr().out
-        assert "rec_0/metadata.yaml still lists what was deleted (its numbers" in output
+        assert "rec_0/metadata.yaml still lists deleted bags (its numbers" in output
         assert f"ros2 bag reindex {metadata.parent}" in output
         assert metadata.read_text() == before
 
@@ -337,7 +337,7 @@ class TestMetadata:
         beat = Heartbeat(1, now, RecorderState.RECORDING, ("rec_0",), now, 0, (), (), None, 2.0)
         write_heartbeat(bag_dir, beat)
         assert forget(20, 35, "--yes") == 0
-        assert "rec_0/metadata.yaml will list what was deleted" in capsys.readouterr().out
+        assert "rec_0/metadata.yaml will list deleted bags" in capsys.readouterr().out
 
     def test_a_dry_run_leaves_it(self, metadata: Path) -> None:
         before = metadata.read_text()

@@ -57,7 +57,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
     assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
     assert printed[1] == "b/b_0.mcap: empty, removed"
-    assert printed[2] == f"{tmp_path / 'a/metadata.yaml'}: written anew, with what the files hold"
+    assert printed[2] == f"{tmp_path / 'a/metadata.yaml'}: rewritten to match the files"
     assert printed[-1] == str(outcome)
 
 
@@ -84,7 +84,7 @@ class TestMetadata:
         os.truncate(cut, cut.stat().st_size - 3000)
         (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
         _, printed = recovered(tmp_path / "rec")
-        assert any("metadata.yaml: written anew" in line for line in printed)
+        assert any("metadata.yaml: rewritten" in line for line in printed)
         held = McapReader().summarize(tmp_path / "rec/rec.mcap")
         assert 0 < held.count < 100
         assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}

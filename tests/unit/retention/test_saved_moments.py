@@ -96,9 +96,7 @@ class TestKeeping:
         assert outcome.bags == 1
         reported = told_of(tmp_path)
         assert reported["complete"] is False
-        assert reported["missing"] == [
-            f"{A}/{A}_1.mcap has gone, or another file of that name is kept"
-        ]
+        assert reported["missing"] == [f"{A}/{A}_1.mcap is missing, or another file has its name"]
 
     def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

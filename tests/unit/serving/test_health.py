@@ -182,7 +182,7 @@ async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
     # On a busy machine patience may end before it is even begun.
     assert not begun.is_set() or ended.wait(10)
     assert reply["status"] == "degraded"
-    assert reply["problems"] == ["the bag directory is being looked through"]
+    assert reply["problems"] == ["the bag directory is being scanned"]
 
 
 async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(

@@ -227,7 +227,7 @@ class TestFaults:
         (bags.bag_dir / SCREENED_FILE).write_text("{")
         assert bags.served() == []
         bags.screening = bags.new()
-        with pytest.raises(RecorderError, match="deleting this file"):
+        with pytest.raises(RecorderError, match="delete this file"):
             bags.begin(20)
 
     def test_a_clock_that_is_set_back_leaves_nothing_sure(self, tmp_path: Path) -> None:

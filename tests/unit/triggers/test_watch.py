@@ -275,7 +275,7 @@ class TestRetention:
         assert robot.logged("needed_bags_deleted")
         problem = robot.record().problem
         assert problem is not None
-        assert "went for want of room" in problem
+        assert "were deleted to make room" in problem
 
 
 class TestFaults:

@@ -277,10 +277,10 @@ def _in_thread() -> Callable[[Callable[[], None]], None]:
 
 def _asking_again(topics: Collection[str]) -> str:
     return (
-        f"a publisher offers weaker QoS than was asked for on {listed(sorted(topics))}: a new "
-        "recording subscribes anew; what that publisher sent meanwhile is not recorded"
+        f"a publisher offers weaker QoS than requested on {listed(sorted(topics))}: a new "
+        "recording subscribes again; messages sent by it meanwhile are not recorded"
     )
 
 
 def _deeper(topics: Collection[str]) -> str:
-    return f"a new recording is begun, to subscribe with deeper queues: {listed(sorted(topics))}"
+    return f"a new recording starts, to subscribe with deeper queues: {listed(sorted(topics))}"
