@@ -285,7 +285,7 @@ def test_where_there_are_transforms_alone_the_tool_for_them_is_named(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", moved)
     reply = ask(tmp_path, recalls, tool, **given)
     assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
-    assert "transforms are on /tf: get_transform_at tells" in reply["detail"]
+    assert "transforms are on /tf: get_transform_at returns" in reply["detail"]
     asked_for = {"parent": "odom", "child": "base_link", "timestamp": T0_S + 1}
     assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
 

@@ -38,7 +38,7 @@ LOST_AND_FOUND: Final = "lost+found"
 
 _OTHER_DISK = (
     "the bag directory is on another disk than before, and contains no bags: the disk of the bags "
-    "was unmounted; mount it again, and the bags are found again"
+    "has been unmounted; mount it again, and the bags are found again"
 )
 _OF_NAME: Final = r"(?:/.*|(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?)?"
 """What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
