@@ -10,7 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Deadline, Ns
@@ -122,9 +122,9 @@ class SegmentFold(Generic[T, R]):
         known = for_all or for_this
         if known:
             return known[0], None
-        with _Completeness(view) as completeness:
+        with view.notes.apart():
             folded, since, left_unread = self._fold(view, topic, share, window, reading)
-            if since is None and completeness.is_complete and not self.failures:
+            if since is None and view.notes.complete and not self.failures:
                 (for_this if left_unread else for_all).append(folded)
         return folded, since
 
@@ -162,7 +162,7 @@ class SegmentFold(Generic[T, R]):
             return
         failed = len(self.failures)
         # What cannot be read of other groups does not matter to this one.
-        with _Completeness(view):
+        with view.notes.apart():
             made, span = self.collect(group.messages())
             if made is not None and span is not None:
                 if group.is_whole and failed == len(self.failures):
@@ -197,24 +197,3 @@ class _Reading:
         if self._deadline is None:
             self._deadline = Deadline.after(READING_S)
         return self._deadline.expired() or self._view.call.deadline.expired()
-
-
-class _Completeness:
-    """Shows whether all could be read inside of a block, whatever could not be before."""
-
-    def __init__(self, view: View) -> None:
-        self._view = view
-        self._before = True
-
-    def __enter__(self) -> Self:
-        notes = self._view.notes
-        self._before, notes.complete = notes.complete, True
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._view.notes.complete = self._view.notes.complete and self._before
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether all could be read so far."""
-        return self._view.notes.complete

@@ -60,6 +60,7 @@ class BagAccess:
             self.snapshot = memory.index.snapshot(reach)
         self.notes = Notes()
         self._as_of: int | None = None
+        self._answers: dict[str, Mapping[tuple[int, ...], str]] = {}
 
     def check_deadline(self) -> None:
         """Checks that the call has time left.
@@ -121,9 +122,16 @@ class BagAccess:
         return cache.cached_answer(question, numbers, parse)
 
     def cached_answers(self, question: str) -> Mapping[tuple[int, ...], str]:
-        """Returns all answers to a question that were stored, by the bags' `entry_numbers`."""
+        """Returns all answers to a question that were stored, by the bags' `entry_numbers`.
+
+        Looked up once in a call.
+        """
         cache = self.memory.recall
-        return {} if cache is None else cache.catalogue.cached_answers(question)
+        if cache is None:
+            return {}
+        if question not in self._answers:
+            self._answers[question] = cache.catalogue.cached_answers(question)
+        return self._answers[question]
 
     def cache_answer(self, question: str, bags: Sequence[BagSpan], answer: str) -> None:
         """Stores what was computed from these bags, unless something could not be read."""

@@ -193,7 +193,7 @@ class Fold(Generic[T, R]):
                 continue
             for is_whole, run in groupby(share.groups(view, topic, window), _is_whole):
                 if is_whole:
-                    spans += self._whole(digests, f"{topic} {share.timeline}", stored, [*run])
+                    spans += self._whole(view, digests, f"{topic} {share.timeline}", stored, [*run])
                     continue
                 found = [self.add(group.messages()) for group in run]
                 spans += [span for span in found if span is not None]
@@ -201,6 +201,7 @@ class Fold(Generic[T, R]):
 
     def _whole(
         self,
+        view: View,
         digests: SegmentDigests | None,
         name: str,
         stored: StoredDigests[T],
@@ -213,22 +214,23 @@ class Fold(Generic[T, R]):
             name = f"{name} {run[0].bags[0].bag.file} {[len(each.bags) for each in run]}"
             known = self._reduced(digests, name, stored, partial(iter, run))
         if known is None:
-            found = [self._digest(stored, group) for group in run]
+            found = [self._digest(view, stored, group) for group in run]
             # Reduced as above, so that rounding does not depend on what is stored.
             known = self.reduce([each for each in found if each is not None]) if any(found) else ()
         yield from self._joined(known)
 
-    def _digest(self, stored: StoredDigests[T], group: Group) -> tuple[T, Span] | None:
+    def _digest(self, view: View, stored: StoredDigests[T], group: Group) -> tuple[T, Span] | None:
         """Returns the digest of a whole group, made from its messages where none is stored."""
         known = stored.of(group)
         if known is not None:
             return known
         failed = len(self.failures)
-        made, span = self.collect(group.messages())
-        if made is None or span is None:
-            return None
-        if failed == len(self.failures):
-            stored.store(group, made, span)
+        with view.notes.apart():
+            made, span = self.collect(group.messages())
+            if made is None or span is None:
+                return None
+            if failed == len(self.failures):
+                stored.store(group, made, span)
         return made, span
 
     def _reduced(

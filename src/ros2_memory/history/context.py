@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias
 
@@ -12,7 +13,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
@@ -270,6 +271,18 @@ class Notes:
         known = self._notes.get((note.kind, note.file))
         if known is None or known.until < note.until:
             self._notes[note.kind, note.file] = note
+
+    @contextmanager
+    def apart(self) -> Iterator[None]:
+        """Has `complete` show of a block alone whether all could be read in it.
+
+        So what is computed in it can be stored, whatever could not be read before.
+        """
+        before, self.complete = self.complete, True
+        try:
+            yield
+        finally:
+            self.complete = self.complete and before
 
     def sentences(self) -> tuple[str, ...]:
         """Returns the sentences for the reply, in the order in which each was first needed."""

@@ -134,15 +134,16 @@ class View:
         if known is not None:
             return known
         stored: dict[str, Census] = {}
-        merged = self.stream.merged(bags, [topic], window, newest_first=False)
         everywhere = [(window.start, window.stop)]
-        once = _counted(deduplicate_forward(_tallied(merged, stored), everywhere))
-        counted = {type_name: (stored[type_name], once[type_name]) for type_name in once}
-        answer = {
-            type_name: [astuple(stored), astuple(once)]
-            for type_name, (stored, once) in counted.items()
-        }
-        self.bags.cache_answer(question, bags, json.dumps(answer))
+        with self.notes.apart():
+            merged = self.stream.merged(bags, [topic], window, newest_first=False)
+            once = _counted(deduplicate_forward(_tallied(merged, stored), everywhere))
+            counted = {type_name: (stored[type_name], once[type_name]) for type_name in once}
+            answer = {
+                type_name: [astuple(stored), astuple(once)]
+                for type_name, (stored, once) in counted.items()
+            }
+            self.bags.cache_answer(question, bags, json.dumps(answer))
         return counted
 
 
