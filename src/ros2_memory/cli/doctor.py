@@ -418,7 +418,18 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
         return
     missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching)
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
-    unoffered = heartbeat.missing if heartbeat and heartbeat.is_live(now) else ()
+    live = heartbeat if heartbeat and heartbeat.is_live(now) else None
+    unoffered = live.missing if live else ()
+    others = _of_another_list(selection, live) if live else []
+    if others:
+        which = listed(others)
+        seen = f"the running recorder records or waits for {which}, not listed in {file}"
+        do = (
+            "give this command the recorder's settings (its environment and key=value arguments), "
+            "or restart the recorder if the list is newer"
+        )
+        yield _warning("topics", seen, do)
+        return
     entries = counted(len(selection.entries), "entry", "entries")
     if not snapshot.bags:
         yield _ok("topics", f"{file} lists {entries}; nothing is recorded yet")
@@ -435,6 +446,13 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
             yield _warning("topics", f"{entry} is in {file}; {_UNOFFERED}", do)
+
+
+def _of_another_list(selection: TopicSelection, heartbeat: Heartbeat) -> list[str]:
+    """Returns what a running recorder records, or waits for, that the list does not have."""
+    waited = [each for each in heartbeat.missing if each not in selection.entries]
+    recorded = [each for each in heartbeat.subscribed if not selection.matches(each)]
+    return [*recorded, *(each for each in waited if not selection.matches(each))]
 
 
 def _unheard_entries(

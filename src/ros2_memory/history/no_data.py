@@ -13,6 +13,7 @@ from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import (
     MAX_NS,
     MIN_NS,
+    NS_PER_S,
     Ns,
     unix_from_ns,
 )
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 MOST_TRIED: Final = 20
 """Topics of unknown content that are looked into for poses."""
+_CLOCKS_DIFFER_NS: Final[Ns] = 60 * NS_PER_S
+"""A time that is later than now by no more may be now by the clock of who asks."""
 ON_DISK_S: Final = 3
 """A message that the recorder received longer ago is on disk, as small as its chunks are."""
 
@@ -232,7 +235,9 @@ def no_data_at(
     window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
     reason = between(view, window) if older and newer else beyond(view, at)
     detail += _advice(view, reason)
-    if older and tolerance is not None:
+    if _is_to_come(view, at):
+        detail.append(_to_come(view, at))
+    elif older and tolerance is not None:
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -248,8 +253,11 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the last one before is at {unix_text(older.time)}")
     if newer:
         detail.append(f"the first one after is at {unix_text(newer.time)}")
-    reason = between(view, window) if older and newer else beyond(view, end)
+    newest = min(end, max(start, view.memory.clock.now()))
+    reason = between(view, window) if older and newer else beyond(view, newest)
     detail += _advice(view, reason)
+    if _is_to_come(view, start):
+        detail.append(_to_come(view, start))
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -282,9 +290,19 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
 def beyond(view: View, at: Ns) -> NoDataReason:
     """Returns why a moment with no message on one of its sides has no answer."""
     latest = view.snapshot.latest
-    if latest is not None and at > latest and view.snapshot.active:
+    if latest is not None and at > latest and view.snapshot.active and not _is_to_come(view, at):
         return NoDataReason.NOT_CLOSED_YET
     return NoDataReason.OUTSIDE_RANGE
+
+
+def _is_to_come(view: View, at: Ns) -> bool:
+    """Whether a moment is later than now by more than two clocks differ: nothing waits for it."""
+    return at > view.memory.clock.now() + _CLOCKS_DIFFER_NS
+
+
+def _to_come(view: View, at: Ns) -> str:
+    now = view.memory.clock.now()
+    return f"the time asked is {seconds(at - now)} in the future: it is {unix_text(now)} now"
 
 
 def undecodable(error: UndecodableError) -> NoDataError:

@@ -309,6 +309,11 @@ def _notes(
             "without a map, each run of odometry has coordinates of its own: a thing may be listed "
             "once for each run"
         )
+    if not sights.topics and known.since is None:
+        yield (
+            "nothing is known of things: no message of a detector was found "
+            "(a type such as vision_msgs/msg/Detection3DArray); find_matches finds words in texts"
+        )
     if label is None or asked is None:
         return
     mine = np.array([known.labels.key(each) == asked for each in sights.labels], bool)

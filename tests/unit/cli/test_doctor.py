@@ -356,11 +356,13 @@ def test_a_copy_of_older_data_is_not_being_written_where_nobody_writes(
 
 
 def test_a_topic_that_nobody_offers_and_restarts_are_reported(robot: Path, capsys: Capture) -> None:
+    topics = robot.parent / "topics.yaml"
+    topics.write_text("topics: [/odom, /gone]\n")
     beat(robot, missing=("/odom", "/gone"), restarts=1, last_error="it died")
     code, wrong = examined(capsys)
     assert code == 1
     seen = [each["seen"] for each in wrong["topics"]]
-    assert [each.split()[0] for each in seen] == ["/odom", "/gone"]
+    assert {each.split()[0] for each in seen} == {"/odom", "/gone"}
     assert all("no publisher has offered it since the recorder started" in each for each in seen)
     assert "it restarted ros2 bag record 1 time; its last error" in wrong["recorder"][0]["seen"]
 
@@ -396,3 +398,18 @@ class TestExtras:
         monkeypatch.setitem(sys.modules, "pyarrow", None)
         assert cli.main(["doctor"]) == 0
         assert "pip install 'ros2-memory[parquet]'" in capsys.readouterr().out
+
+
+def test_a_recorder_with_another_list_of_topics_is_reported_instead_of_the_topics(
+    robot: Path, capsys: Capture
+) -> None:
+    beat(robot, subscribed=("/odom", "/bumper"), missing=("/diagnostics",))
+    (robot.parent / "topics.yaml").write_text("topics: [/odom, /vision/scene]\n")
+    code, wrong = examined(capsys)
+    [finding] = wrong["topics"]
+    assert code == 1
+    assert (
+        "the running recorder records or waits for /bumper, /diagnostics, not listed in"
+        in finding["seen"]
+    )
+    assert "settings" in finding["do"]

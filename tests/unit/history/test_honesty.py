@@ -171,6 +171,25 @@ def test_the_split_being_written_is_reported_where_it_may_hold_newer(tmp_path: P
     assert (now["reason"], now["notes"]) == ("not_closed_yet", [written])
 
 
+def test_a_time_in_the_future_is_not_waited_for(tmp_path: Path) -> None:
+    write_splits(tmp_path, 2)
+    active = write_mcap(tmp_path / "rec" / "rec_2.mcap", messages(20), McapLayout(finish=False))
+    os.utime(active, ns=(T0 + 29 * S,) * 2)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + 30 * S))
+    soon = asked(memory, tmp_path, "get_position_at", timestamp=at(80))
+    assert soon["reason"] == "not_closed_yet"
+    future = asked(memory, tmp_path, "get_position_at", timestamp=at(3630))
+    assert future["reason"] == "outside_range"
+    assert f"the time asked is 3600 s in the future: it is {at(30):.6f} now" in future["detail"]
+    assert "tolerance_s" not in future["detail"]
+    window = {"topic": "/odom", "end": at(9000)}
+    begun = asked(memory, tmp_path, "get_topic_in_range", **window, start=at(25))
+    assert begun["reason"] == "not_closed_yet"
+    later = asked(memory, tmp_path, "get_topic_in_range", **window, start=at(8000))
+    assert later["reason"] == "outside_range"
+    assert "in the future" in later["detail"]
+
+
 SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
 
 

@@ -111,6 +111,19 @@ def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path
     assert mug["still_there"] == {"in_view": BEGIN + 19}
 
 
+def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> None:
+    write(tmp_path, [each for each in looked(0, 3, HERE) if "vision" not in each.topic])
+    reply = ask(tmp_path)
+    assert (reply["things"], len(reply["notes"])) == ([], 1)
+    assert "no message of a detector was found" in reply["notes"][0]
+    assert ask(tmp_path, label="cup")["notes"] == reply["notes"]
+
+
+def test_a_detector_that_sees_nothing_is_no_lack_of_one(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 3, HERE))
+    assert "notes" not in ask(tmp_path)
+
+
 def test_chairs_are_counted(tmp_path: Path) -> None:
     chairs = [("chair", 3.0, 0.0), ("chair", 3.0, 1.2), ("chairs", 4.2, -1.0)]
     write(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
