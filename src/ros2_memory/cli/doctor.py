@@ -333,7 +333,7 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
             f"{iso_local(pair.end)}, and are answered together"
         )
         if topic is not None:
-            seen += f"; each has messages of its own on {topic}: these are two robots"
+            seen += f"; each has messages of its own on {topic}, as from two robots"
         yield _warning("bags", seen, do)
     for contradiction in contradicting_frames(memory, Call())[:MAX_NAMED]:
         yield _warning("bags", str(contradiction), do)

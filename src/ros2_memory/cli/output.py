@@ -41,6 +41,8 @@ _COMMANDS: Final = {
     "list_recorded_topics": "`ros2-memory topics`",
 }
 """What a person runs in place of a tool that a sentence names."""
+_WITH_TOOLS: Final = frozenset({"problems", "trust"})
+"""Keys of sentences that may name tools."""
 _TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
 
 
@@ -72,7 +74,7 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
         else:
             line = _format_line(key, each, now)
             lines.add_row(
-                Text(escape(key)), Text(with_commands(line) if key == "problems" else line)
+                Text(escape(key)), Text(with_commands(line) if key in _WITH_TOOLS else line)
             )
     if lines.row_count:
         console.print(lines)

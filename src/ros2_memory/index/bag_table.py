@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.hard_links import HardLinks
@@ -21,7 +22,6 @@ from ros2_memory.index.unchanged_bags import KINDS, UnchangedBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
-    from pathlib import Path
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -136,12 +136,12 @@ class BagTable:
         timeline, scanned = self._timeline, self._scanned or ScanResult()
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
-        empty = 0
-        for each in self._set_aside.values():
+        empty: list[Path] = []
+        for path, each in self._set_aside.items():
             if each.aside is not None:
                 aside.setdefault(each.state, []).append(each.aside)
             else:
-                empty += 1
+                empty.append(Path(path))
                 silent.update(each.silent)
         return Snapshot(
             timeline=timeline,
@@ -150,7 +150,7 @@ class BagTable:
             ),
             damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *scanned.damaged]),
             unread=_by_path([*aside.get(FileState.UNREAD, ()), *scanned.links]),
-            empty=empty,
+            empty=tuple(sorted(empty)),
             silent_topics=frozenset(silent - timeline.types.keys()),
             scanned_at=now,
             problem=scanned.problem,

@@ -392,7 +392,7 @@ def _is_folder(link: Path) -> bool:
 def _problem(error: OSError) -> str:
     """Returns a sentence on a bag directory that cannot be listed."""
     if isinstance(error, FileNotFoundError):
-        return "the bag directory does not exist; every scan looks for it again"
+        return "the bag directory does not exist (yet): check recording.bag_dir (MEMORY_BAG_DIR)"
     if isinstance(error, NotADirectoryError):
         return "the bag directory is a file, not a directory: correct recording.bag_dir"
     return f"the bag directory cannot be read: {error.strerror or error}"

@@ -26,6 +26,7 @@ from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from ros2_memory.analysis.silences import Presence, Silence
     from ros2_memory.core.model import BagFile, SetAside
@@ -46,7 +47,7 @@ class Snapshot:
             that answer as far as they are complete are among `bags` too.
         damaged: files and directories that cannot be read at all, likewise.
         unread: files of a kind that another adapter reads, and symbolic links, likewise.
-        empty: number of closed bags without a message.
+        empty: closed bags without a message, by path.
         silent_topics: topics that some bag declares and none has a message of.
         scanned_at: when the directory was scanned.
         problem: why the bag directory itself could not be read.
@@ -57,7 +58,7 @@ class Snapshot:
     active: tuple[SetAside, ...] = ()
     damaged: tuple[SetAside, ...] = ()
     unread: tuple[SetAside, ...] = ()
-    empty: int = 0
+    empty: tuple[Path, ...] = ()
     silent_topics: frozenset[str] = frozenset()
     scanned_at: Ns = 0
     problem: str | None = None

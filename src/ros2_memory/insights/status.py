@@ -201,9 +201,8 @@ def nothing_here(snapshot: Snapshot) -> str:
     if snapshot.active:
         return "no bag answers yet: the first one is still being written"
     if snapshot.empty:
-        return (
-            f"no message is recorded here: {counted(snapshot.empty, 'bag holds', 'bags hold')} none"
-        )
+        bags = counted(len(snapshot.empty), "bag holds", "bags hold")
+        return f"no message is recorded here: {bags} none"
     if snapshot.damaged or snapshot.unread:
         return "no bag answers"
     return "no bag is here: nothing is recorded yet, or it is recorded elsewhere"

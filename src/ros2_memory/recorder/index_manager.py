@@ -218,7 +218,7 @@ class IndexManager:
             active=len(after.active),
             damaged=len(after.damaged),
             unread=len(after.unread),
-            empty=after.empty,
+            empty=len(after.empty),
             problem=after.problem,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )

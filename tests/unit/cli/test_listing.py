@@ -114,6 +114,12 @@ class TestPaths:
             assert "data_time_range" not in shown
             assert "list_recorded_topics" not in shown
 
+    def test_a_topic_after_the_folder_is_told_its_place(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["cat", str(folder), "/odom"]) == 2
+        assert f"ros2-memory cat /odom {folder}" in capsys.readouterr().err
+
     def test_bags_of_others_need_no_recorder_and_no_preset(
         self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -192,6 +198,22 @@ class TestRecordings:
         rows = {row["recording"]: row for row in json.loads(shown)}
         assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another program")
         assert rows["c"]["not_read"] == 1
+        _, shown = run(capsys, "info", folder)
+        assert "1 damaged bag file; `ros2-memory info` lists" in " ".join(shown.split())
+
+    def test_one_without_a_message_is_named_too(self, folder: Path, capsys: Capture) -> None:
+        write_mcap(folder / "caught_nothing" / "caught_nothing_0.mcap", [])
+        write_mcap(folder / "b" / "b_1.mcap", [])  # the end of a recording that has messages
+        write_mcap(folder / "lies_loose.mcap", [])
+        _, shown = run(capsys, "recordings", folder, "--json")
+        silent = [row["recording"] for row in json.loads(shown) if row["messages"] == 0]
+        assert silent == ["caught_nothing", "lies_loose.mcap"]
+        _, shown = run(capsys, "recordings", folder)
+        assert "no message was recorded" in shown
+        _, shown = run(capsys, "info", folder, "--json")
+        assert json.loads(shown)["held"]["empty_bags"] == 3
+        code, shown = run(capsys, "recordings", folder / "caught_nothing")
+        assert (code, len(shown.splitlines())) == (1, 1)
 
     @pytest.mark.parametrize(("name", "count"), [("a", 10), ("b", 4), ("loose/blue", 3)])
     def test_each_can_be_looked_at_alone(

@@ -116,7 +116,7 @@ def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yar
     assert _names(snapshot.active) == ["rec_5.mcap"]
     assert _names(snapshot.damaged) == ["rec_4.mcap"]
     assert _names(snapshot.unread) == ["latest", "old_0.db3"]
-    assert snapshot.empty == 1
+    assert [path.name for path in snapshot.empty] == ["rec_2.mcap"]
     assert snapshot.silent_topics == {"/lost", "/idle"}
 
 

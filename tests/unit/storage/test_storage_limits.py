@@ -276,7 +276,7 @@ class TestWholeFiles:
     ) -> None:
         path = bag(tmp_path, bomb(300 * MB))
         snapshot = memory_of(tmp_path).index.snapshot()
-        assert snapshot.empty == 0
+        assert snapshot.empty == ()
         [aside] = snapshot.damaged
         assert aside.path == path
         assert "larger than the 64 MiB allowed" in aside.reason

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
 from itertools import islice
+from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import typer
@@ -87,6 +88,10 @@ def cat(
         raise InvalidArgumentsError("give --csv or --json, not both")
     if limit is not None and tail is not None:
         raise InvalidArgumentsError("give --limit or --tail, not both")
+    if words and Path(topic).exists() and not Path(words[0]).exists():
+        raise InvalidArgumentsError(
+            f"the topic comes first: `ros2-memory cat {words[0]} {topic}`; {topic} is no topic"
+        )
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     view = View(memory, Call())
     name = resolve_topic(view, topic)
@@ -105,7 +110,8 @@ def cat(
         typer.echo(f"note: {with_local_times(note)}", err=True)
     if not count:
         typer.echo(
-            f"no message of {name} in this time; `ros2-memory topics` shows when there are some",
+            f"no message of {name} to show in this time; "
+            "`ros2-memory topics` says when there are some",
             err=True,
         )
     if not count or not view.notes.complete:
@@ -140,9 +146,7 @@ def _extracted(
     if left_out:
         view.notes.complete = False
         what = counted(left_out, "message")
-        view.notes.add(
-            f"{what} left out, because they cannot be decoded: `ros2-memory info` shows why"
-        )
+        view.notes.add(f"{what} left out that cannot be decoded: `ros2-memory info` shows why")
 
 
 def _lines(rows: Iterable[Row]) -> Iterator[str]:

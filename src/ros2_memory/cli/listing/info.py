@@ -163,7 +163,7 @@ def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
     """Returns how much is recorded, as `ros2 bag info` does."""
     bags = snapshot.bags
     kinds = sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})
-    return {
+    held: dict[str, JsonValue] = {
         "recordings": len(recordings_of(snapshot)),
         "bags": len(bags),
         "storage": ", ".join(kinds) or None,
@@ -171,6 +171,9 @@ def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
         "topics": len(snapshot.timeline.topics()),
         "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
     }
+    if snapshot.empty:
+        held["empty_bags"] = len(snapshot.empty)
+    return held
 
 
 def _has_files(snapshot: Snapshot) -> bool:

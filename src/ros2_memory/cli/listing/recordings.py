@@ -35,6 +35,7 @@ _NOT_SHOWN = frozenset({"end"})
 _OWN = "this recorder"
 _OTHERS = "another program"
 _MOMENT = "saved moment"
+_EMPTY = "no message was recorded"
 
 
 def recordings(
@@ -53,8 +54,9 @@ def recordings(
     memory = open_memory(settings, verbose=verbose)
     snapshot, root = memory.index.snapshot(), settings.recording.bag_dir
     rows = [*_rows(snapshot, root)]
+    empty: list[JsonValue] = [*_empty_rows(snapshot, root)]
     if as_json:
-        print_line(json.dumps(rows))
+        print_line(json.dumps([*rows, *empty]))
     elif rows:
         console = stdout_console()
         shown = [{key: row[key] for key in row if key not in _NOT_SHOWN} for row in rows]
@@ -62,6 +64,8 @@ def recordings(
         others: list[JsonValue] = [row for row in rows if "start" not in row]
         if others:
             print_reply(console, {"not_read": others})
+        if empty:
+            print_reply(console, {"empty": empty})
     else:
         print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
     if not rows:
@@ -84,6 +88,15 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     for file, reason in sorted(left.items()):
         name = file.removeprefix(f"{root}/")
         yield {"recording": name, "reason": reason}
+
+
+def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
+    """Yields the recordings without any message; a loose bag file is one."""
+    aside = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
+    folders = {bag.path.parent for bag in snapshot.bags} | {each.path.parent for each in aside}
+    found = [each if each.parent == root else each.parent for each in snapshot.empty]
+    for path in dict.fromkeys(each for each in found if each not in folders):
+        yield {"recording": str(path).removeprefix(f"{root}/"), "messages": 0, "reason": _EMPTY}
 
 
 def _row(name: str, bags: Sequence[BagFile]) -> dict[str, JsonValue]:
