@@ -50,6 +50,7 @@ HANDOVER_FILE: Final = "handover.json"
 METADATA_FILE: Final = "metadata.yaml"
 CARRY_FOLDER: Final = "latched"
 CARRY_FILE: Final = "carried.mcap"
+_CARRIED: Final = f"/{CARRY_FOLDER}/{CARRY_FILE}"
 MOMENTS_FOLDER: Final = "moments"
 MOMENT_FILE: Final = "moment.json"
 OWN_FOLDER: Final = ".episodic"
@@ -89,9 +90,9 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def is_carried(bag: Path) -> bool:
+def is_carried(bag: Path | str) -> bool:
     """Returns whether a bag holds carried messages: it shows nothing of what was recorded when."""
-    return bag.name == CARRY_FILE and bag.parent.name == CARRY_FOLDER
+    return f"/{bag}".endswith(_CARRIED)
 
 
 def is_kept_apart(name: str) -> bool:

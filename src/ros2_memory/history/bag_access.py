@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -268,8 +268,7 @@ class BagAccess:
             numbers, stored = digests.numbers, digests.messages(topic)
         for bag in segment.bags_with(topic):
             records = stored.get(numbers.get(bag.file, -1))
-            # A path for each bag of a week would take longer than the look-up.
-            if records is None or (bag.file.endswith(CARRY_FILE) and is_carried(bag.path)):
+            if records is None or is_carried(bag.file):
                 yield bag, self.read(bag, (topic,), TimeWindow.everything())
             else:
                 yield bag, [StoredMessage(bag, each) for each in records]
@@ -296,7 +295,7 @@ class BagAccess:
         if len(topics) != 1 or not self._stores(topics[0]):
             return None
         [topic] = topics
-        if is_carried(bag.path):
+        if is_carried(bag.file):
             return None  # its channels name the recording of each message, the catalogue not
         entry = self.entry(bag)
         if entry is None:

@@ -199,7 +199,7 @@ class Latching:
         configured = self._configured(channel.topic)
         if configured is not None or not snapshot.timeline.is_transient_state(channel.topic):
             return bool(configured)
-        if is_carried(found.bag.path):
+        if is_carried(found.bag.file):
             origin = origin_of(channel)
             return origin is None or not origin.often
         return snapshot.timeline.pace(channel.topic, found.bag.recording).is_rare

@@ -302,7 +302,7 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tup
     # Unlike `bags`, what overlaps a window includes the bag of carried messages.
     for bag in snapshot.bags if window is None else snapshot.timeline.overlapping(window):
         # Carried messages do not show when something was recorded.
-        if bag.file in snapshot.dating.misdated or is_carried(bag.path):
+        if bag.file in snapshot.dating.misdated or is_carried(bag.file):
             continue
         if reach is not None and bag.start - reach > longest:
             yield reach, bag.start

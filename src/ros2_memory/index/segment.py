@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import between, stretched
@@ -124,9 +124,9 @@ class Segment:
     @cached_property
     def recorded(self) -> Segment | None:
         """The bags without that of carried messages: mostly itself; None where no other is left."""
-        if not any(bag.file.endswith(CARRY_FILE) for bag in self.bags):
+        rest = [bag for bag in self.bags if not is_carried(bag.file)]
+        if len(rest) == len(self.bags):
             return self
-        rest = [bag for bag in self.bags if not is_carried(bag.path)]
         return Segment(rest) if rest else None
 
     @cached_property

@@ -143,7 +143,7 @@ class Inventory:
             if own is None:
                 own = owned[bag.recording] = self._is_own(bag.recording)
             # A recording is listed as own some moments after its directory appears.
-            ours = own or bag.recording in named or is_carried(Path(path))
+            ours = own or bag.recording in named or is_carried(path)
             if not ours and deletable is not Deletable.SAVED:
                 foreign.update((each.inode, each.size) for each in bag.files)
                 continue
@@ -206,7 +206,7 @@ class Inventory:
         deletable = _BY_STATE.get(classification.state, Deletable.NO)
         if path in known.saved:
             deletable = Deletable.SAVED
-        elif deletable is Deletable.YES and is_carried(Path(path)):
+        elif deletable is Deletable.YES and is_carried(path):
             deletable = Deletable.NO
         return _Entry(classification, known.files[path].stamp, bag, deletable)
 

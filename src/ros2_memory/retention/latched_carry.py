@@ -162,7 +162,7 @@ class Carrier:
             return None
         topics = self.topics(snapshot)
         gone = {str(path) for path in {*to_delete} - {*saved}}
-        kept = [bag for bag in snapshot.bags if bag.file not in gone and not _is_carried(bag)]
+        kept = [bag for bag in snapshot.bags if bag.file not in gone and not is_carried(bag.file)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
@@ -287,7 +287,7 @@ class Carrier:
             for bag in snapshot.bags:
                 if topic not in bag.summary.schema.positions or bag.recording in seen:
                     continue
-                if bag.path in to_delete or _is_carried(bag):
+                if bag.path in to_delete or is_carried(bag.file):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
@@ -347,10 +347,6 @@ def _merged_origin(
     ]
     first, *others = own.recordings
     return replace(own, recordings=(first, *sorted({*others, *copies} - {first})))
-
-
-def _is_carried(bag: BagFile) -> bool:
-    return bag.file.endswith(CARRY_FILE) and is_carried(bag.path)
 
 
 def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:

@@ -92,7 +92,7 @@ def needed_bags(
     waits = now < window.stop or any(_may_overlap(each, window) for each in open_files)
     ready = []
     for bag in bags:
-        if not window.overlaps(bag.start, bag.end) or is_carried(bag.path):
+        if not window.overlaps(bag.start, bag.end) or is_carried(bag.file):
             continue
         unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
         if unfinished and now - asked < REPAIRED_WITHIN_NS:
