@@ -376,7 +376,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         notes=view.notes.sentences(),
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
-        silences=tuple(silences_of(snapshot, memory.limits.latching)),
+        silences=tuple(silences_of(memory, snapshot)),
         clock_steps=steps,
     )
 
@@ -457,7 +457,10 @@ def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindo
 def _never(view: View, search: ReverseSearch, until: Ns) -> tuple[str, ...]:
     """Returns what a search that found nothing did not read, and when its topics were silent."""
     window = TimeWindow(MIN_NS, until)
-    return (*not_covered(view, window), *describe_silences(view, search.topics, window))
+    return (
+        *not_covered(view, search.topics, window),
+        *describe_silences(view, search.topics, window),
+    )
 
 
 def _before(before_s: float | None) -> Ns:

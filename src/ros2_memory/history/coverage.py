@@ -44,7 +44,7 @@ from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile, SetAside
@@ -99,6 +99,12 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             yield f"{counted(sum(topics.values()), 'message')} {what}: {named}"
 
 
+def was_forgotten(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
+    """Whether messages of a topic in a window were deleted by request."""
+    losses = read_losses(bag_dir, window.start, window.stop)
+    return any(each.topic == topic and each.by == "forgotten" for each in losses)
+
+
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on the stretches of a window of which nothing was to be recorded."""
     found = united(
@@ -132,16 +138,18 @@ def unix_text(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
 
 
-def not_covered(view: View, window: TimeWindow) -> tuple[str, ...]:
-    """Returns why a search of a window that found nothing was not complete; empty where it was.
+def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:
+    """Returns why a search of topics in a window was not complete; empty where it was.
 
-    It was where all that closed files hold of the window was read. A file that is being written
+    It was where all that closed files hold of the window was read, and nothing of the topics was
+    deleted by request. A file that is being written
     does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     whole = all(map(_is_whole, view.snapshot.timeline.faulty(window)))
     excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
-    if view.notes.complete and whole and not lost and not excluded:
+    forgotten = any(was_forgotten(view.memory.index.bag_dir, each, window) for each in topics)
+    if view.notes.complete and whole and not lost and not excluded and not forgotten:
         return ()
     note_unread(view, window, nothing=True)
     return view.notes.sentences()

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
-from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.coverage import unix_text, was_forgotten
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from ros2_memory.analysis.silences import Silence
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Latching
+    from ros2_memory.history.context import Memory
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
 
@@ -22,13 +22,19 @@ _ALIKE_NS: Final[Ns] = 30 * NS_PER_S
 """Topics of one node fall silent and return within this of each other."""
 
 
-def silences_of(snapshot: Snapshot, latching: Latching) -> Iterator[Silence]:
-    """Yields all silences in order of time; a latched topic holds, and is never silent."""
+def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
+    """Yields all silences in order of time.
+
+    A latched topic holds, and is never silent. Nor was one silent whose messages were deleted by
+    request.
+    """
+    latching, bag_dir = memory.limits.latching, memory.index.bag_dir
     latched: dict[str, bool] = {}
     for each in snapshot.silences:
         if each.topic not in latched:
             latched[each.topic] = latching.is_latched(snapshot, each.topic)
-        if not latched[each.topic]:
+        span = TimeWindow(each.start + 1, each.end)
+        if not latched[each.topic] and not was_forgotten(bag_dir, each.topic, span):
             yield each
 
 
@@ -36,7 +42,7 @@ def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
     """Yields the silences in a window, in order, as far as they are inside."""
     start = window.start + START_SLACK_NS
     end = max(start, window.stop - 1 - AT_OR_BEFORE_SLACK_NS)
-    for each in silences_of(view.snapshot, view.memory.limits.latching):
+    for each in silences_of(view.memory, view.snapshot):
         part = each.within(start, end)
         if part is not None:
             yield part

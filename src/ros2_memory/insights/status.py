@@ -8,7 +8,7 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.coverage import describe_excluded, describe_lost
+from ros2_memory.history.coverage import describe_excluded, describe_lost, was_forgotten
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import BagFile
-    from ros2_memory.history.context import Call, Latching, Memory
+    from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
@@ -62,8 +62,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
         missing=() if heartbeat is None else heartbeat.missing,
         never_heard=() if heartbeat is None else heartbeat.silent,
         lost={} if heartbeat is None or not live else heartbeat.lost,
-        fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
-        silences=tuple(silences_of(snapshot, memory.limits.latching)),
+        fell_silent=tuple(_fallen_silent(memory, snapshot)),
+        silences=tuple(silences_of(memory, snapshot)),
         clock_steps=clock_steps(view),
         damaged=len(snapshot.damaged),
         incomplete=snapshot.timeline.disk_use[1],
@@ -132,9 +132,9 @@ def lacking_in(view: View) -> Iterator[str]:
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
 
 
-def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[SilentTopic]:
+def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     """Yields topics that had messages often, and none when the newest data was recorded."""
-    latest = snapshot.dating.latest
+    latest, latching = snapshot.dating.latest, memory.limits.latching
     if latest is None:
         return
     for topic in snapshot.timeline.topics():
@@ -146,7 +146,9 @@ def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[SilentTop
         if messages < _MIN_MESSAGES:
             continue
         usual = (last - first) // (messages - 1)
-        if latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual):
+        is_long = latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual)
+        since = TimeWindow(last + 1, latest + 1)
+        if is_long and not was_forgotten(memory.index.bag_dir, topic, since):
             yield SilentTopic(topic, last, usual)
 
 

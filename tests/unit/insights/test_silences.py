@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ros2_memory.bag_dir.lost_file import Loss, append_losses
 from ros2_memory.core.timebase import local_text
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
@@ -62,6 +63,20 @@ def test_the_span_of_the_memory_lists_the_silence(memory: Memory, tmp_path: Path
 
 def test_the_status_lists_it(memory: Memory, tmp_path: Path) -> None:
     assert asked(memory, tmp_path, "memory_status")["silences"] == [row(BEGIN + 190.000001)]
+
+
+def test_messages_deleted_by_request_are_no_silence(memory: Memory, tmp_path: Path) -> None:
+    start, stop = (BEGIN + 100) * S, (BEGIN + 189) * S
+    lost = [Loss("/other", start, stop, 9, "forgotten"), Loss(SEEN, 0, BEGIN * S, 9, "forgotten")]
+    append_losses(tmp_path, lost)
+    assert asked(memory, tmp_path, "memory_status")["silences"] == [row(BEGIN + 190.000001)]
+    append_losses(tmp_path, [Loss(SEEN, start, stop, 90, "forgotten")])
+    status = asked(memory, tmp_path, "memory_status")
+    assert status["silences"] == []
+    assert "deleted by request" in status["trust"]
+    assert f"{SEEN} was silent" not in status["trust"]
+    [note] = asked(memory, tmp_path, "find_last_match", **NEVER)["notes"]
+    assert "deleted by request" in note
 
 
 def test_a_recap_has_it_as_an_event(memory: Memory, tmp_path: Path) -> None:
