@@ -9,6 +9,7 @@ reaches over a bag's end. What counts is one rule over the whole memory:
   of its messages or after the last. Before the first it was not there yet.
 - The robot is on where a third of the topics are heard that have a usual rate and are recorded
   together with it. Where it is not, nothing was recorded: that is a gap, and no part of a silence.
+  Behind a gap of `LONGEST_OFF_NS` no silence goes on: that may be another robot's recording.
 - A topic that is silent more often than `SELDOM` times, and for longer than it is heard, has
   silence as its habit: none of them is reported. Of one that is heard for less than `HABIT_NS`
   between two, as one that starts late each time, only those count that last `UNUSUAL` times as long
@@ -32,6 +33,7 @@ PERIODS: Final = 20
 SELDOM: Final = 2
 HABIT_NS: Final[Ns] = 3600 * NS_PER_S
 UNUSUAL: Final = 10
+LONGEST_OFF_NS: Final[Ns] = 7 * 86_400 * NS_PER_S
 _TOGETHER: Final = 3
 """The robot is on where one in so many of the topics is heard."""
 
@@ -191,15 +193,19 @@ def _silences_of(
         while at < len(on) and on[at][1] <= start:
             at += 1
         pieces: list[Span] = []
+        until, parted = start, False
         for span in on[at:]:
-            if span[0] >= stop:
+            parted = span[0] - until > LONGEST_OFF_NS
+            if span[0] >= stop or parted:
                 break
+            until = span[1]
             first, last = max(span[0], start), min(span[1], stop)
             if last - first > limit:
                 pieces.append((first, last))
         if pieces:
             length = sum(last - first for first, last in pieces)
-            yield Silence(topic, pieces[0][0], pieces[-1][1], length, stop == end)
+            goes_on = stop == end and not parted
+            yield Silence(topic, pieces[0][0], pieces[-1][1], length, goes_on)
 
 
 def _reported(found: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:

@@ -7,7 +7,7 @@ from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.silences import joined, silences
+from ros2_memory.analysis.silences import LONGEST_OFF_NS, joined, silences
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
@@ -126,6 +126,20 @@ class Snapshot:
         """Where topics with a usual rate were silent, in order of time; see `analysis.silences`."""
         together = frozenset(chain.from_iterable(part.together for part in self._dated))
         return tuple(silences(self._presences, together))
+
+    @cached_property
+    def newest_stretch(self) -> Ns | None:
+        """The log time since when nothing parts the recorded time for `LONGEST_OFF_NS`."""
+        begin = reach = None
+        for part in self._dated:
+            spans = [(part.bags[0].start, part.latest)]
+            if part.latest - part.bags[0].start > LONGEST_OFF_NS:
+                spans = [(bag.start, bag.end) for bag in part.bags]
+            for start, end in spans:
+                if reach is None or start - reach > LONGEST_OFF_NS:
+                    begin = start
+                reach = end if reach is None else max(reach, end)
+        return begin
 
     @cached_property
     def suspected_holes(self) -> tuple[SuspectedHole, ...]:

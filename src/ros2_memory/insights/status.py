@@ -133,9 +133,13 @@ def lacking_in(view: View) -> Iterator[str]:
 
 
 def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
-    """Yields topics that had messages often, and none when the newest data was recorded."""
+    """Yields topics that had messages often, and none when the newest data was recorded.
+
+    Not those of before a long gap: that may be another robot's recording.
+    """
     latest, latching = snapshot.dating.latest, memory.limits.latching
-    if latest is None:
+    begin = snapshot.newest_stretch
+    if latest is None or begin is None:
         return
     for topic in snapshot.timeline.topics():
         if snapshot.timeline.is_log(topic) or latching.is_latched(snapshot, topic):
@@ -143,7 +147,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         stated = [*snapshot.timeline.totals(topic).values()]
         messages = sum(each.messages for each in stated)
         first, last = min(each.first for each in stated), max(each.last for each in stated)
-        if messages < _MIN_MESSAGES:
+        if messages < _MIN_MESSAGES or last < begin:
             continue
         usual = (last - first) // (messages - 1)
         is_long = latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual)

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.silences import (
     HABIT_NS,
+    LONGEST_OFF_NS,
     Presence,
     Silence,
     Spacing,
@@ -61,6 +62,16 @@ def test_a_silence_begins_where_the_robot_is_on_again() -> None:
     assert found(odom=odom, seen=heard((0, 2 * HOUR - S), (6 * HOUR, 9 * HOUR))) == [
         Silence(SEEN, 5 * HOUR, 6 * HOUR, HOUR)
     ]
+
+
+def test_no_silence_goes_on_behind_a_gap_after_which_another_robot_may_be_recorded() -> None:
+    later = 9 * HOUR + LONGEST_OFF_NS
+    for gap, goes_on in ((0, True), (1, False)):
+        odom = heard((0, 9 * HOUR), (later + gap, later + 5 * HOUR))
+        assert [each.goes_on for each in found(odom=odom, seen=heard((0, HOUR)))] == [goes_on]
+        # It fell silent when all else did: nothing shows that it should be heard later.
+        whole = found(odom=odom, seen=heard((0, 9 * HOUR)))
+        assert [each.length for each in whole] == ([5 * HOUR] if goes_on else [])
 
 
 def test_half_a_minute_is_no_silence_nor_are_twenty_periods() -> None:

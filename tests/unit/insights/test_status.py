@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 from mcap.writer import Writer
 
+from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.lost_file import Loss, append_losses
 from ros2_memory.bag_dir.screened_file import Excluded, ScreenState, write_screen_state
@@ -186,6 +187,20 @@ def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Pat
     ]
     answer = memory_status(remembering(tmp_path, messages), Call())
     assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S, S),)
+
+
+@pytest.mark.parametrize(("later", "fell"), [(0, ["/bumper"]), (S, [])])
+def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
+    tmp_path: Path, later: int, fell: list[str]
+) -> None:
+    """That may be the recording of another robot."""
+    bumps = [boolean(BEGIN + t * S, True) for t in range(80)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", bumps)
+    again = bumps[-1].log_time + LONGEST_OFF_NS + later
+    poses = [odom(again + t * S, 0.0, 0.0, 0.0) for t in range(80)]
+    write_mcap(tmp_path / "b" / "b_0.mcap", poses)
+    answer = memory_status(memory_of(tmp_path), Call())
+    assert [each.topic for each in answer.fell_silent] == fell
 
 
 def test_damaged_files_are_counted_and_reported(tmp_path: Path) -> None:
