@@ -34,6 +34,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.coverage import was_forgotten
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import Status
@@ -197,7 +198,11 @@ def _is_live(memory: Memory, snapshot: Snapshot, status: Status, wall: Ns) -> bo
 
 
 def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
-    """Yields the rate of every topic that is not latched."""
+    """Yields the rate of every topic that is not latched.
+
+    A log has no usual rate; nor is one compared with that of a topic whose last messages were
+    deleted by request.
+    """
     latest = snapshot.dating.latest
     if latest is None:
         return
@@ -209,7 +214,11 @@ def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
         last = max(each.last for each in snapshot.timeline.totals(topic).values())
         rate = _count(memory, snapshot, topic, window) / unix_from_ns(WINDOW_NS)
         age_s = max(unix_from_ns(latest - last), 0.0)
-        yield TopicRate(topic, rate, usual_rate(snapshot, topic, latching), age_s)
+        usual = usual_rate(snapshot, topic, latching)
+        since = TimeWindow(last + 1, latest + 1)
+        if snapshot.timeline.is_log(topic) or was_forgotten(memory.index.bag_dir, topic, since):
+            usual = None
+        yield TopicRate(topic, rate, usual, age_s)
 
 
 def _count(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:

@@ -13,10 +13,11 @@ import pytest
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.lost_file import Loss, append_losses
 from ros2_memory.cli.output import format_duration
 from ros2_memory.cli.watch import AS_USUAL, TopicRate
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import boolean, odom, text, write_mcap
+from tests.support.bags import boolean, log_entry, odom, text, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,6 +69,19 @@ def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture)
     assert "/chatter silent (0 Hz, usually 1" in lines[0]
     assert "/bumper slow (0.2 Hz" in lines[0]
     assert "/odom" not in lines[0]
+
+
+def test_a_log_and_a_topic_that_was_forgotten_are_not_called_silent(
+    bag_dir: Path, capsys: Capture
+) -> None:
+    begin = time.time_ns() - 70 * NS_PER_S
+    lines = [log_entry(begin + n * NS_PER_S, 20, "nav", "hello") for n in range(30)]
+    write_mcap(bag_dir / "log" / "log_0.mcap", lines)
+    append_losses(bag_dir, [Loss("/chatter", begin, begin + 65 * NS_PER_S, 30, "forgotten")])
+    assert cli.main(["watch", "--count", "1"]) == 0
+    line = capsys.readouterr().out
+    assert "silent" not in line
+    assert "/bumper slow (0.2 Hz" in line
 
 
 def test_an_empty_memory_can_be_watched(tmp_path: Path, capsys: Capture) -> None:
