@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.bag_dir import durable_write, moment_file, trigger_file
+from ros2_memory.bag_dir import durable_write, moment_file
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.state import trigger_file
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.watched_bags import T0, S, WatchedBags, flag, rule
 

@@ -9,7 +9,7 @@ reaches over a bag's end. What counts is one rule over the whole memory:
   of its messages or after the last. Before the first it was not there yet.
 - The robot is on where a third of the topics are heard that have a usual rate and are recorded
   together with it. Where it is not, nothing was recorded: that is a gap, and no part of a silence.
-  Behind a gap of `LONGEST_OFF_NS` no silence goes on: that may be another robot's recording.
+  A gap of more than `LONGEST_OFF_NS` ends a silence: what follows may be another robot's recording.
 - A topic that is silent more often than `SELDOM` times, and for longer than it is heard, has
   silence as its habit: none of them is reported. Of one that is heard for less than `HABIT_NS`
   between two, as one that starts late each time, only those count that last `UNUSUAL` times as long

@@ -25,7 +25,8 @@
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
-No name here has the suffix of a bag, so the index ignores these files.
+No name here has the suffix of a bag, so the index ignores these files. What lies below `.episodic/`
+has its modules in `bag_dir.state`.
 """
 
 from __future__ import annotations

@@ -152,10 +152,7 @@ class SegmentDigests:
         return frozenset(pair for edge in edges.values() for pair in edge.pairs)
 
     def relatched(self, topic: str) -> Mapping[int, bool]:
-        """Returns whether another recording may have received a message of the topic before.
-
-        For each entry that has the topic.
-        """
+        """Returns, for each entry that has the topic, whether it may repeat another recording's."""
         return self._cached(
             self._relatched,
             topic,

@@ -146,9 +146,9 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
 
 
 def renew_entry(connection: sqlite3.Connection, row_id: int, sidecar: int) -> None:
-    """Has an entry hold for another time of the sidecar, under a new row id.
+    """Gives an entry another mtime of its sidecar (ns), and a new row id.
 
-    The cached answers that used it are deleted.
+    Deletes the cached answers that used it.
     """
     columns = "config, path, size, mtime, shape, counts"
     row = connection.execute(f"SELECT {columns} FROM bags WHERE id = ?", (row_id,)).fetchone()

@@ -268,7 +268,7 @@ class Catalogue(CatalogueDatabase):
         return self._of_topic(topic, numbers, UNDECODABLE, lambda row: dict(json.loads(row[1])))
 
     def relatched(self, topic: str, numbers: Sequence[int]) -> dict[int, bool]:
-        """Returns whether another recording may have received a message of the topic before."""
+        """Returns, by entry, whether the topic may repeat a message of another recording."""
         return self._of_topic(topic, numbers, RELATCHED, lambda row: bool(row[1]))
 
     def _of_topic(

@@ -68,7 +68,7 @@ class TopicDigest:
         events: on the topic; None where no message can be decoded.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
-        relatched: whether another recording may have received one of its messages before.
+        relatched: whether one of its messages may repeat a message of another recording.
         fields: the range of each field with numbers; None where they are not known.
         undecodable: by type, why none of its messages can be decoded; mostly empty.
     """

@@ -17,7 +17,6 @@ from typing import Annotated, Final
 
 import typer
 
-from ros2_memory.bag_dir.erasure_file import Erasure, read_erasure
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
@@ -29,7 +28,8 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state.erasure_file import Erasure, read_erasure
+from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_reader, catalogue_paths, supposed_own
 from ros2_memory.catalogue.purge import purge
 from ros2_memory.catalogue.store import BagKey

@@ -20,7 +20,7 @@ from rich.console import Console
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
-from ros2_memory.bag_dir.own_recordings import folders_with_bags
+from ros2_memory.bag_dir.state.own_recordings import folders_with_bags
 from ros2_memory.cli.output import with_commands
 from ros2_memory.config import NullRecorderNode, Settings, load_explained
 from ros2_memory.config_sources import GROUPS, Sources, quoted
@@ -218,8 +218,8 @@ def require_recorder(settings: Settings) -> None:
     """Checks that this deployment records: only then may a command have bags deleted.
 
     Raises:
-        ConfigError: it does not, or it looks at one recording alone: then it would not know what
-            others hold of what is deleted.
+        ConfigError: it does not, or `data.recording` limits it to one recording, and others may
+            contain the same messages.
     """
     if settings.data.recording is not None:
         raise ConfigError(

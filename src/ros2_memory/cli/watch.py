@@ -200,8 +200,7 @@ def _is_live(memory: Memory, snapshot: Snapshot, status: Status, wall: Ns) -> bo
 def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
     """Yields the rate of every topic that is not latched.
 
-    A log has no usual rate; nor is one compared with that of a topic whose last messages were
-    deleted by request.
+    Without a usual rate for logs, and for topics whose last messages were deleted by request.
     """
     latest = snapshot.dating.latest
     if latest is None:

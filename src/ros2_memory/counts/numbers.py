@@ -116,7 +116,7 @@ def _count(view: View, topic: str, group: Group) -> int:
     question = f"count {topic}"
     known = view.bags.cached_answer(question, group.bags, int) if group.is_whole else None
     if known is None:
-        with view.notes.apart():
+        with view.notes.isolated():
             known = group.count()
             if group.is_whole:
                 view.bags.cache_answer(question, group.bags, str(known))

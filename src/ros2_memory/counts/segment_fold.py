@@ -122,7 +122,7 @@ class SegmentFold(Generic[T, R]):
         known = for_all or for_this
         if known:
             return known[0], None
-        with view.notes.apart():
+        with view.notes.isolated():
             folded, since, left_unread = self._fold(view, topic, share, window, reading)
             if since is None and view.notes.complete and not self.failures:
                 (for_this if left_unread else for_all).append(folded)
@@ -162,7 +162,7 @@ class SegmentFold(Generic[T, R]):
             return
         failed = len(self.failures)
         # What cannot be read of other groups does not matter to this one.
-        with view.notes.apart():
+        with view.notes.isolated():
             made, span = self.collect(group.messages())
             if made is not None and span is not None:
                 if group.is_whole and failed == len(self.failures):

@@ -225,7 +225,7 @@ class Fold(Generic[T, R]):
         if known is not None:
             return known
         failed = len(self.failures)
-        with view.notes.apart():
+        with view.notes.isolated():
             made, span = self.collect(group.messages())
             if made is None or span is None:
                 return None

@@ -273,10 +273,10 @@ class Notes:
             self._notes[note.kind, note.file] = note
 
     @contextmanager
-    def apart(self) -> Iterator[None]:
-        """Has `complete` show of a block alone whether all could be read in it.
+    def isolated(self) -> Iterator[None]:
+        """Within the block, `complete` is about the block alone.
 
-        So what is computed in it can be stored, whatever could not be read before.
+        So a result that was computed from readable bags is stored, whatever failed before.
         """
         before, self.complete = self.complete, True
         try:

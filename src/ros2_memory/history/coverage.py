@@ -12,7 +12,7 @@ The first few of each kind are named, and the others counted:
   on disk of it answers, from the end of that on;
 - bags that a crash left open, up to the last time that their files were written to;
 - closed bags of which parts could not be read, or that contradict themselves;
-- messages that the recorder found to be missing (`bag_dir.lost_file`);
+- messages that the recorder found to be missing (`bag_dir.state.lost_file`);
 - stretches that `recording.exclude_when` excluded;
 - bags that a wrong clock dated, except where the answer is that there is nothing.
 """
@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
-from ros2_memory.bag_dir.lost_file import read_losses
-from ros2_memory.bag_dir.screened_file import excluded_between
+from ros2_memory.bag_dir.state.lost_file import read_losses
+from ros2_memory.bag_dir.state.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
     DOUBTS,
     MESSAGES_MISSING,

@@ -174,9 +174,9 @@ class MergedStream:
         )
 
     def relatched_bags(self, topic: str, among: Iterable[BagSpan]) -> set[str]:
-        """Returns the bags in which a message may be that another recording received before.
+        """Returns the files of the bags that may repeat a message of another recording.
 
-        The catalogue knows it of the bags with an entry.
+        Bags without a catalogue entry are among them.
         """
         found: set[str] = set()
         if self.may_be_relatched([topic]):
@@ -204,10 +204,10 @@ class MergedStream:
         return found.time > first[0] and found.bag.recording != first[1]
 
     def _find_first_copies(self, late: StoredMessage) -> None:
-        """Records where messages were received first that a late one may have been received with.
+        """Records the first reception of every message that a late one may repeat.
 
-        Late messages come many at once: the search goes on to the end of the bag, and back by its
-        own length again, so that a few serve all.
+        Late messages come many at once. So the search covers the rest of the late one's bag, and as
+        much again before its window: a few searches serve them all.
         """
         topic, window = late.record.channel.topic, _since_published(late)
         searched = self._searched.setdefault(topic, [])

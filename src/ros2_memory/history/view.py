@@ -135,7 +135,7 @@ class View:
             return known
         stored: dict[str, Census] = {}
         everywhere = [(window.start, window.stop)]
-        with self.notes.apart():
+        with self.notes.isolated():
             merged = self.stream.merged(bags, [topic], window, newest_first=False)
             once = _counted(deduplicate_forward(_tallied(merged, stored), everywhere))
             counted = {type_name: (stored[type_name], once[type_name]) for type_name in once}

@@ -129,7 +129,7 @@ class Snapshot:
 
     @cached_property
     def newest_stretch(self) -> Ns | None:
-        """The log time since when nothing parts the recorded time for `LONGEST_OFF_NS`."""
+        """First log time after the newest gap of more than `LONGEST_OFF_NS`; None without a bag."""
         begin = reach = None
         for part in self._dated:
             spans = [(part.bags[0].start, part.latest)]

@@ -129,7 +129,7 @@ def _steps_in(view: View, topic: str, suspect: SuspectedHole) -> Sequence[ClockS
     question = json.dumps(["clock steps", topic, suspect.first, suspect.last])
     steps = view.bags.cached_answer(question, bags, _decode)
     if steps is None:
-        with view.notes.apart():
+        with view.notes.isolated():
             steps = tuple(_read_steps(view, topic, suspect))
             view.bags.cache_answer(question, bags, json.dumps(steps))
     return steps

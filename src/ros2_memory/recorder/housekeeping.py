@@ -19,7 +19,7 @@ import structlog
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState

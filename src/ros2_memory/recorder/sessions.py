@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child

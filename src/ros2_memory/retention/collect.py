@@ -25,7 +25,7 @@ from ros2_memory.retention.recorded_time import relative_recording
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier

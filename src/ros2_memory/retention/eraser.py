@@ -1,6 +1,6 @@
 """Takes messages out of bags by writing these anew, with all that names or repeats them.
 
-What goes is written down first (`bag_dir.erasure_file`), so that an erasure that is interrupted can
+What goes is written down first (`bag_dir.state.erasure_file`), so that an interrupted erasure can
 be finished. Then for each bag: its messages leave the sidecar; the bag is written anew beside
 itself, read back, compared and flushed; and the new file takes the name of the old one, wherever a
 hard link in a moment has it. It is done when no name of the old one is left.
@@ -18,7 +18,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.erasure_file import Erased, Erasure, remove_erasure, write_erasure
 from ros2_memory.bag_dir.handover_file import (
     handover_to_change,
     message_id,
@@ -36,8 +35,9 @@ from ros2_memory.bag_dir.layout import (
     is_carried,
     is_kept_apart,
 )
-from ros2_memory.bag_dir.lost_file import Loss, append_losses, read_losses
 from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.bag_dir.state.erasure_file import Erased, Erasure, remove_erasure, write_erasure
+from ros2_memory.bag_dir.state.lost_file import Loss, append_losses, read_losses
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from ros2_memory.bag_dir.handover_file import MessageList
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader, BagWriter

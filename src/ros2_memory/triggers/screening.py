@@ -22,7 +22,7 @@ import structlog
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE, bag_kind, named_start
 from ros2_memory.bag_dir.metadata_yaml import correct
-from ros2_memory.bag_dir.screened_file import (
+from ros2_memory.bag_dir.state.screened_file import (
     FileStep,
     Heard,
     RecordingScreen,
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.screened_file import Excluded
+    from ros2_memory.bag_dir.state.screened_file import Excluded
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, BagWriter, Record

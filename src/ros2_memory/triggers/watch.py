@@ -19,7 +19,7 @@ import structlog
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
-from ros2_memory.bag_dir.trigger_file import (
+from ros2_memory.bag_dir.state.trigger_file import (
     RuleMoment,
     RuleRecord,
     TriggerState,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot

@@ -26,11 +26,11 @@ from mcap.writer import CompressionType
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.erasure_file import read_erasure
 from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.lost_file import read_losses
 from ros2_memory.bag_dir.metadata_yaml import Contents, describing
+from ros2_memory.bag_dir.state.erasure_file import read_erasure
+from ros2_memory.bag_dir.state.lost_file import read_losses
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey

@@ -84,17 +84,17 @@ def test_a_png_begins_as_one_and_no_home_is_written_to(
 
 
 def test_the_path_is_that_of_the_poses(bags: Path) -> None:
-    way, line, _ = scene.way_in(scene_of(bags), None, None)
-    assert (way.frame, way.xs[0], way.ys[0]) == ("odom", 0.0, 0.0)
-    assert (way.xs[-1], way.ys[-1]) == (10.0, 9.8)
-    assert way.at(1_700_000_005.0) == pytest.approx((5.0, 0.0), abs=0.06)
+    path, line, _ = scene.path_in(scene_of(bags), None, None)
+    assert (path.frame, path.xs[0], path.ys[0]) == ("odom", 0.0, 0.0)
+    assert (path.xs[-1], path.ys[-1]) == (10.0, 9.8)
+    assert path.at(1_700_000_005.0) == pytest.approx((5.0, 0.0), abs=0.06)
     assert line.startswith("19.8 m in 69.8 s")
 
 
 def test_standstills_are_on_the_path(bags: Path) -> None:
     asked = scene_of(bags)
-    way, _, _ = scene.way_in(asked, None, None)
-    (stop, *_) = scene.stops_on(scene.recap_in(asked), way)
+    path, _, _ = scene.path_in(asked, None, None)
+    (stop, *_) = scene.stops_along(scene.recap_in(asked), path)
     assert (stop.x, stop.y) == pytest.approx((10.0, 0.0), abs=0.1)
     assert stop.length > 15
 
@@ -110,12 +110,12 @@ def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> N
 
 def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
     asked = scene_of(bags)
-    lanes = {lane.name: lane.stretches for lane in scene.event_lanes(asked, scene.recap_in(asked))}
+    rows = {row.name: row.stretches for row in scene.event_rows(asked, scene.recap_in(asked))}
     start = 1_700_000_000.0
-    assert lanes["recorded"] == [(start, start + 29.8), (start + 60, start + 69.8)]
-    assert lanes["gaps"] == [(start + 29.8, start + 60)]
-    assert "stood" in lanes
-    topics = {lane.name: lane.stretches for lane in scene.topic_lanes(asked)}
+    assert rows["recorded"] == [(start, start + 29.8), (start + 60, start + 69.8)]
+    assert rows["gaps"] == [(start + 29.8, start + 60)]
+    assert "stood" in rows
+    topics = {row.name: row.stretches for row in scene.topic_rows(asked)}
     assert topics["/battery_state"] == [(start, start + 29)]
     assert len(topics["/odom"]) == 2
 

@@ -17,8 +17,8 @@ from ros2_memory.bag_dir.moment_file import (
     make_moment_folder,
     write_saved_moment,
 )
-from ros2_memory.bag_dir.request_queue import PendingRequest
-from ros2_memory.bag_dir.trigger_file import RuleRecord, TriggerState, write_trigger_state
+from ros2_memory.bag_dir.state.request_queue import PendingRequest
+from ros2_memory.bag_dir.state.trigger_file import RuleRecord, TriggerState, write_trigger_state
 from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import RefusedError

@@ -9,8 +9,8 @@ from mcap.writer import Writer
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.lost_file import Loss, append_losses
-from ros2_memory.bag_dir.screened_file import Excluded, ScreenState, write_screen_state
+from ros2_memory.bag_dir.state.lost_file import Loss, append_losses
+from ros2_memory.bag_dir.state.screened_file import Excluded, ScreenState, write_screen_state
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index.listed_splits import absent_splits

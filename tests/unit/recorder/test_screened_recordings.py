@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
-from ros2_memory.bag_dir.screened_file import read_gate
+from ros2_memory.bag_dir.state.screened_file import read_gate
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.storage.mcap.writer import McapWriter

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import parse_condition
-from ros2_memory.bag_dir.screened_file import Excluded, Heard
+from ros2_memory.bag_dir.state.screened_file import Excluded, Heard
 from ros2_memory.core.spans import lies_inside, united, without
 from ros2_memory.triggers.exclusion import (
     Cut,

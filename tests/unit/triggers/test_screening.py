@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
-from ros2_memory.bag_dir.screened_file import excluded_between, read_gate, read_screen_state
+from ros2_memory.bag_dir.state.screened_file import excluded_between, read_gate, read_screen_state
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import rewriting

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir import trigger_file
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
+from ros2_memory.bag_dir.state import trigger_file
 from ros2_memory.retention import saved_moments
 from ros2_memory.triggers.rules import RuleKind
 from tests.support.bags import McapLayout, Msg, boolean, text

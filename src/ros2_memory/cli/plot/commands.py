@@ -28,19 +28,19 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import with_local_times
 from ros2_memory.cli.plot.scene import (
     MOST_TOPICS,
+    DrawnPath,
     Stop,
-    Way,
     day_of,
-    event_lanes,
-    figures_of,
+    event_lines,
+    event_rows,
     opened,
+    path_in,
     places_in,
     recap_in,
     signals_of,
-    stops_on,
-    told_lines,
-    topic_lanes,
-    way_in,
+    stops_along,
+    topic_rows,
+    totals_line,
 )
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, NoDataError
 from ros2_memory.core.text import counted
@@ -101,10 +101,10 @@ def plot_path(
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     asked = opened(memory, parse_window(memory, start, end, last))
     with spinner("looking for the path"):
-        way, subtitle, notes = way_in(asked, topic, frame)
-        stops = stops_on(recap_in(asked), way)
+        path, subtitle, notes = path_in(asked, topic, frame)
+        stops = stops_along(recap_in(asked), path)
     picture = drawing.Picture(f"Path, {asked.title}", subtitle, (8.5, 7.0))
-    drawing.draw_way(picture, way, places_in(memory, way.frame), stops)
+    drawing.draw_path(picture, path, places_in(memory, path.frame), stops)
     _finish(picture, out, notes, as_json=as_json)
 
 
@@ -167,13 +167,13 @@ def plot_timeline(
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     asked = opened(memory, parse_window(memory, start, end, last))
     with spinner("looking what was recorded when"):
-        told = recap_in(asked)
-        lanes = [*event_lanes(asked, told), *topic_lanes(asked)]
+        found = recap_in(asked)
+        rows = [*event_rows(asked, found), *topic_rows(asked)]
     left_out = len(asked.view.snapshot.timeline.topics()) - MOST_TOPICS
     subtitle = f"without the {counted(left_out, 'rarest topic')}" if left_out > 0 else ""
-    picture = drawing.Picture(f"Recorded, {asked.title}", subtitle, (11.0, 1.3 + 0.27 * len(lanes)))
-    drawing.draw_timeline(picture, lanes, asked.span)
-    _finish(picture, out, () if told is None else told.notes, as_json=as_json)
+    picture = drawing.Picture(f"Recorded, {asked.title}", subtitle, (11.0, 1.3 + 0.27 * len(rows)))
+    drawing.draw_timeline(picture, rows, asked.span)
+    _finish(picture, out, () if found is None else found.notes, as_json=as_json)
 
 
 @plot.command("recap", epilog=epilog("plot"))
@@ -209,17 +209,17 @@ def plot_recap(
         raise InvalidArgumentsError("give --day, or --start, --end and --last, not both")
     asked = opened(memory, window)
     with spinner("recalling the day"):
-        told = recap_in(asked)
-        lanes = event_lanes(asked, told)
-        way: tuple[Way, Sequence[Place], Sequence[Stop]] | str
+        found = recap_in(asked)
+        rows = event_rows(asked, found)
+        path: tuple[DrawnPath, Sequence[Place], Sequence[Stop]] | str
         try:
-            drawn, _, _ = way_in(asked, None, None)
-            way = (drawn, places_in(memory, drawn.frame), stops_on(told, drawn))
+            drawn, _, _ = path_in(asked, None, None)
+            path = (drawn, places_in(memory, drawn.frame), stops_along(found, drawn))
         except (InvalidArgumentsError, NoDataError) as error:
-            way = f"nothing is known of the way: {error}"
-    picture = drawing.Picture(f"Recap, {asked.title}", figures_of(told), (12.0, 8.0))
-    drawing.draw_recap(picture, way, lanes, asked.span, [*told_lines(told)])
-    _finish(picture, out, () if told is None else told.notes, as_json=as_json)
+            path = f"the path is unknown: {error}"
+    picture = drawing.Picture(f"Recap, {asked.title}", totals_line(found), (12.0, 8.0))
+    drawing.draw_recap(picture, path, rows, asked.span, [*event_lines(found)])
+    _finish(picture, out, () if found is None else found.notes, as_json=as_json)
 
 
 def _check(out: Path) -> None:

@@ -1,4 +1,4 @@
-"""Draws with matplotlib: a path, lanes of a timeline, signals. Times are Unix seconds.
+"""Draws with matplotlib: a path, rows of a timeline, signals. Times are Unix seconds.
 
 Nothing here knows bags or a memory. No window is opened, and nothing is written but the picture and
 matplotlib's list of fonts (see `cache_folder`).
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from ros2_memory.cli.plot.scene import Lane, Signal, Stop, Way
+    from ros2_memory.cli.plot.scene import DrawnPath, Signal, Stop, TimelineRow
     from ros2_memory.core.regions import Place
 
 _STYLE: Final = {
@@ -101,22 +101,24 @@ class Picture:
             self.figure.savefig(path, dpi=_DPI, metadata=metadata)
 
 
-def draw_way(picture: Picture, way: Way, places: Sequence[Place], stops: Sequence[Stop]) -> None:
+def draw_path(
+    picture: Picture, path: DrawnPath, places: Sequence[Place], stops: Sequence[Stop]
+) -> None:
     """Draws a path on a plane that fills the picture."""
     with rc_context(_STYLE):
-        draw_plane(picture.figure.add_subplot(), way, places, stops)
+        draw_plane(picture.figure.add_subplot(), path, places, stops)
 
 
 def draw_plane(
-    axes: Axes, way: Way, places: Sequence[Place] = (), stops: Sequence[Stop] = ()
+    axes: Axes, path: DrawnPath, places: Sequence[Place] = (), stops: Sequence[Stop] = ()
 ) -> None:
     """Draws a path, coloured by time, with named places and standstills of the same frame."""
     for place in places:
         _draw_place(axes, place)
-    points = np.column_stack([way.xs, way.ys])
+    points = np.column_stack([path.xs, path.ys])
     pieces = np.stack([points[:-1], points[1:]], axis=1)
-    driven = ~np.array(way.jumps[1:], dtype=bool)
-    times = np.array(way.times)
+    driven = ~np.array(path.jumps[1:], dtype=bool)
+    times = np.array(path.times)
     lines = LineCollection(
         [*pieces[driven]], array=(times[:-1] / _DAY_S)[driven], cmap="viridis", linewidths=2.0
     )
@@ -135,17 +137,17 @@ def draw_plane(
                 xs, ys, s=sizes, color="#f59e0b", alpha=0.55, linewidths=0, zorder=2, label="stood"
             )
         )
-    _fit(axes, [*way.xs], [*way.ys])
+    _fit(axes, [*path.xs], [*path.ys])
     axes.grid(visible=True, **_GRID)
     axes.set_axisbelow(True)
-    axes.set_xlabel(f"x (m, {way.frame})")
+    axes.set_xlabel(f"x (m, {path.frame})")
     axes.set_ylabel("y (m)")
     axes.legend(handles=handles, loc="best", framealpha=0.85, fontsize=8)
-    if way.times[-1] > way.times[0] and axes.figure is not None:
+    if path.times[-1] > path.times[0] and axes.figure is not None:
         is_wide = np.ptp(axes.get_xlim()) > 1.4 * np.ptp(axes.get_ylim())
         side = "bottom" if is_wide else "right"
         bar = axes.figure.colorbar(lines, ax=axes, location=side, shrink=0.8, pad=0.02)
-        _format_times(bar.ax, way.times[0], way.times[-1], of_colors=side)
+        _format_times(bar.ax, path.times[0], path.times[-1], of_colors=side)
 
 
 def _fit(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
@@ -174,24 +176,24 @@ def _draw_place(axes: Axes, place: Place) -> None:
     axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
 
 
-def draw_timeline(picture: Picture, lanes: Sequence[Lane], span: tuple[float, float]) -> None:
-    """Draws lanes on a timeline that fills the picture, the first one on top."""
+def draw_timeline(picture: Picture, rows: Sequence[TimelineRow], span: tuple[float, float]) -> None:
+    """Draws rows on a timeline that fills the picture, the first one on top."""
     with rc_context(_STYLE):
-        draw_lanes(picture.figure.add_subplot(), lanes, span)
+        draw_rows(picture.figure.add_subplot(), rows, span)
 
 
-def draw_lanes(axes: Axes, lanes: Sequence[Lane], span: tuple[float, float]) -> None:
-    """Draws lanes, the first one on top."""
+def draw_rows(axes: Axes, rows: Sequence[TimelineRow], span: tuple[float, float]) -> None:
+    """Draws rows, the first one on top."""
     start, end = span
     least = max((end - start) * _LEAST_SHARE, 1e-6)
-    for row, lane in enumerate(reversed(lanes)):
+    for at, row in enumerate(reversed(rows)):
         bars = [
-            (first / _DAY_S, max(last - first, least) / _DAY_S) for first, last in lane.stretches
+            (first / _DAY_S, max(last - first, least) / _DAY_S) for first, last in row.stretches
         ]
-        axes.broken_barh(bars, (row - 0.34, 0.68), facecolors=lane.color, linewidth=0)
-    names = [shortened(lane.name, _LONGEST_NAME) for lane in lanes]
-    axes.set_yticks(range(len(lanes)), [*reversed(names)])
-    axes.set_ylim(-0.6, len(lanes) - 0.4)
+        axes.broken_barh(bars, (at - 0.34, 0.68), facecolors=row.color, linewidth=0)
+    names = [shortened(row.name, _LONGEST_NAME) for row in rows]
+    axes.set_yticks(range(len(rows)), [*reversed(names)])
+    axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=True, axis="x", **_GRID)
     axes.set_axisbelow(True)
@@ -215,24 +217,24 @@ def draw_signals(picture: Picture, signals: Sequence[Signal], span: tuple[float,
 
 def draw_recap(
     picture: Picture,
-    way: tuple[Way, Sequence[Place], Sequence[Stop]] | str,
-    lanes: Sequence[Lane],
+    path: tuple[DrawnPath, Sequence[Place], Sequence[Stop]] | str,
+    rows: Sequence[TimelineRow],
     span: tuple[float, float],
     lines: Sequence[str],
 ) -> None:
     """Draws a path, or why there is none, beside lines of text, and a timeline below."""
     with rc_context(_STYLE):
-        height = 0.35 + 0.3 * len(lanes)
+        height = 0.35 + 0.3 * len(rows)
         grid = picture.figure.add_gridspec(
             2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
         )
         plane = picture.figure.add_subplot(grid[0, 0])
-        if isinstance(way, str):
+        if isinstance(path, str):
             plane.set_axis_off()
-            shown = textwrap.fill(way, 50)
+            shown = textwrap.fill(path, 50)
             plane.text(0.5, 0.5, shown, ha="center", va="center", color="#6b7280")
         else:
-            draw_plane(plane, *way)
+            draw_plane(plane, *path)
             plane.set_adjustable("datalim")  # it fills its part of the picture
         beside = picture.figure.add_subplot(grid[0, 1])
         beside.set_axis_off()
@@ -240,7 +242,7 @@ def draw_recap(
             textwrap.fill(each, 62, subsequent_indent="            ") for each in lines
         )
         beside.text(0, 1, wrapped, ha="left", va="top", fontsize=8.5, linespacing=1.5)
-        draw_lanes(picture.figure.add_subplot(grid[1, :]), lanes, span)
+        draw_rows(picture.figure.add_subplot(grid[1, :]), rows, span)
 
 
 def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") -> None:

@@ -14,6 +14,7 @@ from ros2_memory.cli.options import parse_time, present
 from ros2_memory.cli.output import format_duration
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call
@@ -24,7 +25,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place
@@ -51,7 +52,7 @@ _COLORS: Final = {
     "goal": "#059669",
     "thing": "#7c3aed",
 }
-_LANES: Final = {
+_ROWS: Final = {
     "gap": "gaps",
     "clock step": "clock steps",
     "silence": "silences",
@@ -63,12 +64,12 @@ _LANES: Final = {
     "flip": "flips",
     "thing": "things in view",
 }
-"""The kinds of events in a recap, and the lane of each, the first one on top."""
+"""The kinds of events in a recap, and the name of each one's row, the first one on top."""
 _TOPIC: Final = "#94a3b8"
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class DrawnPath:
     """A driven path in a frame: where (m) and when, and which points the robot jumped to."""
 
     frame: str
@@ -85,7 +86,7 @@ class Way:
         )
 
 
-class Lane(NamedTuple):
+class TimelineRow(NamedTuple):
     """A row of a timeline: stretches from one time to another; equal ones are a moment."""
 
     name: str
@@ -176,7 +177,9 @@ def recap_in(asked: Scene) -> Recap | None:
         return None
 
 
-def way_in(asked: Scene, topic: str | None, frame: str | None) -> tuple[Way, str, Sequence[str]]:
+def path_in(
+    asked: Scene, topic: str | None, frame: str | None
+) -> tuple[DrawnPath, str, Sequence[str]]:
     """Returns the path, a line on it, and notes; in the map where transforms lead there.
 
     Raises:
@@ -202,7 +205,7 @@ def way_in(asked: Scene, topic: str | None, frame: str | None) -> tuple[Way, str
     if not points:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {found.topic} has a place")
     totals = found.trajectory.totals
-    way = Way(
+    path = DrawnPath(
         found.frame_id,
         tuple(unix_from_ns(each.time) for each in points),
         tuple(each.position[0] for each in points),
@@ -213,7 +216,7 @@ def way_in(asked: Scene, topic: str | None, frame: str | None) -> tuple[Way, str
         f"{totals.distance_m:.1f} m in {format_duration(unix_from_ns(found.end - found.start))}, "
         f"at most {found.trajectory.max_speed:.2f} m/s; by {found.topic}"
     )
-    return way, line, found.notes
+    return path, line, found.notes
 
 
 def places_in(memory: Memory, frame: str) -> list[Place]:
@@ -221,12 +224,12 @@ def places_in(memory: Memory, frame: str) -> list[Place]:
     return [each for each in memory.limits.places if each.frame_id == frame]
 
 
-def stops_on(told: Recap | None, way: Way) -> list[Stop]:
+def stops_along(found: Recap | None, path: DrawnPath) -> list[Stop]:
     """Returns where the robot stood, by the path at that time."""
     stops: list[Stop] = []
-    for each in () if told is None else told.events:
+    for each in () if found is None else found.events:
         if each.kind == "stop" and each.end is not None:
-            x, y = way.at(unix_from_ns((each.start + each.end) // 2))
+            x, y = path.at(unix_from_ns((each.start + each.end) // 2))
             stops.append(Stop(x, y, unix_from_ns(each.end - each.start)))
     return stops
 
@@ -313,24 +316,23 @@ def _with_breaks(points: Sequence[tuple[Ns, float]]) -> Iterator[tuple[Ns, float
         before = at
 
 
-def event_lanes(asked: Scene, told: Recap | None) -> list[Lane]:
-    """Returns a lane of what was recorded, and one for each kind of events that there are."""
-    start, end = asked.span
-    gaps = [
-        (unix_from_ns(first), unix_from_ns(last))
-        for first, last in recording_gaps(asked.view, asked.window)
-    ]
-    lanes = [Lane("recorded", [*_between(start, end, gaps)], _COLORS["recorded"])]
+def event_rows(asked: Scene, found: Recap | None) -> list[TimelineRow]:
+    """Returns a row of what was recorded, and one for each kind of events that there are."""
+    span = asked.window.start, asked.window.stop - 1
+    recorded = without([span], [*recording_gaps(asked.view, asked.window)])
+    rows = [TimelineRow("recorded", [*map(_unix, recorded)], _COLORS["recorded"])]
     events: dict[str, list[Event]] = {}
-    for each in () if told is None else told.events:
+    for each in () if found is None else found.events:
         events.setdefault(each.kind, []).append(each)
-    for kind, name in _LANES.items():
+    for kind, name in _ROWS.items():
         if kind in events:
-            stretches = [
-                (unix_from_ns(each.start), unix_from_ns(_until(each))) for each in events[kind]
-            ]
-            lanes.append(Lane(name, stretches, _COLORS[kind]))
-    return lanes
+            stretches = [_unix((each.start, _until(each))) for each in events[kind]]
+            rows.append(TimelineRow(name, stretches, _COLORS[kind]))
+    return rows
+
+
+def _unix(span: tuple[Ns, Ns]) -> tuple[float, float]:
+    return unix_from_ns(span[0]), unix_from_ns(span[1])
 
 
 def _until(event: Event) -> Ns:
@@ -338,19 +340,7 @@ def _until(event: Event) -> Ns:
     return event.start if event.end is None or event.kind == "flip" else event.end
 
 
-def _between(
-    start: float, end: float, gaps: Iterable[tuple[float, float]]
-) -> Iterator[tuple[float, float]]:
-    """Yields what is left of a time without gaps in it, which come in order."""
-    for first, last in gaps:
-        if first > start:
-            yield start, min(first, end)
-        start = max(start, last)
-    if start < end:
-        yield start, end
-
-
-def topic_lanes(asked: Scene) -> Iterator[Lane]:
+def topic_rows(asked: Scene) -> Iterator[TimelineRow]:
     """Yields when each topic was recorded, of the topics with the most messages, by name."""
     timeline = asked.view.snapshot.timeline
     messages = {
@@ -366,28 +356,27 @@ def topic_lanes(asked: Scene) -> Iterator[Lane]:
                 stretches[-1] = (stretches[-1][0], max(last, stretches[-1][1]))
             else:
                 stretches.append((first, last))
-        spans = [(unix_from_ns(first), unix_from_ns(last)) for first, last in stretches]
-        yield Lane(topic, spans, _TOPIC)
+        yield TimelineRow(topic, [*map(_unix, stretches)], _TOPIC)
 
 
-def figures_of(told: Recap | None) -> str:
+def totals_line(found: Recap | None) -> str:
     """Returns distance, speed and time of standing in a line, as far as they are known."""
     parts: list[str] = []
-    if told is not None and told.distance_m is not None and told.max_speed is not None:
-        parts = [f"{told.distance_m:.1f} m driven", f"at most {told.max_speed:.2f} m/s"]
-    if told is not None and told.stood is not None:
-        parts.append(f"stood {format_duration(unix_from_ns(told.stood))}")
-    if told is not None:
-        parts += [f"{count} {name}" for name, count in told.counts]
+    if found is not None and found.distance_m is not None and found.max_speed is not None:
+        parts = [f"{found.distance_m:.1f} m driven", f"at most {found.max_speed:.2f} m/s"]
+    if found is not None and found.stood is not None:
+        parts.append(f"stood {format_duration(unix_from_ns(found.stood))}")
+    if found is not None:
+        parts += [f"{count} {name}" for name, count in found.counts]
     return ", ".join(parts)
 
 
-def told_lines(told: Recap | None) -> Iterator[str]:
+def event_lines(found: Recap | None) -> Iterator[str]:
     """Yields each event in a line, with the time of day, and how long it took."""
-    if told is None or not told.events:
+    if found is None or not found.events:
         yield "no events"
         return
-    for each in told.events:
+    for each in found.events:
         at = datetime.fromtimestamp(unix_from_ns(each.start)).astimezone()
         length = unix_from_ns(_until(each) - each.start)
         took = f" ({format_duration(length)})" if length >= 1 else ""

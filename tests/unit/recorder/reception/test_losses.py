@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir import lost_file
-from ros2_memory.bag_dir.lost_file import Loss, append_losses, read_losses
+from ros2_memory.bag_dir.state import lost_file
+from ros2_memory.bag_dir.state.lost_file import Loss, append_losses, read_losses
 from ros2_memory.recorder.reception.continuity import Position, holes, reader_of
 from ros2_memory.recorder.reception.losses import HOUR_NS, LossCounter, Progress
 from ros2_memory.storage.base import Schema
