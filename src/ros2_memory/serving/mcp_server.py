@@ -55,7 +55,7 @@ _LONGEST_URI: Final = 200
 _JSON: Final = "application/json"
 _PROMPT_NAME: Final = "use_memory"
 _PROMPT_TITLE: Final = "How to use the robot's memory"
-_PROMPT_DESCRIPTION: Final = "Teaches a planner which tool answers what, in one call each."
+_PROMPT_DESCRIPTION: Final = "Explains to a planner which tool answers which question."
 
 
 TOPICS: Final = Resource(
@@ -67,13 +67,13 @@ TOPICS: Final = Resource(
 STATUS: Final = Resource(
     uri="episodic://status",
     name="status",
-    description="How far the memory can be trusted just now.",
+    description="Recorder state, age of the newest data, damaged files and silent topics.",
     mime_type=_JSON,
 )
 MOMENTS: Final = Resource(
     uri="episodic://moments",
     name="moments",
-    description="What remember_moment and rules kept, newest first.",
+    description="Moments saved by remember_moment or a rule, newest first.",
     mime_type=_JSON,
 )
 TOOLS_OF_RESOURCES: Final = {
@@ -85,7 +85,7 @@ TOOLS_OF_RESOURCES: Final = {
 _Report: TypeAlias = "Callable[[float, float | None, str | None], Awaitable[None]]"
 
 LISTS_CACHED: Final = CacheHint(ttl_ms=3_600_000, scope="public")
-"""Lists are the same for every client, and change with the configuration alone."""
+"""Lists are the same for every client, and change only with the configuration."""
 _LISTS: Final[tuple[CacheableMethod, ...]] = (
     "server/discover",
     "tools/list",
@@ -108,7 +108,7 @@ _MOMENT_PREFIX: Final = "episodic://moments/"
 MOMENT: Final = ResourceTemplate(
     uri_template=f"{_MOMENT_PREFIX}{{id}}",
     name="moment",
-    description="One moment that remember_moment kept, by its name in episodic://moments.",
+    description="One saved moment, by its name in episodic://moments.",
     mime_type=_JSON,
 )
 _TEMPLATES: Final = {

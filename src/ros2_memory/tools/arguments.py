@@ -48,9 +48,9 @@ REGION_KINDS: Final = ("string", "object")
 """The JSON types of a place: its name, or its bounds."""
 LONGEST_BEFORE_S: Final = 3600.0
 LONGEST_AFTER_S: Final = 600.0
-"""Of a moment that is to be saved."""
+"""How far a saved moment may reach before and after now."""
 LONGEST_REASON_S: Final = 60.0
-"""Before a moment of which is asked what changed before."""
+"""How far before a time `recap` looks for changes (`around`)."""
 
 
 def _as_list(value: object) -> object:
@@ -107,7 +107,7 @@ def _as_while(value: object) -> object:
     """Returns the condition on another topic, which planners also send as JSON text."""
     parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
     if not isinstance(parsed, dict):
-        raise ValueError("is no object")  # noqa: TRY004 - pydantic reports ValueError alone
+        raise ValueError("is not an object")  # noqa: TRY004 - pydantic reports ValueError alone
     unknown = sorted(str(name) for name in parsed.keys() - CONDITION_KEYS)
     if unknown:
         raise ValueError(f"has no {abbreviate(unknown[0])}; it has {', '.join(CONDITION_KEYS)}")
@@ -115,7 +115,7 @@ def _as_while(value: object) -> object:
         condition = ConditionArguments.model_validate(parsed)
     except ValidationError as error:
         names = dict.fromkeys(str(fault["loc"][0]) for fault in error.errors(include_url=False))
-        raise ValueError(f"needs another {' and '.join(names)}") from None
+        raise ValueError(f"needs a valid {' and '.join(names)}") from None
     return WhileCondition(
         condition.topic, condition.condition_type, condition.value, condition.field
     )
@@ -190,7 +190,7 @@ _Time: TypeAlias = Annotated[
 _Times: TypeAlias = Annotated[tuple[_Time, ...], BeforeValidator(_as_times)]
 _Tolerance: TypeAlias = _Duration
 _Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
-_PoseTopic: TypeAlias = Annotated[_Name, Field(description="Not the default.")]
+_PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
     _Name,
     Field(description="Topic or glob.", examples=["/vision/*/scene_objects"]),
@@ -198,7 +198,7 @@ _SearchTopic: TypeAlias = Annotated[
 _Fields: TypeAlias = Annotated[
     tuple[_Name, ...],
     BeforeValidator(_as_list),
-    Field(description='Parts of value, e.g. ["position.x"].'),
+    Field(description='Only these, e.g. ["position.x"].'),
 ]
 _Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
@@ -214,7 +214,7 @@ _Where: TypeAlias = Annotated[
     ),
     Field(description="A place."),
 ]
-_FrameId: TypeAlias = Annotated[_Name, Field(description="Of the reply.")]
+_FrameId: TypeAlias = Annotated[_Name, Field(description="Frame of the reply.")]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
 ]
@@ -231,12 +231,12 @@ _ConditionValue: TypeAlias = Annotated[
         }
     ),
 ]
-_SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path of what is tested.")]
+_SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path to test.")]
 
 
 _By: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place"],
-    Field(description="Counts for each, local time: {columns, rows}."),
+    Field(description="Count for each, local time: {columns, rows}."),
 ]
 
 
@@ -267,23 +267,23 @@ class TimeArgument(Arguments):
 
 
 class At(TimeArgument):
-    """A moment, or several."""
+    """A time, or several."""
 
     replaces = "moment"
     text = "at a time"
     either = ("timestamp", "timestamps")
     at_s: _Time | None = Field(default=None, alias="timestamp", examples=[1784023200.5])
-    each_s: Annotated[_Times, Field(description=f"Up to {MOST_TIMES}.")] = Field(
+    each_s: Annotated[_Times, Field(description=f"Up to {MOST_TIMES} times.")] = Field(
         default=(), alias="timestamps"
     )
 
 
 class Ago(TimeArgument):
-    """A moment counted back from now."""
+    """A time some seconds before now."""
 
     replaces = "moment"
     text = "some seconds ago"
-    extra_reply = "age_s (before now)"
+    extra_reply = "with age_s (before now)"
     ago_s: Annotated[_Duration, Field(examples=[10], alias="seconds_ago")]
 
 
@@ -297,7 +297,7 @@ class Between(TimeArgument):
 
 
 class RecapTime(TimeArgument):
-    """A window that ends now, or between two times, or a moment and how much before it."""
+    """A window that ends now, a window between two times, or the seconds before a time."""
 
     replaces = "span"
     text = "in the last_s seconds, between two times, or before one"
@@ -308,13 +308,13 @@ class RecapTime(TimeArgument):
     around_s: _Time | None = Field(
         default=None,
         alias="around",
-        description="What changed before it.",
+        description="What changed before then.",
         examples=[1784023230],
     )
     before_s: Annotated[
         _Positive,
         AfterValidator(partial(_check_most, LONGEST_REASON_S)),
-        Field(description="Before around."),
+        Field(description="How far before around."),
     ] = Field(default=10, alias="seconds_before")
 
 
@@ -375,10 +375,10 @@ class PositionArguments(MotionArguments):
 
 
 class TransformArguments(Arguments):
-    """A pair of frames at a moment."""
+    """Two frames at a time."""
 
     parent: Annotated[_Name, Field(description="Reference frame.", examples=["odom"])]
-    child: Annotated[_Name, Field(description="Frame whose pose is asked.", examples=["laser"])]
+    child: Annotated[_Name, Field(description="Frame to locate.", examples=["laser"])]
     moment: AtTime
 
 
@@ -393,10 +393,10 @@ class ConditionArguments(Arguments):
 
 
 class LastMatchArguments(ConditionArguments):
-    """A condition on a topic, of which the last match is returned."""
+    """A condition on a topic; the last match is returned."""
 
     fields: _Fields = ()
-    before_s: _Time | None = Field(default=None, alias="before", description="Nothing after.")
+    before_s: _Time | None = Field(default=None, alias="before", description="Up to this time.")
 
 
 class ValueWhenArguments(Arguments):
@@ -411,7 +411,7 @@ class ValueWhenArguments(Arguments):
     field: _SearchField | None = None
     min_score: _Score | None = None
     fields: _Fields = ()
-    before_s: _Time | None = Field(default=None, alias="before", description="Nothing after.")
+    before_s: _Time | None = Field(default=None, alias="before", description="Up to this time.")
 
 
 class TrajectoryArguments(Arguments):
@@ -437,7 +437,7 @@ class RecapArguments(Arguments):
 
 
 class SaveMomentArguments(Arguments):
-    """A label, and how much around now is to be saved."""
+    """A label, and how many seconds before and after now to save."""
 
     label: Annotated[
         str, Field(strict=True, examples=["charger found"]), AfterValidator(_check_label)
@@ -468,11 +468,10 @@ class VisitsArguments(Arguments):
     where: _Where | None = None
     start_s: _Time | None = Field(default=None, alias="start")
     end_s: _Time | None = Field(default=None, alias="end")
-    frame_id: (
-        Annotated[_Name, Field(description="Of x and y, as replies name it; default: the map.")]
-        | None
-    ) = None
-    radius_m: Annotated[_Positive, Field(description="How near is there, m.")] | None = None
+    frame_id: Annotated[_Name, Field(description="Frame of x and y; default: the map.")] | None = (
+        None
+    )
+    radius_m: Annotated[_Positive, Field(description="Radius around x, y, m.")] | None = None
     limit: _Limit = 10
     by: _By | None = None
 
@@ -494,14 +493,14 @@ class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
     fields: _Fields = ()
-    last_s: Annotated[_Positive, Field(description="Only the last so many s.")] | None = Field(
+    last_s: Annotated[_Positive, Field(description="Only the last seconds.")] | None = Field(
         default=None, alias="seconds"
     )
     start_s: _Time | None = Field(default=None, alias="start")
     end_s: _Time | None = Field(default=None, alias="end")
-    oldest_first: Annotated[
-        bool, Field(strict=True, description="Counts all, lists the first.")
-    ] = False
+    oldest_first: Annotated[bool, Field(strict=True, description="List the first; count all.")] = (
+        False
+    )
     limit: _Limit = 5
     by: _By | None = None
     where: _Where | None = None
@@ -512,7 +511,7 @@ class MatchesArguments(ConditionArguments):
 class ThingsArguments(Arguments):
     """Which things, where, and when."""
 
-    label: Annotated[_Name, Field(description="Whole name.", examples=["mug"])] | None = None
+    label: Annotated[_Name, Field(description="Whole label.", examples=["mug"])] | None = None
     where: _Where | None = None
     start_s: _Time | None = Field(default=None, alias="start")
     end_s: _Time | None = Field(default=None, alias="end")
@@ -521,7 +520,7 @@ class ThingsArguments(Arguments):
 
 
 class CompareArguments(Arguments):
-    """A window, and the one that it is compared with."""
+    """Two windows to compare."""
 
     start_s: Annotated[_Time, Field(alias="start", examples=[1784023200])]
     end_s: Annotated[_Time, Field(alias="end", examples=[1784023260])]

@@ -28,13 +28,13 @@ from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
-    "When, where, how often and how long a condition held, newest first; "
-    "matches in a row are one sighting; on /_action/status each goal is: failed, aborted, "
+    "When, where, how often and how long a condition was true, newest first. "
+    "Consecutive matches are one sighting; on /_action/status each goal is one: failed, aborted, "
     'succeeded. while: {{"topic": "/is_docked", "condition_type": '
-    '"equals", "value": false}} takes those while another topic meets a condition. '
+    '"equals", "value": false}} requires a condition on another topic too. '
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "
-    "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: where it "
-    "was then, place: of the thing, score}}], total}}.",
+    "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
+    "position then, place: of the thing, score}}], total}}.",
     MatchesArguments,
     find_matches,
     blocking=True,
@@ -43,7 +43,7 @@ _SIGHTINGS = ToolDeclaration(
 )
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
-    "What happened {when}: way, stops, speed drops, things in view, flips of booleans, goals, "
+    "What happened {when}: path, stops, speed drops, things in view, toggled booleans, goals, "
     "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
     "duration_s, text, in, score, before: what changed in the 10 s before}}], counts}}. With "
     "around: {{before: [{{text, s_before}}], after, nearest first, recorded, robot, state}}.",
@@ -52,17 +52,17 @@ _RECAP = ToolDeclaration(
     blocking=True,
 )
 _STATUS = ToolDeclaration(
-    (ToolName("memory_status", "How far to trust the memory"),),
-    "Whether the recorder is alive, how old the newest data is, which topics fell silent and when, "
-    "what is damaged, for how long the disk lasts, and the newest kept moments.",
+    (ToolName("memory_status", "State of the memory"),),
+    "Whether the recorder runs, how old the newest data is, which topics fell silent and when, "
+    "damaged files, how many days of data the disk budget holds, and the newest saved moments.",
     NoArguments,
     memory_status,
 )
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
-    "{map_frame} where transforms lead there, else in the frame of {pose_topic}; without a place, "
-    "in every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
+    "{map_frame} if transforms lead there, else in the frame of {pose_topic}; without a place, "
+    "for every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
     "closest_m, ago_s}}], total, minutes}} or {{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,
     visits,
@@ -71,17 +71,18 @@ _VISITS = ToolDeclaration(
 )
 _THINGS = ToolDeclaration(
     (ToolName("find_things", "Things"),),
-    "What there is and where: how many chairs, what is in a place, where is X, since when and "
-    "where before; as of end. Reply: {{things: [{{label, place, in, first_seen, last_seen, ago_s, "
-    "count, seen_from, still_there, moved: [{{from, to, place, times}}]}}], total, labels}}.",
+    "Which things there are and where: how many chairs, what is in a place, where X is, since "
+    "when, where it was before; as of end. Reply: {{things: [{{label, place, in, first_seen, "
+    "last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "
+    "times}}]}}], total, labels}}.",
     ThingsArguments,
     find_things,
     blocking=True,
 )
 _COMPARE = ToolDeclaration(
-    (ToolName("compare", "What differs"),),
-    "What differs between two times, or two runs: things that moved, appeared, or were missed; "
-    "way, standstills, minutes in places, errors, silences. What is equal is left out. Reply: "
+    (ToolName("compare", "Differences"),),
+    "Differences between two time windows: things that moved, appeared, or were not seen again; "
+    "path, standstills, minutes in places, errors, silences. Equal values are left out. Reply: "
     "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "
     "movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
     "farthest_apart, minutes, errors, silent_s}}.",
@@ -96,21 +97,21 @@ TYPE = ToolDeclaration(
     describe_type,
 )
 MOMENTS = ToolDeclaration(
-    (ToolName("list_moments", "Kept moments"),),
-    "Moments kept by remember_moment, newest first.",
+    (ToolName("list_moments", "Saved moments"),),
+    "Moments saved by remember_moment or a rule, newest first.",
     NoArguments,
     list_moments,
 )
 MOMENT = ToolDeclaration(
-    (ToolName("show_moment", "A kept moment"),),
-    "One moment kept by remember_moment.",
+    (ToolName("show_moment", "A saved moment"),),
+    "One saved moment.",
     MomentArguments,
     show_moment,
 )
 _SAVE_MOMENT = ToolDeclaration(
-    (ToolName("remember_moment", "Keep a moment"),),
-    "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
-    "being written}}.",
+    (ToolName("remember_moment", "Save a moment"),),
+    "Saves the bags around now from deletion. Reply: {{moment, bags, pending: the rest is "
+    "still being written}}.",
     SaveMomentArguments,
     remember_moment,
     blocking=True,
@@ -119,4 +120,4 @@ _SAVE_MOMENT = ToolDeclaration(
 DECLARATIONS = (_SIGHTINGS, _THINGS, _COMPARE, _RECAP, _VISITS, _STATUS, _SAVE_MOMENT)
 """The tools, in the order in which clients see them."""
 READABLE = (TYPE, MOMENTS, MOMENT)
-"""What is read as a resource, and is no tool."""
+"""Declared like tools, but offered as resources."""

@@ -37,8 +37,8 @@ _TIME: Final = "Unix seconds or ISO 8601 text"
 class Signature:
     """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
 
-    `plain_times`: the schema shows times as numbers, and places as names, alone, since some clients
-    refuse an argument of two types. The other type is read all the same.
+    `plain_times`: the schema declares times as numbers only, and places as names only, since some
+    clients refuse an argument of two types. The other types are still accepted.
     """
 
     def __init__(
@@ -123,14 +123,14 @@ class Signature:
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
         names = ", ".join(self._properties)
-        known = f"there are: {names}" if names else "there are none"
+        known = f"the arguments are: {names}" if names else "the tool takes none"
         unknown = (name for name in given if name not in self._properties)
         for name in islice(unknown, _MAX_UNKNOWN_NAMED):
             near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
             hint = f"do you mean {near[0]}?" if near else known
-            yield f"there is no argument {abbreviate(name)}; {hint}"
+            yield f"unknown argument {abbreviate(name)}; {hint}"
         if more := sum(1 for _ in unknown):
-            yield f"and {more} more that there are not"
+            yield f"and {more} more unknown arguments"
 
     def _missing(self, present: Mapping[str, object]) -> Iterator[str]:
         for name in self._required:
@@ -141,7 +141,7 @@ class Signature:
         either = self._either
         named = [name for name in either if present.get(name) not in (None, [])]
         if len(named) > 1:
-            yield f"{' and '.join(named)} were both given: one of them is needed"
+            yield f"{' and '.join(named)} were both given: give only one"
         elif either and not named:
             others = " or ".join(either[1:])
             yield f"{either[0]} is missing: {_expected(self._properties[either[0]])}; or {others}"

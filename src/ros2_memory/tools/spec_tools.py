@@ -114,23 +114,23 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
 _DECLARATIONS = (
     ToolDeclaration(
         (ToolName("list_recorded_topics", "Recorded topics"),),
-        "Every recorded topic. Ask this first when a topic's name is not known. "
-        "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first "
-        "where they are too many.",
+        "Lists every recorded topic. Call this first if you do not know a topic's name. "
+        "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; if there are too "
+        "many, the busiest.",
         TopicListArguments,
         _list_topics,
     ),
     ToolDeclaration(
-        (ToolName("data_time_range", "Span of the memory"),),
-        "The time span of the memory, its holes, and what time it is now. "
+        (ToolName("data_time_range", "Recorded time range"),),
+        "The time range that is recorded, gaps in it, and the current time. "
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, times "
-        "in Unix s and local ISO, null while the memory is empty.",
+        "in Unix s and local ISO, null if nothing is recorded.",
         NoArguments,
         queries.data_time_range,
     ),
     ToolDeclaration(
         _at_and_ago("topic", "A topic's value", at="at_time"),
-        "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
+        "A topic's value {when}: its newest message at or before then, at most tolerance_s old "
         "(default {tolerance}, too little for slow topics; latched topics: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
@@ -141,7 +141,7 @@ _DECLARATIONS = (
             ToolName("get_topic_in_range", "A topic over a window", Between),
             ToolName("get_topic_in_last", "A topic over the last seconds", Last),
         ),
-        "What a topic said {when}: up to max_samples messages, evenly spaced over the window, "
+        "A topic's messages {when}: up to max_samples, evenly spaced over the window, "
         "first and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; "
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
         "max, max_at}}}} of all messages}}.",
@@ -152,16 +152,16 @@ _DECLARATIONS = (
     ToolDeclaration(
         _at_and_ago("position", "Robot position"),
         "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-        "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, "
-        "longitude and altitude instead of x, y, z, which are null.",
+        "(counter-clockwise from x), timestamp, topic, frame_id}}; for NavSatFix latitude, "
+        "longitude and altitude, and x, y, z are null.",
         PositionArguments,
         at_each(queries.position),
     ),
     ToolDeclaration(
         _at_and_ago("velocity", "Robot velocity"),
         "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
-        "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
-        "x is ahead and angular z turns left.",
+        "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}. In the robot's own frame "
+        "x is forward and positive angular z turns left.",
         MotionArguments,
         at_each(queries.velocity),
     ),
@@ -175,17 +175,17 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("list_frames", "Frames"),),
-        "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
+        "Lists every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
         "static}}]}}.",
         NoArguments,
         queries.frames,
         blocking=True,
     ),
     ToolDeclaration(
-        (ToolName("find_last_match", "Last time something held"),),
-        "When a condition last held, in all history. Reply: {{timestamp, value, topic, type, "
-        "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
-        "read).",
+        (ToolName("find_last_match", "Last match"),),
+        "When a condition was last true, in all history. Reply: {{timestamp, value, topic, type, "
+        "age_s}}, or null if never ({{timestamp: null, value: null, notes}} if something could not "
+        "be read).",
         LastMatchArguments,
         queries.find_last_match,
         blocking=True,
@@ -193,21 +193,21 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("get_value_when", "A topic when another matched"),),
-        "What value_topic held when condition_topic last met a condition, "
+        "The value of value_topic when condition_topic last met a condition, "
         "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
-        "value_timestamp, condition_topic, value_topic}}, or null as there.",
+        "value_timestamp, condition_topic, value_topic}}, or null as find_last_match.",
         ValueWhenArguments,
         queries.value_when,
         blocking=True,
     ),
     ToolDeclaration(
         (
-            ToolName("trajectory_summary", "Way driven", Between),
-            ToolName("recent_trajectory_summary", "Way driven lately", Last),
+            ToolName("trajectory_summary", "Driven path", Between),
+            ToolName("recent_trajectory_summary", "Recent path", Last),
         ),
         "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, "
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
-        "...}}; with where only what it drove there, and visits.",
+        "...}}; with where: only the path inside it, and visits.",
         TrajectoryArguments,
         _trajectory,
         blocking=True,

@@ -136,9 +136,9 @@ def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_anot
 @pytest.mark.parametrize(
     ("condition", "reason"),
     [
-        ({"topic": "/is_docked"}, "needs another condition_type and value"),
+        ({"topic": "/is_docked"}, "needs a valid condition_type and value"),
         ({"topic": "/is_docked", "condition_type": "equals", "value": 1, "x": 2}, 'has no "x"'),
-        (5, "no object"),
+        (5, "not an object"),
     ],
 )
 def test_what_is_no_condition_is_refused(tmp_path: Path, condition: object, reason: str) -> None:
