@@ -464,6 +464,50 @@ def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> 
         assert path["begins"] == [0]
 
 
+def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch: Path) -> None:
+    """Two robots in one folder are warned of; the address keeps which is looked at."""
+    bag_dir = scratch / "two_robots"
+    drive(bag_dir, "robin", T0, 20)
+    drive(bag_dir, "wren", T0 + 5 * NS_PER_S, 20, x=100.0)
+    chromium.looks(width=1200, height=900)
+    chromium.open("about:blank")
+    chromium.complaints()  # of a page whose server ended
+    given = ("storage=mcap", "recorder=none", "data.now=latest")
+    with serving(bag_dir, scratch / "log_two_robots", *given) as server:
+        show(chromium, server)
+        assert "Robots are mixed: robin, wren overlap" in chromium.text("#mixed")
+        offered = chromium.run("return [...document.getElementById('recording').options]")
+        assert len(offered) == 3
+        chromium.run(
+            "const chosen = document.getElementById('recording'); chosen.value = 'wren';"
+            "chosen.dispatchEvent(new Event('change'));"
+        )
+        chromium.awaits("return state.view.recording === 'wren'")
+        assert "recording=wren" in chromium.run("return location.hash")
+        chromium.awaits("return state.view.isWhole")
+        assert chromium.run("return Math.min(...state.view.path.x)") == 100
+        assert chromium.run("return document.getElementById('mixed').hidden")
+        assert "only wren" in chromium.text("#summary")
+        chromium.run("pointed(arguments[0], true)", T0_S + 2)
+        chromium.awaits("return document.getElementById('moment').textContent.includes('It saw')")
+        # What is asked about a moment is asked of this recording, which had not begun.
+        assert "x\u00a02.00" not in chromium.text("#moment")
+        show(chromium, server, "#last=all&recording=robin")
+        assert chromium.run("return Math.max(...state.view.path.x)") == 20
+        chromium.open("about:blank")
+        chromium.open(server.url("/#recording=robim"))
+        chromium.awaits("return !document.getElementById('trouble').hidden")
+        assert "similar: robin" in chromium.text("#trouble")
+        # The way back is offered.
+        chromium.run(
+            "const chosen = document.getElementById('recording'); chosen.value = '';"
+            "chosen.dispatchEvent(new Event('change'));"
+        )
+        chromium.awaits(READY)
+        assert chromium.run("return Math.max(...state.view.path.x)") == 120
+    assert chromium.complaints() == []
+
+
 def drive(bag_dir: Path, name: str, begin: int, seconds: int, x: float = 0.0) -> None:
     """A bag of a robot that drives 1 m/s, in place at once as a closed one."""
     at_s = [n / 10 for n in range(seconds * 10 + 1)]

@@ -64,11 +64,13 @@ class SnapshotSource(Protocol):
 
     Attributes:
         bag_dir: the bag directory.
-        published: the result of the last scan, however old; None before the first.
     """
 
     bag_dir: Path
-    published: Snapshot | None
+
+    @property
+    def published(self) -> Snapshot | None:
+        """The result of the last scan, however old; None before the first."""
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
         """Returns a current snapshot, which reaches the log time `reach` if there is data."""

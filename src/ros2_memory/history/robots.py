@@ -58,6 +58,8 @@ _MAKERS: Final[WeakKeyDictionary[Timeline, list[tuple[str, Sequence[BagFile]]]]]
 """Caches, for a timeline, the recordings of which frames are compared."""
 
 
+ADVICE: Final = "; data.recording selects one recording"
+"""The end of a sentence on robots that are mixed."""
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
 _DESCRIBED: Final[WeakKeyDictionary[SnapshotSource, tuple[Ns | None, tuple[str, ...]]]] = (
     WeakKeyDictionary()
@@ -165,7 +167,7 @@ def _described(memory: Memory, call: Call) -> Iterator[str]:
         yield (
             f"robots are mixed: {listed(names)} overlap in time (from "
             f"{iso_local(first.pair.start)}), each with messages of its own on {first.topic}, but "
-            "answers treat them as one robot; data.recording selects one recording"
+            f"answers treat them as one robot{ADVICE}"
         )
     contradictions = contradicting_frames(memory, call)
     if contradictions:

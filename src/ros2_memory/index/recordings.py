@@ -8,20 +8,88 @@ other.
 from __future__ import annotations
 
 import re
+import threading
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
 
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
+from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, SetAside
+    from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
 _NUMBERED: Final = re.compile(
     r"(?P<series>.+?)(?:_(?P<number>\d+))?\.(?:mcap|db3)(?:\.zstd)?", re.IGNORECASE
 )
+
+_OF_NAME: Final = r"(?:/.*|(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?)?"
+"""What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
+
+
+def paths_named(root: str, name: str) -> re.Pattern[str]:
+    """Returns what the paths of a recording match.
+
+    Args:
+        root: the bag directory.
+        name: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
+            and its like).
+    """
+    return re.compile(re.escape(f"{root.rstrip('/')}/{name.strip('/')}") + _OF_NAME)
+
+
+class RecordingFilter:
+    """Narrows snapshots of a bag directory to one recording, as `data.recording` does. Thread-safe.
+
+    The bags of an unchanged segment are not looked at again.
+    """
+
+    def __init__(self, bag_dir: Path, name: str) -> None:
+        self._is_named = paths_named(str(bag_dir), name).fullmatch
+        self._lock = threading.Lock()
+        self._known: WeakKeyDictionary[Segment, list[BagFile]] = WeakKeyDictionary()
+        self._whole: Timeline | None = None
+        self._narrowed = Timeline()
+
+    def narrowed(self, snapshot: Snapshot) -> Snapshot:
+        """Returns the part of a snapshot that is of the recording; it may be empty."""
+
+        def of(files: tuple[SetAside, ...]) -> tuple[SetAside, ...]:
+            return tuple(each for each in files if self._is_named(str(each.path)))
+
+        timeline = self._timeline(snapshot.timeline)
+        return replace(
+            snapshot,
+            timeline=timeline,
+            active=of(snapshot.active),
+            damaged=of(snapshot.damaged),
+            unread=of(snapshot.unread),
+            empty=tuple(each for each in snapshot.empty if self._is_named(str(each))),
+            silent_topics=timeline.silent - timeline.types.keys(),
+            metadata_folders=tuple(filter(self._is_named, snapshot.metadata_folders)),
+        )
+
+    def _timeline(self, whole: Timeline) -> Timeline:
+        with self._lock:
+            if whole is not self._whole:
+                before = {bag.file: bag for bag in self._narrowed.bags}
+                after = {bag.file: bag for each in whole.segments for bag in self._of(each)}
+                removed = [bag for file, bag in before.items() if after.get(file) is not bag]
+                added = [bag for file, bag in after.items() if before.get(file) is not bag]
+                self._narrowed = self._narrowed.changed(removed, added)
+                self._whole = whole
+            return self._narrowed
+
+    def _of(self, segment: Segment) -> list[BagFile]:
+        if segment not in self._known:
+            self._known[segment] = [bag for bag in segment.bags if self._is_named(bag.file)]
+        return self._known[segment]
 
 
 def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
@@ -34,6 +102,18 @@ def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
     for bag in snapshot.bags:
         found.setdefault(loose.get(bag.file) or folder_of(bag.file), []).append(bag)
     return found
+
+
+def name_of(path: str, bags: Sequence[BagFile], root: str) -> str:
+    """Returns the name, below the bag directory `root`, under which a recording is found.
+
+    `path` and `bags` are an item of `recordings_of`.
+    """
+    if path != root:
+        return path.removeprefix(f"{root}/")
+    # Its bags lie in the folder itself.
+    name = stem_of(bags[0].file).removeprefix(f"{root}/")
+    return name if len(bags) == 1 else name.rpartition("_")[0]
 
 
 def loose_bags(snapshot: Snapshot) -> dict[str, str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import stat
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -24,6 +23,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.core.model import SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.index.recordings import paths_named
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -40,8 +40,6 @@ _OTHER_DISK = (
     "the bag directory is on another disk than before, and contains no bags: the disk of the bags "
     "has been unmounted; mount it again, and the bags are found again"
 )
-_OF_NAME: Final = r"(?:/.*|(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?)?"
-"""What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
 _LINK = "a symbolic link, which is not followed: move or mount the bags into the bag directory"
 
 
@@ -146,7 +144,7 @@ class Tree:
     def __init__(self, root: Path, only: str | None = None) -> None:
         self._root = str(root)
         self._only = None if only is None else f"{self._root.rstrip('/')}/{only.strip('/')}"
-        self._named = None if only is None else re.compile(re.escape(str(self._only)) + _OF_NAME)
+        self._named = None if only is None else paths_named(self._root, only)
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
         self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}"

@@ -21,6 +21,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.serving.backfill import Progress
 from ros2_memory.serving.page import span
 from ros2_memory.serving.page.moment import moment_shown
+from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import moment_request, span_request
 from ros2_memory.serving.page.span import MOST_POINTS, cut, span_shown, thinned
 from ros2_memory.serving.question_log import QuestionLog
@@ -323,3 +324,42 @@ def test_kept_questions_are_shown_and_make_an_answer_new(bag_dir: Path) -> None:
         "ms": 250.0,
         "answer": '{"events": []}',
     }
+
+
+def test_one_recording_answers_alone_and_all_are_listed(memory: Memory) -> None:
+    recordings = Recordings()
+    one = recordings.alone(memory, "rec_1")
+    found = shown(one, "last=1000")
+    assert found["range"]["earliest"] == BEGIN_S + 20
+    assert found["range"]["latest"] == BEGIN_S + 39.9
+    assert (found["path"]["x"][0], found["robot"]["x"]) == (10.0, 20.0)
+    assert found["status"]["recorder"] is None
+    assert moment(one, f"t={BEGIN_S + 5}")["robot"] is None
+    listed = recordings.shown(memory, one, Call())
+    assert listed["recordings"] == [
+        {"name": "rec_2", "start": BEGIN_S + 140, "end": BEGIN_S + 159.9},
+        {"name": "rec_1", "start": BEGIN_S + 20, "end": BEGIN_S + 39.9},
+        {"name": "rec_0", "start": BEGIN_S, "end": BEGIN_S + 19.9},
+    ]
+    assert listed["mixed"] == []
+    # What belongs to the same recording later is asked of the same memory.
+    assert recordings.alone(memory, "rec_1") is one
+
+
+@pytest.mark.parametrize("name", ["rec_9", "rec", "", ".", "../page0", "rec_1/..", "rec_1/x"])
+def test_a_recording_of_another_name_is_refused(memory: Memory, name: str) -> None:
+    with pytest.raises(InvalidArgumentsError, match="no recording is named"):
+        Recordings().alone(memory, name)
+
+
+def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:
+    for n, name in enumerate(("robin/a", "robin/b", "wren/c", "moments/x/d", "moments/y/e")):
+        write_mcap(tmp_path / name / "0.mcap", [odom(BEGIN + n * S, 0.0, 0.0)])
+    memory = memory_of(tmp_path)
+    recordings = Recordings()
+    rows = recordings.shown(memory, memory, Call())["recordings"]
+    assert isinstance(rows, list)
+    names = [row["name"] for row in rows if isinstance(row, dict)]
+    assert names == ["moments/y/e", "moments/x/d", "wren/c", "robin", "robin/b", "robin/a"]
+    assert rows[3] == {"name": "robin", "start": BEGIN_S, "end": BEGIN_S + 1, "holds": 2}
+    assert len(recordings.alone(memory, "robin").index.snapshot().bags) == 2

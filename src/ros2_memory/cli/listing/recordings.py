@@ -26,7 +26,7 @@ from ros2_memory.cli.output import print_reply
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import BagFile, BagState, JsonValue
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.index.recordings import recordings_of, stem_of
+from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
 
@@ -78,7 +78,7 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     found = sorted(recordings_of(snapshot).items(), key=lambda each: each[1][0].start)
     for path, bags in found:
         inside = [file for file in left if file.startswith(f"{path}/")]
-        row = _row(_name(path, bags, root), bags)
+        row = _row(name_of(path, bags, str(root)), bags)
         row["whose"] = _maker(Path(path), bags, root, own)
         if inside:
             row["not_read"] = len(inside)
@@ -114,14 +114,6 @@ def _row(name: str, bags: Sequence[BagFile]) -> dict[str, JsonValue]:
         "topics": len(topics),
         "storage": ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})),
     }
-
-
-def _name(path: str, bags: Sequence[BagFile], root: Path) -> str:
-    """Returns the name under which `--recording` finds a recording."""
-    if Path(path) == root:  # its bags lie in the folder itself
-        name = stem_of(bags[0].file).removeprefix(f"{root}/")
-        return name if len(bags) == 1 else name.rpartition("_")[0]
-    return path.removeprefix(f"{root}/")
 
 
 def _own_recordings(root: Path) -> OwnRecordings | None:

@@ -12,6 +12,7 @@ const state = {
   last: 3600,  // seconds of a live page; null for a chosen span
   span: null,
   t: null,  // the chosen time; null for now
+  recording: "",  // the name of the only one that is shown; empty for all
   hovered: null,
 };
 let asking = null;  // cancels the running look
@@ -29,7 +30,8 @@ const map = new RobotMap(at("map"), { time: pointed, thing: (each) => chooseThin
 const line = new Timeline(at("timeline"), { span: spanned, time: pointed, stretch: chooseStretch });
 const plots = new Plots(at("plots"), { time: pointed, changed: () => remember() });
 
-/* The address has what is shown: #last=3600, or #from=...&to=..., with &at=... and &plot=... */
+/* The address has what is shown: #last=3600, or #from=...&to=..., with &at=..., &recording=... and
+   &plot=... */
 function remember() {
   const given = new URLSearchParams();
   if (state.last !== null) given.set("last", state.last);
@@ -38,6 +40,7 @@ function remember() {
     given.set("to", state.span.end.toFixed(3));
   }
   if (state.t !== null) given.set("at", state.t.toFixed(3));
+  if (state.recording) given.set("recording", state.recording);
   for (const each of plots.names) given.append("plot", each);
   const hash = `#${given}`;
   if (location.hash !== hash) history.replaceState(null, "", hash);
@@ -54,6 +57,7 @@ function readAddress() {
     state.span = { start: from, end: to };
   }
   state.t = number("at");
+  state.recording = given.get("recording") || "";
   plots.use(given.getAll("plot"));
 }
 
@@ -64,6 +68,7 @@ function query() {
     given.set("end", state.span.end.toFixed(3));
   } else given.set("last", state.last === "all" ? 1e10 : state.last);
   for (const each of plots.names) given.append("signal", each);
+  if (state.recording) given.set("recording", state.recording);
   return given;
 }
 
@@ -72,7 +77,8 @@ async function look(isMore = false, isPatient = false) {
   if (asking) asking.abort();
   const mine = asking = new AbortController();
   const given = query();
-  const view = state.view;
+  const { view, recording } = state;
+  lookedAt = Date.now();
   if (isPatient) given.set("patient", "1");
   if (isMore) {
     const isOld = Date.now() - statusAt > STATUS_MS;
@@ -96,7 +102,9 @@ async function look(isMore = false, isPatient = false) {
     lookedAt = Date.now();
     if (reply.things) thingsAt = lookedAt;
     if (reply.status) statusAt = lookedAt;
+    if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
     state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
+    state.view.recording = recording;
     show(reply, isMore);
     // What takes long comes later: the rest can be looked at until then.
     const isPart = reply.range && reply.range.earliest !== null && !(reply.events && reply.path !== undefined);
@@ -105,6 +113,8 @@ async function look(isMore = false, isPatient = false) {
     if (mine !== asking || error.name === "AbortError") return;
     if (error instanceof Locked) lock(error);
     else {
+      showRecordings(state.view || {});
+      if (!state.view) at("summary").textContent = "";
       at("trouble").textContent = plain(error.message);
       at("trouble").hidden = false;
     }
@@ -114,6 +124,17 @@ async function look(isMore = false, isPatient = false) {
       at("summary").setAttribute("aria-busy", "false");
     }
   }
+}
+/* What was in view all the time is no event: the timeline has it wherever something was recorded. */
+function always(reply, range) {
+  const from = Math.max(reply.since, range.earliest);
+  const to = Math.min(reply.end, reply.latest);
+  const gaps = range.gaps.filter(([start, end]) => end > from && start < to);
+  const begins = [from, ...gaps.map(([, end]) => end)];
+  const ends = [...gaps.map(([start]) => start), to];
+  const spans = begins.map((t, n) => ({ t, end: ends[n] })).filter(({ t, end }) => t < end);
+  return reply.throughout.flatMap((label) => spans.map(
+    (span) => ({ kind: "thing", ...span, text: `${label} in view` })));
 }
 function whole(reply) {
   return { path: null, robot: null, places: [], moments: [], ...reply, things: reply.things || [],
@@ -155,6 +176,7 @@ function continued(view, reply) {
 function lock(error) {
   at("locked").hidden = false;
   at("memory").hidden = true;
+  at("recording-part").hidden = true;
   at("summary").textContent = "";
   at("locked-why").textContent = token ? plain(error.message) : "";
   at("token").focus();
@@ -167,6 +189,7 @@ function show(reply, isMore) {
   showState(at("state"), status, range);
   showSummary();
   showFilling(view.catalogue);
+  showRecordings(view);
   at("questions-part").hidden = !view.questions;
   if (view.questions) showQuestions(at("questions"), view.questions);
   at("memory").hidden = range.earliest === null;
@@ -192,8 +215,31 @@ function showSummary() {
   const halted = status.latest !== null && status.now === status.latest;
   const newest = range.latest === null ? "nothing is recorded"
     : halted ? `recorded until ${clock(range.latest)}` : `newest data ${ago(range.now - range.latest)}`;
-  const parts = [recorderOf(status), newest, sound ? "nothing is known to be missing" : "see State"];
+  const parts = [state.recording ? `only ${state.recording}` : recorderOf(status), newest, sound ? "nothing is known to be missing" : "see State"];
   at("summary").textContent = plain(parts.filter(Boolean).join(" \u00b7 "));
+}
+/* Which recordings there are, and where those shown are plainly of several robots. */
+function showRecordings(view) {
+  const rows = view.recordings || [];
+  const mixed = view.mixed || [];
+  const hidden = (view.recordings_total || 0) - rows.length;
+  const named = (each) => `${each.name}${each.holds ? ` (${counted(each.holds, "recording")})` : ""}, `
+    + `${clock(each.start)}, ${lasting(each.end - each.start)}`;
+  const all = `all${hidden > 0 ? ` (the newest ${rows.length} are listed)` : ""}`;
+  const options = [["", all], ...rows.map((each) => [each.name, named(each)])];
+  if (!options.some(([value]) => value === state.recording)) {
+    options.splice(1, 0, [state.recording, state.recording]);
+  }
+  at("recording-part").hidden = options.length < 3 && !state.recording;
+  const names = options.map(([value, text]) => el("option", { value }, text));
+  if (document.activeElement !== at("recording") || !at("recording").options.length) {
+    at("recording").replaceChildren(...names);
+  }
+  at("recording").value = state.recording;
+  at("ask-all").hidden = !state.recording;
+  at("mixed").hidden = !mixed.length;
+  at("mixed").replaceChildren(...mixed.map((each) => el("p", {}, `! ${each[0].toUpperCase()}${each.slice(1)}.`)),
+    ...(mixed.length ? [el("p", {}, "The map joins their paths. Choose one recording above.")] : []));
 }
 function showFilling(catalogue) {
   at("filling").hidden = !catalogue;
@@ -269,7 +315,8 @@ async function ask(given, then) {
   const mine = ++turn;
   at("moment").setAttribute("aria-busy", "true");
   try {
-    const answer = await asked("/page/moment", given);
+    const answer = await asked("/page/moment",
+      state.recording ? { ...given, recording: state.recording } : given);
     if (mine === turn) then(answer);
   } catch (error) {
     if (error instanceof Locked) lock(error);
@@ -331,6 +378,15 @@ at("length").addEventListener("change", () => {
   state.last = chosenLength === "all" ? "all" : Number(chosenLength);
   look();
 });
+at("recording").addEventListener("change", () => {
+  state.recording = at("recording").value;
+  state.last = state.recording ? "all" : state.last || "all";  // another one was at another time
+  at("mixed").hidden = true;
+  pointed(null, true);
+  map.fit();
+  remember();
+  look();
+});
 at("live").addEventListener("click", () => {
   if (state.last === null) {
     const length = Math.round(state.span.end - state.span.start);
@@ -360,12 +416,16 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   line.draw();
 });
 window.addEventListener("hashchange", () => { readAddress(); look(); });
-document.addEventListener("visibilitychange", () => { if (!document.hidden && state.view) follow(); });
+document.addEventListener("visibilitychange", () => { if (!document.hidden) follow(); });
 
 /* Looks for what is new, as long as somebody looks at the page. */
 async function follow() {
-  if (document.hidden || isLooking || !state.view || !at("locked").hidden) return;
+  if (document.hidden || isLooking || !at("locked").hidden) return;
   const { view } = state;
+  if (!view || view.recording !== state.recording) {  // the last look failed
+    if (Date.now() - lookedAt >= FILLING_MS) await look();
+    return;
+  }
   if (view.range.earliest === null) { await look(); return; }
   const isWhole = !view.catalogue && view.isWhole;
   if (isWhole) { pause = FILLING_MS; await look(true); return; }

@@ -81,7 +81,10 @@ function showThings(host, view, choose) {
     el("span", {}, link(each.label, () => choose(each)), each.in ? ` in ${plain(each.in)}` : "",
       each.state === MISSED ? el("span", { class: "warn" }, " no longer there") : ""),
     `${metres(each)} \u00b7 ${ago(now - each.last)}`));
-  host.replaceChildren(...(rows.length ? listing(rows, 8) : [soft("Nothing was seen in this time.")]));
+  host.replaceChildren(...(rows.length ? listing(rows, 8)
+    : [soft(view.events.some((each) => each.kind === "thing")
+      ? "What was seen has no place on the map. The timeline shows when it was in view."
+      : "Nothing was seen in this time.")]));
 }
 function eventRows(events, point) {
   return events.map((each) => pair(
@@ -121,7 +124,8 @@ function showState(host, status, range) {
   const sound = status.trust === "nothing is known to be missing";
   const own = status.budget.max_gb !== null;
   const recorder = recorderOf(status)
-    || (own ? "not heard of" : "none belongs to this memory");
+    || (own ? "not heard of" : state.recording ? "not shown for one recording"
+      : "none belongs to this memory");
   const halted = status.latest !== null && status.now === status.latest;
   const failing = status.recorder !== null && status.recorder !== "stopped"
     && !status.recorder_alive;
@@ -160,7 +164,8 @@ function showState(host, status, range) {
     ...together("Offered by nobody", "missing", status),
     ...faults("Damaged bags, not in the answers", "damaged", range),
     ...faults("Incomplete bags", "incomplete", range), ...faults("Unread bags", "unread", range),
-    ...faults("Bags with a wrong clock", "clock_faults", range), ...notesOf(range.notes));
+    ...faults("Bags with a wrong clock", "clock_faults", range),
+    ...notesOf([...new Set([...(range.notes || []), ...(status.notes || [])])]));
   const since = halted ? "the newest recorded moment" : "the time of this look";
   parts.push(soft(`\u201cAgo\u201d counts from ${since}, ${clock(status.now)}. Time zone: ${ZONE}.`));
   host.replaceChildren(...parts);

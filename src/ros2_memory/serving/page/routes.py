@@ -1,6 +1,7 @@
 """The two endpoints of the page: `/page/span` and `/page/moment`, each a GET that returns JSON.
 
-They answer from the same queries as the tools, in the queue of the tools that may take long.
+They answer from the same queries as the tools, in the queue of the tools that may take long. With
+`recording=NAME` they answer from that recording alone.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from starlette.routing import Route
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
+from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
 from ros2_memory.serving.page.span import LAST_S, SpanRequest, span_shown
 
@@ -37,18 +39,28 @@ _HEADERS: Final = {
     "cross-origin-resource-policy": "same-origin",
 }
 _LONGEST_LABEL: Final = 200
+_LONGEST_NAME: Final = 1000
 
 
 def page_routes(
     dispatcher: Dispatcher, progress: Callable[[], Progress] | None = None
 ) -> list[Route]:
     """Returns the routes of the page; `progress`: how far the catalogue is filled."""
+    recordings = Recordings()
+
+    def chosen(given: QueryParams, memory: Memory) -> Memory:
+        name = _short(given, "recording", _LONGEST_NAME)
+        return recordings.alone(memory, name) if name else memory
 
     def span(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-        return span_shown(memory, call, span_request(given), progress, dispatcher.questions)
+        part, asked = chosen(given, memory), span_request(given)
+        shown = span_shown(part, call, asked, progress, dispatcher.questions)
+        if "status" in shown:
+            shown |= recordings.shown(memory, part, call)
+        return shown
 
     def moment(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-        return moment_shown(memory, call, moment_request(given))
+        return moment_shown(chosen(given, memory), call, moment_request(given))
 
     def route(path: str, work: Callable[[QueryParams, Memory, Call], JsonObject]) -> Route:
         async def answer(request: Request) -> Response:
@@ -90,15 +102,20 @@ def moment_request(given: QueryParams) -> MomentRequest:
     Raises:
         InvalidArgumentsError: a number is none, or the label is too long.
     """
-    label = given.get("label", "")
-    if len(label) > _LONGEST_LABEL:
-        raise InvalidArgumentsError(f"label is longer than {_LONGEST_LABEL} characters")
+    label = _short(given, "label", _LONGEST_LABEL)
     return MomentRequest(
         t_s=_number(given, "t"),
         start_s=_number(given, "start"),
         end_s=_number(given, "end"),
         label=label,
     )
+
+
+def _short(given: QueryParams, name: str, longest: int) -> str:
+    text = given.get(name, "")
+    if len(text) > longest:
+        raise InvalidArgumentsError(f"{name} is longer than {longest} characters")
+    return text
 
 
 def _number(given: QueryParams, name: str) -> float | None:

@@ -1,0 +1,145 @@
+"""One recording of many, for the page: which there are, and a memory that holds one alone."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import replace
+from difflib import get_close_matches
+from itertools import chain
+from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
+
+from ros2_memory.bag_dir.layout import is_kept_apart
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.text import shortened
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.robots import ADVICE, describe_mixed
+from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.core.model import BagFile, JsonValue
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Call, Memory, SnapshotSource
+    from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.index.timeline import Timeline
+    from ros2_memory.retention.foreign import Foreign
+    from ros2_memory.tools.reply_size import JsonObject
+
+MOST_RECORDINGS: Final = 300
+"""The newest are listed: a week of recordings of an hour is 168."""
+_MOST_MEMORIES: Final = 8
+"""Recordings that pages look at and that stay at hand."""
+
+
+class OneRecording:
+    """The part of an index that is of one recording; a `SnapshotSource`. Thread-safe."""
+
+    def __init__(self, index: SnapshotSource, name: str) -> None:
+        self.bag_dir: Path = index.bag_dir
+        self._index = index
+        self._filter = RecordingFilter(index.bag_dir, name)
+
+    @property
+    def published(self) -> Snapshot | None:
+        """The part of the last scan's result; None before the first."""
+        published = self._index.published
+        return None if published is None else self._filter.narrowed(published)
+
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """Returns the part of a current snapshot."""
+        return self._filter.narrowed(self._index.snapshot(reach))
+
+    def refresh(self) -> Snapshot:
+        """Scans now, and returns the part of the result."""
+        return self._filter.narrowed(self._index.refresh())
+
+    def heartbeat(self) -> Heartbeat | None:
+        """Returns the last heartbeat of the directory's recorder."""
+        return self._index.heartbeat()
+
+    def foreign(self, snapshot: Snapshot) -> Foreign | None:
+        """Returns the bags of a snapshot that the directory's recorder did not make."""
+        return self._index.foreign(snapshot)
+
+
+class Recordings:
+    """The recordings of a memory, and a memory for each that is looked at. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._memories: OrderedDict[str, Memory] = OrderedDict()
+        self._listed: WeakKeyDictionary[Timeline, list[JsonObject]] = WeakKeyDictionary()
+
+    def alone(self, memory: Memory, name: str) -> Memory:
+        """Returns a memory that holds one recording, or those of one folder, and nothing else.
+
+        Its ages count from its newest message, and it has neither a recorder nor a budget.
+
+        Raises:
+            InvalidArgumentsError: none is named so.
+        """
+        with self._lock:
+            found = self._memories.get(name)
+        if found is None:
+            limits = replace(memory.limits, now="latest", kept=None)
+            found = replace(memory, index=OneRecording(memory.index, name), limits=limits)
+        snapshot = found.index.snapshot()
+        if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
+            names = [str(each["name"]) for each in self._list(memory)]
+            near = get_close_matches(name, names, n=3)
+            similar = f"; similar: {', '.join(near)}" if near else ""
+            raise InvalidArgumentsError(f"no recording is named {shortened(name)}{similar}")
+        with self._lock:
+            found = self._memories.setdefault(name, found)
+            self._memories.move_to_end(name)
+            if len(self._memories) > _MOST_MEMORIES:
+                self._memories.popitem(last=False)
+        return found
+
+    def shown(self, memory: Memory, chosen: Memory, call: Call) -> JsonObject:
+        """Returns the recordings of a memory, the newest first, and where robots are mixed.
+
+        Of the latter in what is chosen.
+        """
+        rows = self._list(memory)
+        newest: list[JsonValue] = [*rows[:MOST_RECORDINGS]]
+        return {
+            "recordings": newest,
+            "recordings_total": len(rows),
+            "mixed": [each.removesuffix(ADVICE) for each in describe_mixed(chosen, call)],
+        }
+
+    def _list(self, memory: Memory) -> list[JsonObject]:
+        snapshot = memory.index.published or memory.index.snapshot()
+        rows = self._listed.get(snapshot.timeline)
+        if rows is None:
+            rows = self._listed[snapshot.timeline] = _rows(snapshot, str(memory.index.bag_dir))
+        return rows
+
+
+def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
+    """Returns recordings, and the folders of the bag directory that hold several of them."""
+    found = {name_of(path, bags, root): bags for path, bags in recordings_of(snapshot).items()}
+    folders: dict[str, list[list[BagFile]]] = {}
+    for name, bags in found.items():
+        if "/" in name and not is_kept_apart(name):
+            folders.setdefault(name.partition("/")[0], []).append(bags)
+    rows = [_row(name, bags) for name, bags in found.items()]
+    for folder, inside in folders.items():
+        if len(inside) > 1 and folder not in found:
+            every = [*chain.from_iterable(inside)]
+            rows.append({**_row(folder, every), "holds": len(inside)})
+    return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
+
+
+def _row(name: str, bags: list[BagFile]) -> JsonObject:
+    start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
+    return {
+        "name": name,
+        "start": round(unix_from_ns(start), 1),
+        "end": round(unix_from_ns(end), 1),
+    }

@@ -1,0 +1,78 @@
+"""One recording of a bag directory: a filter leaves what a scan of it alone finds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import odom, write_mcap
+from tests.support.clocks import SettableClock
+from tests.support.memories import LAST_WRITTEN
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.index.snapshot import Snapshot
+
+T0 = 1_700_000_000
+
+
+def write(folder: Path, name: str, *, at_s: int = 0) -> None:
+    write_mcap(folder / f"{name}.mcap", [odom((T0 + at_s) * NS_PER_S, 0.0, 0.0)])
+
+
+def index_of(folder: Path, only: str | None = None) -> IndexManager:
+    clock = SettableClock(LAST_WRITTEN)
+    return IndexManager(folder, McapReader(), clock, refresh_s=0, split_duration_s=10.0, only=only)
+
+
+def comparable(snapshot: Snapshot) -> tuple[object, ...]:
+    files = [bag.file for bag in snapshot.timeline.bags]
+    return files, replace(snapshot, problem=None, scanned_at=0)
+
+
+@pytest.mark.parametrize("name", ["a", "a_1", "run", "run_1", "deep", "deep/b", "loose", "nothing"])
+def test_a_filter_leaves_what_a_scan_of_one_recording_finds(tmp_path: Path, name: str) -> None:
+    bags = ["a/a_0", "a/a_1", "a_1/0", "run_0", "run_1", "run_10", "loose", "loose_x"]
+    for n, bag in enumerate([*bags, "deep/b/0", "deep/c/0", "latched/carried"]):
+        write(tmp_path, bag, at_s=n)
+    for folder in ("a", "deep/b"):
+        (tmp_path / folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}")
+        (tmp_path / folder / "damaged.mcap").write_bytes(b"this is not a bag" * 100)
+        (tmp_path / folder / "other.db3").symlink_to(tmp_path / "run_0.mcap")
+    index = index_of(tmp_path)
+    part = RecordingFilter(tmp_path, name)
+    assert comparable(part.narrowed(index.refresh())) == comparable(
+        index_of(tmp_path, name).refresh()
+    )
+    write(tmp_path, "a/a_2", at_s=50)
+    write(tmp_path, "run_2", at_s=51)
+    (tmp_path / "a" / "a_0.mcap").unlink()
+    assert comparable(part.narrowed(index.refresh())) == comparable(
+        index_of(tmp_path, name).refresh()
+    )
+
+
+def test_what_did_not_change_is_the_same_timeline(tmp_path: Path) -> None:
+    """What is computed of a timeline is kept with it."""
+    write(tmp_path, "a/0")
+    write(tmp_path, "b/0", at_s=1)
+    index, part = index_of(tmp_path), RecordingFilter(tmp_path, "a")
+    before = part.narrowed(index.refresh())
+    write(tmp_path, "b/1", at_s=2)
+    assert part.narrowed(index.refresh()).timeline is before.timeline
+
+
+def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
+    for n, bag in enumerate(["a/0", "a/1", "run_0", "run_1", "loose", "deep/b/x", "deep/b/y"]):
+        write(tmp_path, bag, at_s=n)
+    snapshot = index_of(tmp_path).refresh()
+    for path, bags in recordings_of(snapshot).items():
+        part = RecordingFilter(tmp_path, name_of(path, bags, str(tmp_path))).narrowed(snapshot)
+        assert list(part.bags) == bags
