@@ -63,9 +63,11 @@ class Cells:
 
     def __init__(self, sights: Sights, epoch: Ints) -> None:
         looks = sights.looks
-        self.bag, self.n = looks[:, Look.BAG], looks[:, Look.N]
-        self.first, self.last = looks[:, Look.FIRST], looks[:, Look.LAST]
-        self.topic = looks[:, Look.TOPIC]
+        # Looks of single places are picked thousands of times: from whole columns that is faster.
+        self.bag, self.n, self.first, self.last, self.topic = (
+            np.ascontiguousarray(looks[:, each])
+            for each in (Look.BAG, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
+        )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
         self.yaw = looks[:, Look.YAW] / 10.0
@@ -81,14 +83,37 @@ class Cells:
         )
         _, cell = np.unique(keys, axis=0, return_inverse=True)
         self.cell: Ints = cell.reshape(-1).astype(np.int64)
+        self._count = int(self.cell.max(initial=-1)) + 1
         order = np.argsort(self.cell, kind="stable")
-        self._order = order
-        self._starts = np.searchsorted(self.cell[order], np.arange(self.cell.max(initial=-1) + 2))
+        after, before = order[1:], order[:-1]
+        goes_on = self.cell[after] == self.cell[before]
+        goes_on &= self.bag[after] - self.bag[before] <= 1
+        self._goes_on = np.zeros(len(order), bool)
+        self._goes_on[after] = goes_on
+        self._before = np.zeros(len(order), np.int64)
+        self._before[after] = before
 
-    def looks_from(self, cells: Ints) -> Ints:
-        """Returns the looks from some cells, in order of time."""
-        parts = [self._order[self._starts[each] : self._starts[each + 1]] for each in cells]
-        return np.sort(np.concatenate(parts)) if parts else np.zeros(0, np.int64)
+    def looks_like(self, looks: Ints) -> tuple[Ints, Ints]:
+        """Returns all looks from the cells of some, in order of time, and the cell of each.
+
+        These cells are numbered from 0 on.
+        """
+        # A table of all cells: sorting the looks of a few cells takes ten times as long.
+        known = np.zeros(self._count, bool)
+        known[self.cell[looks]] = True
+        found = np.flatnonzero(known[self.cell])
+        return found, (np.cumsum(known) - 1)[self.cell[found]]
+
+    def in_vain_again(self, looks: Ints, hits: Ints) -> Flags:
+        """Returns which looks without a hit go on where the one before looked in vain.
+
+        `looks` are as of `looks_like`; the one before, from the same cell, is no older than the
+        bag before.
+        """
+        seen = np.zeros(len(self.cell), bool)
+        seen[looks] = hits > 0
+        again: Flags = self._goes_on[looks] & ~seen[looks] & ~seen[self._before[looks]]
+        return again
 
     def seen_at(self, looks: Ints, x: float, y: float) -> tuple[Floats, Floats]:
         """Returns how far (mm) and in which direction (degrees from ahead) a place was."""
@@ -115,22 +140,16 @@ class FieldOfView:
 
 def field_of_view(away: Floats, bearing: Floats, n: Ints) -> FieldOfView:
     """Returns the field of view in which all but a few of the detections lie."""
-    far, low, high = (
-        _weighted_quantile(values, n, share)
-        for values, share in (
-            (away, 1 - _VIEW_SHARE),
-            (bearing, _VIEW_SHARE),
-            (bearing, 1 - _VIEW_SHARE),
-        )
-    )
+    [far] = _weighted_quantiles(away, n, 1 - _VIEW_SHARE)
+    low, high = _weighted_quantiles(bearing, n, _VIEW_SHARE, 1 - _VIEW_SHARE)
     return FieldOfView(far, low, high)
 
 
-def _weighted_quantile(values: Floats, n: Ints, share: float) -> float:
+def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
     order = np.argsort(values, kind="stable")
     running = np.cumsum(n[order])
-    at = int(np.searchsorted(running, share * running[-1]))
-    return float(values[order[min(at, len(order) - 1)]])
+    at = [int(np.searchsorted(running, share * running[-1])) for share in shares]
+    return [float(values[order[min(each, len(order) - 1)]]) for each in at]
 
 
 class Evidence(NamedTuple):
@@ -178,17 +197,17 @@ def evidence_at(
     for bag, look, n in rows.tolist():
         if look < 0:
             blind[bag] = blind.get(bag, 0) + n
-    known = np.unique(cells.cell[placed[:, Hit.LOOK]])
-    looks = cells.looks_from(known)
-    cell = np.searchsorted(known, cells.cell[looks])
+    looks, cell = cells.looks_like(placed[:, Hit.LOOK])
     hits = np.zeros(len(looks), np.int64)
     np.add.at(hits, np.searchsorted(looks, placed[:, Hit.LOOK]), placed[:, Hit.N])
     np.minimum(hits, cells.n[looks], out=hits)
-    away, bearing = cells.seen_at(looks, x, y)
-    fair = np.zeros(len(looks), bool)
+    fair = _sees(cell, cells.n[looks], hits)[cell]
+    seeing = looks[fair]
+    away, bearing = cells.seen_at(seeing, x, y)
+    covered = np.zeros(len(seeing), bool)
     for topic, each in view.items():
-        fair |= (cells.topic[looks] == topic) & each.covers(away, bearing)
-    fair &= _sees(cell, cells.n[looks], hits)[cell]
+        covered |= (cells.topic[seeing] == topic) & each.covers(away, bearing)
+    fair[fair] = covered
     return Evidence(looks, cell, hits, blind, fair)
 
 
@@ -198,9 +217,9 @@ def _sees(cell: Ints, n: Ints, hits: Ints) -> Flags:
     From a dock that faces a wall, ten thousands of messages have some false detections behind it.
     """
     cells = int(cell.max(initial=-1)) + 1
-    seen, of = np.bincount(cell, hits, cells), np.bincount(cell, n, cells)
-    hit = hits > 0
-    looks, hit_looks = np.bincount(cell, minlength=cells), np.bincount(cell, hit, cells)
+    hit = np.flatnonzero(hits)  # few of them all
+    seen, of = np.bincount(cell[hit], hits[hit], cells), np.bincount(cell, n, cells)
+    looks, hit_looks = np.bincount(cell, minlength=cells), np.bincount(cell[hit], minlength=cells)
     enough = (seen >= _FEWEST_HITS) | (of <= _RARE_OF * seen)
     dense = seen >= _LEAST_RATE * np.bincount(cell[hit], n[hit], cells)
     # What other cells see most of the time, a cell that sees it does not miss nearly always.
@@ -214,21 +233,29 @@ def _sees(cell: Ints, n: Ints, hits: Ints) -> Flags:
 
 def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
     """Returns the stays at a place, in order of time."""
-    looks, hits = evidence.looks, evidence.hits
+    looks, cell = evidence.looks, evidence.cell
     bag, n = cells.bag[looks], cells.n[looks]
-    if not hits.any() and not evidence.blind:
+    hit = np.flatnonzero(evidence.hits)  # few of them all
+    hits = evidence.hits[hit]
+    if not len(hit) and not evidence.blind:
         return []
     bags, at = _numbered(bag, evidence.blind)
-    seen = np.bincount(at, hits, len(bags))
+    seen = np.bincount(at[hit], hits, len(bags))
     for each, count in evidence.blind.items():
         seen[int(np.searchsorted(bags, each))] += count
-    rate = _rates(evidence.cell, n, hits, seen[at] > 0)
-    odds = hits * np.log(rate / _FALSE_RATE) + (n - hits) * np.log((1 - rate) / (1 - _FALSE_RATE))
-    odds[~evidence.fair & (hits == 0)] = 0.0
-    odds[~evidence.fair] = odds[~evidence.fair].clip(_LEAST_BLIND)
-    odds[_stood_on(evidence.cell, bag, hits)] *= _STANDING
+    there = np.flatnonzero((seen > 0)[at])
+    # For each cell, how often it sees the thing while that is there.
+    of = np.bincount(cell[there], n[there], int(cell.max(initial=-1)) + 1)
+    rate = (np.bincount(cell[hit], hits, len(of)) + _PRIOR) / (of + 2 * _PRIOR)
+    rate = rate.clip(2 * _FALSE_RATE, 0.98)
+    for_hit, for_miss = np.log(rate / _FALSE_RATE), np.log((1 - rate) / (1 - _FALSE_RATE))
+    odds = np.where(evidence.fair, n * for_miss[cell], 0.0)
+    own = hits * for_hit[cell[hit]] + (n[hit] - hits) * for_miss[cell[hit]]
+    odds[hit] = np.where(evidence.fair[hit], own, own.clip(_LEAST_BLIND))
+    again = cells.in_vain_again(looks, evidence.hits)
+    np.multiply(odds, _STANDING, out=odds, where=again)
     by_bag = np.bincount(at, odds, len(bags))
-    messages = np.bincount(at, np.where(hits > 0, n, 0), len(bags))
+    messages = np.bincount(at[hit], n[hit], len(bags))
     for each, count in evidence.blind.items():
         nth = int(np.searchsorted(bags, each))
         by_bag[nth] += 2.0 * count
@@ -330,14 +357,6 @@ def _missed(
     return math.exp(chance), messages, crossed
 
 
-def _rates(cell: Ints, n: Ints, hits: Ints, there: Flags) -> Floats:
-    """Returns for each look how often its cell sees the thing while that is there."""
-    seen = np.bincount(cell[there], hits[there], int(cell.max(initial=-1)) + 1)
-    of = np.bincount(cell[there], n[there], len(seen))
-    rate: Floats = (seen + _PRIOR) / (of + 2 * _PRIOR)
-    return rate[cell].clip(2 * _FALSE_RATE, 0.98)
-
-
 def _numbered(bag: Ints, blind: Iterable[int]) -> tuple[Ints, Ints]:
     """Returns the bags of looks, which ascend, and of blind hits; and the number of each look's."""
     more = np.array([*blind], np.int64)
@@ -347,16 +366,6 @@ def _numbered(bag: Ints, blind: Iterable[int]) -> tuple[Ints, Ints]:
     fresh = np.ones(len(bag), bool)
     fresh[1:] = bag[1:] != bag[:-1]
     return bag[fresh], np.cumsum(fresh) - 1
-
-
-def _stood_on(cell: Ints, bag: Ints, hits: Ints) -> Flags:
-    """Returns which looks without a hit go on where the bag before looked in vain."""
-    order = np.argsort(cell, kind="stable")
-    after, before = order[1:], order[:-1]
-    same = (cell[after] == cell[before]) & (bag[after] - bag[before] <= 1)
-    stood = np.zeros(len(cell), bool)
-    stood[after[same & (hits[after] == 0) & (hits[before] == 0)]] = True
-    return stood
 
 
 def _present(by_bag: Floats) -> list[tuple[int, int]]:
