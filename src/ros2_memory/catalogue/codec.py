@@ -12,6 +12,7 @@ import math
 import struct
 from dataclasses import fields
 from functools import lru_cache
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,7 +27,13 @@ from ros2_memory.analysis.motion.odometry import (
 )
 from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop, SpeedDropDigest
-from ros2_memory.analysis.motion.standstills import ChainDigest, StandstillDigest
+from ros2_memory.analysis.motion.standstills import (
+    Box3,
+    ChainDigest,
+    Standstill,
+    StandstillDigest,
+    StandstillRun,
+)
 from ros2_memory.analysis.state_changes import (
     NO_CHANGES,
     KnownLevel,
@@ -121,6 +128,40 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     return StandstillDigest(
         body[:head], head_until, body[head : head + tail], tail_since, tuple(unpacked), slowed
     )
+
+
+def encode_standstill_run(run: StandstillRun) -> bytes:
+    """Encodes consecutive bags' standstills that are joined."""
+    last = () if run.last is None else (run.last,)
+    bags = [encode_standstills(each) for each in (*run.lead, *last, *run.trail)]
+    kinds = [len(run.lead), len(last), [len(each) for each in bags]]
+    head = json.dumps([*kinds, run.found, run.drops])
+    return b"".join((head.encode(), b"\n", *bags))
+
+
+def decode_standstill_run(packed: bytes) -> StandstillRun:
+    """Decodes consecutive bags' standstills that are joined.
+
+    Raises:
+        ValueError: the bytes are not some.
+    """
+    head, _, body = packed.partition(b"\n")
+    try:
+        leading, ends, sizes, found, drops = json.loads(head)
+        edges = [0, *accumulate(sizes)]
+        bags = [decode_standstills(body[begin:end]) for begin, end in pairwise(edges)]
+        return StandstillRun(
+            tuple(bags[:leading]),
+            tuple(
+                Standstill(start, end, Box3(_decode_vector(low), _decode_vector(high)))
+                for start, end, (low, high) in found
+            ),
+            tuple(SpeedDrop(*each) for each in drops),
+            bags[leading] if ends else None,
+            tuple(bags[leading + ends :]),
+        )
+    except (TypeError, IndexError) as error:
+        raise ValueError(f"not joined standstills: {error}") from error
 
 
 def encode_zone_map(zones: ZoneMap) -> bytes:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from hashlib import sha256
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.analysis.topic_events import NO_EVENTS
@@ -77,6 +78,8 @@ if TYPE_CHECKING:
 FOLDER: Final = ".episodic"
 FILE: Final = "catalogue.sqlite"
 
+MOST_JOINED: Final = 90
+"""Bytes for each entry that what many entries add up to may take."""
 _BATCH: Final = 4096
 """Rows that are held at a time while known files are made of them."""
 
@@ -394,6 +397,48 @@ class Catalogue(CatalogueDatabase):
                 )
 
         self.write(write)
+
+    def joined(self, name: str, entries: Sequence[Sequence[int]]) -> bytes | None:
+        """Returns what `store_joined` stored; empty where it was too much."""
+
+        def ask(connection: sqlite3.Connection) -> bytes | None:
+            key = self._key_of_joined(name, entries)
+            row = connection.execute(
+                "SELECT answer FROM remembered WHERE question = ?", (key,)
+            ).fetchone()
+            return None if row is None else unpacked(row[0], model_of(connection, NO_TOPIC, name))
+
+        return self.read(ask, None)
+
+    def store_joined(self, name: str, entries: Sequence[Sequence[int]], joined: bytes) -> None:
+        """Stores what many entries add up to, until the oldest of the first of them is deleted.
+
+        Only that it is too much where it takes more than `MOST_JOINED` bytes for each of those.
+        """
+
+        def write(connection: sqlite3.Connection) -> None:
+            row_ids = self.row_ids(entries[0])
+            key = self._key_of_joined(name, entries)
+            if row_ids and key is not None:
+                stored = packed_by_model(connection, NO_TOPIC, name, joined)
+                if len(stored) > MOST_JOINED * len(row_ids):
+                    stored = b""
+                connection.execute(
+                    "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
+                    (key, min(row_ids), stored),
+                )
+
+        self.write(write)
+
+    def _key_of_joined(self, name: str, entries: Sequence[Sequence[int]]) -> str | None:
+        """Returns the key of what entries add up to: short, for any number; None if some are gone.
+
+        Entries come in lists, of which each has a meaning.
+        """
+        row_ids = [self.row_ids(each) for each in entries]
+        if [*map(len, row_ids)] != [*map(len, entries)]:
+            return None
+        return json.dumps([name, sha256(json.dumps(row_ids).encode()).hexdigest()])
 
     def put(self, key: BagKey, digest: Digest) -> bool:
         """Adds an entry in place of any other of that path; returns whether it was written."""

@@ -6,6 +6,7 @@ not be joined anew.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count, groupby
@@ -34,6 +35,8 @@ _Crossings: TypeAlias = "dict[tuple[str, Segment], tuple[BagSpan, ...]]"
 _CROSSINGS: Final[WeakKeyDictionary[Timeline, _Crossings]] = WeakKeyDictionary()
 _NUMBERS: Final[WeakKeyDictionary[Timeline, int]] = WeakKeyDictionary()
 _COUNTER: Final = count()
+JOINED_VERSION: Final = 1
+"""Of how digests are joined, and of how that is encoded: another one has it joined anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +55,18 @@ class Share:
     segment: Segment
     first: Ns
     last: Ns
-    begins_in: tuple[str, ...] = ()
-    ends_in: tuple[str, ...] = ()
+    begins_in: tuple[BagSpan, ...] = ()
+    ends_in: tuple[BagSpan, ...] = ()
     timeline: str = ""
 
     @property
     def key(self) -> str:
         """All that what is in the groups depends on besides the bags of the segment."""
-        return f"{self.begins_in} {self.ends_in} {self.timeline}"
+        crossing = [
+            [f"{each.bag.file} {each.bag.size}" for each in bags]
+            for bags in (self.begins_in, self.ends_in)
+        ]
+        return f"{crossing} {self.timeline}"
 
     def is_covered_by(self, window: TimeWindow) -> bool:
         """Returns whether all groups lie in a window."""
@@ -96,9 +103,8 @@ def shares_of(view: View, topic: str, window: TimeWindow) -> list[Share]:
         if crossing:
             before = shares[-1]
             last = max(before.last, *(each.last for each in crossing))
-            names = tuple(f"{each.bag.file} {each.bag.size}" for each in crossing)
-            shares[-1] = replace(before, last=last, ends_in=names)
-            shares.append(Share(segment, *span, begins_in=names))
+            shares[-1] = replace(before, last=last, ends_in=crossing)
+            shares.append(Share(segment, *span, begins_in=crossing))
         else:
             shares.append(Share(segment, *span))
         if _may_hold_relatched(view, topic, segment):
@@ -116,6 +122,24 @@ def _may_hold_relatched(view: View, topic: str, segment: Segment) -> bool:
     digests = view.bags.digests_of(segment)
     known = {} if digests is None else digests.relatched(topic)
     return len(known) < len(segment.bags_with(topic)) or any(known.values())
+
+
+def _entries_of(
+    view: View, digests: SegmentDigests, share: Share
+) -> tuple[Sequence[int], ...] | None:
+    """Returns the numbers of the entries that decide what is in a share.
+
+    Those of its segment, then of the bags at either end that belong to two segments. None where one
+    of these has none, where more decides, and where the segment is still to change.
+    """
+    is_settled = digests.whole and view.snapshot.timeline.is_settled(share.segment)
+    if share.timeline or not is_settled:
+        return None
+    before = view.bags.entry_numbers(share.begins_in)
+    after = view.bags.entry_numbers(share.ends_in)
+    if before is None or after is None:
+        return None
+    return [*digests.numbers.values()], before, after
 
 
 def _crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:
@@ -160,6 +184,8 @@ class Fold(Generic[T, R]):
         join: adds a digest, or what `reduce` returned.
         reduce: joins consecutive digests, at least one, as far as that can be done for whatever
             comes before and after them. It stays in memory, so later questions need not.
+        encode: what `reduce` returned as bytes.
+        decode: the bytes as it; ValueError where they are none.
         failures: where `add` and `collect` put messages that cannot be decoded; a digest without
             these is not stored.
         name: of what `reduce` depends on besides the kind.
@@ -170,6 +196,8 @@ class Fold(Generic[T, R]):
     collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]]
     join: Callable[[T | R, Span], None]
     reduce: Callable[[Sequence[tuple[T, Span]]], Sequence[tuple[T | R, Span]]]
+    encode: Callable[[T | R], bytes]
+    decode: Callable[[bytes], T | R]
     failures: Sequence[UndecodableError] = ()
     name: str = ""
 
@@ -184,10 +212,9 @@ class Fold(Generic[T, R]):
             digests = view.bags.digests_of(share.segment)
             stored = StoredDigests(view, topic, self.kind, share.inside(window))
             known = None
-            if digests is not None and share.is_covered_by(window):
-                name = f"{topic} {share.key}"
+            if digests is not None and share.segment.is_closed and share.is_covered_by(window):
                 groups = partial(share.groups, view, topic, window)
-                known = self._reduced(digests, name, stored, groups)
+                known = self._of_share(view, digests, share, stored, groups)
             if known is not None:
                 spans += self._joined(known)
                 continue
@@ -233,16 +260,64 @@ class Fold(Generic[T, R]):
                 stored.store(group, made, span)
         return made, span
 
+    def _of_share(
+        self,
+        view: View,
+        digests: SegmentDigests,
+        share: Share,
+        stored: StoredDigests[T],
+        groups: Callable[[], Iterable[Group]],
+    ) -> Sequence[tuple[T | R, Span]] | None:
+        """Returns what is joined from a whole share; None where some digest is not stored.
+
+        It is in the catalogue, too, where it follows from entries: joining a week takes seconds of
+        a process's first answer.
+        """
+        name = f"{stored.topic} {share.key}"
+        entries = _entries_of(view, digests, share)
+        if entries is None:
+            return self._reduced(digests, name, stored, groups)
+        question = f"joined {JOINED_VERSION} {self.kind.name} {self.name} {stored.topic}"
+        look_up = partial(digests.catalogue.joined, question, entries)
+        known = self._reduced(digests, name, stored, groups, look_up)
+        if view.call.stores_joined and known is not None and look_up() is None:
+            digests.catalogue.store_joined(question, entries, self._encoded(known))
+        return known
+
+    def _encoded(self, known: Sequence[tuple[T | R, Span]]) -> bytes:
+        parts = [self.encode(each) for each, _ in known]
+        spans = [[len(part), *span] for part, (_, span) in zip(parts, known, strict=True)]
+        return b"".join((json.dumps(spans).encode(), b"\n", *parts))
+
+    def _decoded(self, packed: bytes) -> Sequence[tuple[T | R, Span]] | None:
+        """Returns what `_encoded` encoded; None where a damaged file holds something else."""
+        head, _, body = packed.partition(b"\n")
+        found: list[tuple[T | R, Span]] = []
+        at = 0
+        try:
+            for size, first, last in json.loads(head):
+                found.append((self.decode(body[at : at + size]), (first, last)))
+                at += size
+        except (ValueError, TypeError, LookupError, AttributeError):
+            return None
+        return found
+
     def _reduced(
         self,
         digests: SegmentDigests,
         name: str,
         stored: StoredDigests[T],
         groups: Callable[[], Iterable[Group]],
+        in_catalogue: Callable[[], bytes | None] = lambda: None,
     ) -> Sequence[tuple[T | R, Span]] | None:
         """Returns what is joined from groups of a segment; None where some digest is not stored."""
 
         def compute() -> Sequence[tuple[T | R, Span]] | None:
+            packed = in_catalogue()
+            known = self._decoded(packed) if packed else None
+            return join_anew() if known is None else known
+
+        def join_anew() -> Sequence[tuple[T | R, Span]] | None:
             found: list[tuple[T, Span]] = []
             for group in groups():
                 known = stored.of(group) if _is_whole(group) else None

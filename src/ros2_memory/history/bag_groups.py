@@ -197,11 +197,11 @@ class DigestKind(Generic[T]):
 
 
 class StoredDigests(Generic[T]):
-    """The digests of one topic in a window that the catalogue has."""
+    """The digests of one `topic` in a window that the catalogue has."""
 
     def __init__(self, view: View, topic: str, kind: DigestKind[T], window: TimeWindow) -> None:
         self._view = view
-        self._topic = topic
+        self.topic = topic
         self._kind = kind
         self._window = window
         self._question = f"{kind.name} {topic}"
@@ -252,9 +252,9 @@ class StoredDigests(Generic[T]):
         self._segment, number = entry
         numbers = self._segment.numbers
         segment = self._view.snapshot.timeline.segment_of(span.bag)
-        inside = [each.bag.file for each in segment.extents(self._topic, self._window)]
+        inside = [each.bag.file for each in segment.extents(self.topic, self._window)]
         among = [numbers[file] for file in dict.fromkeys(inside) if file in numbers]
-        self._known = self._kind.look_up(self._segment, self._topic, among)
+        self._known = self._kind.look_up(self._segment, self.topic, among)
         return number
 
     def store(self, group: Group, digest: T, span: Span) -> None:

@@ -164,11 +164,13 @@ class Call:
 
     Attributes:
         used_active: whether the answer is partly from a bag that is still being written.
+        stores_joined: whether what is joined of many bags is stored for other processes.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
     used_active: bool = False
+    stores_joined: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -91,6 +91,8 @@ def driven_path(
         collect=collect,
         join=lambda digest, _span: builder.join(digest),
         reduce=lambda found: joined_poses(found, fastest),
+        encode=encode_poses,
+        decode=decode_poses,
         failures=failures,
         name=f"{fastest:g}",
     ).over(view, topic, window)

@@ -136,6 +136,11 @@ class Segment:
         return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
+    def is_closed(self) -> bool:
+        """Whether every bag is whole, and written to no more."""
+        return all(bag.state is BagState.CLOSED for bag in self.bags)
+
+    @cached_property
     def folders(self) -> frozenset[str]:
         """The folders of the bags."""
         return frozenset(map(_folder_of, self.bags))

@@ -7,10 +7,12 @@ that changes is computed again.
 
 from __future__ import annotations
 
+import os
 from bisect import bisect_left, bisect_right
 from functools import cached_property, reduce
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
+from zlib import crc32
 
 from ros2_memory.core.model import BagState
 from ros2_memory.index.segment import (
@@ -34,6 +36,9 @@ if TYPE_CHECKING:
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
+_STARTS: Final = 1024
+"""One of so many bags begins a segment wherever it is. So the oldest bags may go, and a later
+process still has the segments of those that are left, but for the first few."""
 
 
 class Timeline:
@@ -91,7 +96,7 @@ class Timeline:
     def _position(self, bag: BagFile) -> int:
         return max(bisect_right(self._firsts, in_time(bag)) - 1, 0)
 
-    def _segments_in(self, window: TimeWindow) -> Sequence[Segment]:
+    def segments_in(self, window: TimeWindow) -> Sequence[Segment]:
         """Returns the segments that can contain something of a window, in order."""
         begin = bisect_left(self._reaches, window.start)
         end = bisect_left(self._firsts, window.stop, key=lambda first: first[0])
@@ -100,6 +105,13 @@ class Timeline:
     def segment_of(self, bag: BagFile) -> Segment:
         """Returns the segment of a bag of this timeline."""
         return self.segments[self._position(bag)]
+
+    def is_settled(self, segment: Segment) -> bool:
+        """Returns whether a segment stays as it is while bags are added and the oldest deleted."""
+        if segment is self.segments[-1]:
+            return False
+        shrinks = segment is self.segments[0] and not _starts_segment(segment.bags[0])
+        return not shrinks or len(segment.bags) == SEGMENT_BAGS
 
     def totals(self, topic: str) -> dict[str, TopicTotals]:
         """Returns by type what all bags hold of a topic."""
@@ -197,7 +209,7 @@ class Timeline:
             return ()
         return tuple(
             bag
-            for segment in self._segments_in(window)
+            for segment in self.segments_in(window)
             for bag in segment.bags
             if window.overlaps(bag.start, bag.end)
         )
@@ -228,7 +240,7 @@ class Timeline:
         """
         if window.empty:
             return
-        for segment in self._segments_in(window):
+        for segment in self.segments_in(window):
             span = segment.spans.get(topic)
             if span is not None and window.overlaps(*span):
                 yield from segment.extents(topic, window)
@@ -250,9 +262,18 @@ def _lost_until(bag: BagFile) -> Ns:
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:
-    """Returns segments of bags given in any order, the first ones full."""
-    ordered = sorted(bags, key=in_time)
-    return [Segment(ordered[at : at + SEGMENT_BAGS]) for at in range(0, len(ordered), SEGMENT_BAGS)]
+    """Returns segments of bags given in any order."""
+    runs: list[list[BagFile]] = []
+    for bag in sorted(bags, key=in_time):
+        if not runs or len(runs[-1]) == SEGMENT_BAGS or _starts_segment(bag):
+            runs.append([])
+        runs[-1].append(bag)
+    return [Segment(run) for run in runs]
+
+
+def _starts_segment(bag: BagFile) -> bool:
+    """Whether a bag begins a segment whatever comes before it: chosen evenly, by its name."""
+    return crc32(os.fsencode(bag.file[bag.file.rfind("/") + 1 :])) % _STARTS == 0
 
 
 def _recordings(

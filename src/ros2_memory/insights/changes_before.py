@@ -157,10 +157,9 @@ def changes_in(
         if events is not None:
             joined[topic] = events
         is_telling = any(each == LOG or has_levels(each) for each in types)
-        if (is_telling or (events is not None and events.known)) and view.stream.overlapping_bags(
-            [topic], window.widened(_AROUND_NS)
-        ):
-            recorded.append(topic)
+        if is_telling or (events is not None and events.known):
+            around = timeline.extents(topic, window.widened(_AROUND_NS))
+            recorded += [topic] if any(around) else []
     changes: list[_Change] = []
     for topic, events in joined.items():
         if topic not in commands:

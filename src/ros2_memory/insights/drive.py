@@ -19,7 +19,12 @@ from ros2_memory.analysis.motion.standstills import (
     StandstillDigest,
     StandstillRun,
 )
-from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
+from ros2_memory.catalogue.codec import (
+    decode_standstill_run,
+    decode_standstills,
+    encode_standstill_run,
+    encode_standstills,
+)
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -166,6 +171,12 @@ def _in_one(
     return [(run, (found[0][1][0], found[-1][1][1]))]
 
 
+def _encoded(joined: StandstillDigest | StandstillRun) -> bytes:
+    if isinstance(joined, StandstillDigest):
+        joined = StandstillRun((joined,))
+    return encode_standstill_run(joined)
+
+
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
@@ -199,6 +210,8 @@ def _standstills_in(
         collect=collect,
         join=lambda digest, _span: builder.join(digest),
         reduce=_in_one,
+        encode=_encoded,
+        decode=decode_standstill_run,
         failures=failures,
     ).over(view, topic, window.widened(CONTEXT_NS))
     found = builder.standstills()

@@ -35,6 +35,7 @@ TOPIC_EVENTS: Final = DigestKind(
     decode=decode_topic_events,
 )
 
+_NOTHING: Final = b"-"
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
 
 
@@ -53,6 +54,8 @@ def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
         collect=partial(collect_events, view),
         join=partial(_join, builder),
         reduce=_reduced,
+        encode=_encoded,
+        decode=_decoded,
     ).over(view, topic, window)
     return builder.events()
 
@@ -76,6 +79,14 @@ def _reduced(
     if whole is None or whole.all_left_out > sum(each.all_left_out for each in parts):
         return found
     return [(whole, (found[0][1][0], found[-1][1][1]))]
+
+
+def _encoded(events: TopicEvents | None) -> bytes:
+    return _NOTHING if events is NO_EVENTS else encode_topic_events(events)
+
+
+def _decoded(packed: bytes) -> TopicEvents | None:
+    return NO_EVENTS if packed == _NOTHING else decode_topic_events(packed)
 
 
 def store_shared_events(view: View, topic: str, window: TimeWindow) -> int:

@@ -10,6 +10,7 @@ import math
 import os
 import subprocess
 import time
+from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -27,14 +28,15 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns
+from ros2_memory.history.bag_fold import JOINED_VERSION
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import store_shared_paths
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
-from ros2_memory.insights.drive import store_shared_standstills
-from ros2_memory.insights.topic_events import store_shared_events
+from ros2_memory.insights.drive import drive_in, store_shared_standstills
+from ros2_memory.insights.topic_events import events_in, store_shared_events
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.queries import list_recorded_topics
@@ -216,8 +218,9 @@ class Backfill:
     def precompute(self) -> None:
         """Computes what overlapping recordings hold together, before a client asks.
 
-        What was computed once is not looked at again, but for the hour before the bags that were
-        digested since.
+        And what the bags of a segment add up to, so that no process joins a week for its first
+        answer. What was computed once is not looked at again, but for the hour before the bags
+        that were digested since, and the segments that this touches.
         """
         with suppress(EpisodicError):
             rows = list_recorded_topics(self._memory, Call())
@@ -235,6 +238,7 @@ class Backfill:
             if any(has_events(each) for each in types):
                 with suppress(EpisodicError):
                     store_shared_events(view, topic, window)
+        store_joined(self._memory, window)
 
     def prune(self) -> None:
         """Removes the entries of deleted files, and those of older configurations.
@@ -275,6 +279,33 @@ class Backfill:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
+
+
+def store_joined(memory: Memory, window: TimeWindow) -> None:
+    """Stores what the bags of each segment in a window, and of the one before, add up to.
+
+    Nothing is looked at where all of it was stored, be it by another process.
+    """
+    view = View(memory, Call(stores_joined=True))
+    timeline = view.snapshot.timeline
+    known = [view.bags.digests_of(each) for each in timeline.segments if timeline.is_settled(each)]
+    numbers = [number for each in known if each is not None for number in each.numbers.values()]
+    if memory.recall is None or not numbers:
+        return
+    catalogue, limits = memory.recall.catalogue, memory.limits
+    mark = f"joined {JOINED_VERSION} all {limits.max_plausible_speed_mps:g} {limits.pose_topic}"
+    if catalogue.joined(mark, [numbers]) is not None:
+        return
+    at = bisect_right(timeline.segments, window.start, key=lambda each: each.bags[0].start)
+    # The one before a segment that is new has become final with it.
+    window = TimeWindow(timeline.segments[max(at - 2, 0)].bags[0].start, MAX_NS)
+    with suppress(EpisodicError):
+        drive_in(view, window)
+    for topic, types in timeline.types.items():
+        if any(map(has_events, types)):
+            with suppress(EpisodicError):
+                events_in(view, topic, window)
+    catalogue.store_joined(mark, [numbers], b"-")
 
 
 async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: float) -> None:

@@ -15,13 +15,16 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange, View
+from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap, recap_or_before
 from ros2_memory.insights.sightings import find_matches
+from ros2_memory.serving.backfill import store_joined
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
 from tests.support.memories import memory_of, recalling
@@ -30,6 +33,8 @@ from tests.support.random_histories import S, write_history
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from random import Random
+
+    import pytest
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
@@ -217,6 +222,33 @@ def test_every_question_is_answered_as_without_a_catalogue(
         recalled = recalling(replace(plain), bag_dir, part=part)
         for asked, ask in questions(moments, draw):
             assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
+
+
+@settings(
+    max_examples=EXAMPLES // 2,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+@given(seed=st.integers(0, 2**32), size=st.integers(1, 4))
+def test_what_is_stored_of_many_bags_changes_no_answer(
+    seed: int, size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timeline, "SEGMENT_BAGS", size)
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
+        filling = recalling(replace(plain), bag_dir)
+        assert filling.recall is not None
+        store_joined(filling, TimeWindow.everything())
+        # As another process: nothing is in memory.
+        recalled = replace(plain, recall=DigestCache(filling.recall.catalogue, bag_dir))
+        spans = [(min(moments), max(moments)), sorted(draw.sample(moments, 2))]
+        for first, last in spans:
+            span = TimeRange(start_s=first / 1e9, end_s=last / 1e9)
+            for ask in (partial(_recap, span), partial(_way, "/odom", span)):
+                assert answer(recalled, ask) == answer(plain, ask), (seed, size, span)
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -217,3 +217,27 @@ def test_which_recordings_hold_a_topic_is_known_anew_whatever_changes() -> None:
     for number in (0, SEGMENT_BAGS, first + 5):
         timeline = timeline.changed([split(number)], [])
         assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")
+
+
+def test_what_is_left_when_the_oldest_bags_are_gone_is_kept_in_the_same_segments() -> None:
+    bags = [_bag(f"rec/rec_{n}.mcap", ("/odom", n * 10, n * 10 + 9)) for n in range(4000)]
+    # As a process that goes on has them, and one that starts later.
+    timelines = Timeline.of(bags).changed(bags[:300], ()), Timeline.of(bags[300:])
+    before, after = (
+        {each.bags for each in timeline.segments if timeline.is_settled(each)}
+        for timeline in timelines
+    )
+    assert sum(map(len, before & after)) > 3000
+    assert all(len(each.bags) <= SEGMENT_BAGS for each in timelines[0].segments)
+
+
+def test_a_segment_is_settled_once_another_follows_and_unless_it_is_being_deleted() -> None:
+    bags = [_bag(f"rec/{n:04}.mcap", ("/odom", n * 10, n * 10 + 9)) for n in range(600)]
+    timeline = Timeline.of(bags[:SEGMENT_BAGS])
+    assert not timeline.is_settled(timeline.segments[0])
+    timeline = timeline.changed((), bags[SEGMENT_BAGS:])
+    *before, last = map(timeline.is_settled, timeline.segments)
+    assert (all(before), last) == (True, False)
+    timeline = timeline.changed(bags[:1], ())
+    first, *others, last = map(timeline.is_settled, timeline.segments)
+    assert (first, all(others), last) == (False, True, False)
