@@ -21,7 +21,7 @@ from rich.console import Console
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.state.own_recordings import folders_with_bags
-from ros2_memory.cli.output import with_commands
+from ros2_memory.cli.output import with_local_times
 from ros2_memory.config import NullRecorderNode, Settings, load_explained
 from ros2_memory.config_sources import GROUPS, Sources, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
@@ -333,7 +333,8 @@ def reported_errors(command: str) -> Iterator[None]:
     except BrokenPipeError:
         raise
     except (EpisodicError, OSError) as error:
-        print(f"ros2-memory {command}: {with_commands(str(error))}", file=sys.stderr)
+        lines = "\n".join(map(with_local_times, str(error).split("\n")))
+        print(f"ros2-memory {command}: {lines}", file=sys.stderr)
         raise typer.Exit(EXIT_CANNOT_RUN) from None
     finally:
         _print_collected()

@@ -7,6 +7,8 @@ from contextlib import suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.silences import LONGEST_OFF_NS
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
@@ -17,12 +19,15 @@ from ros2_memory.core.timebase import (
     Ns,
     unix_from_ns,
 )
+from ros2_memory.history.context import short_name
 from ros2_memory.history.coverage import being_written, note_unread, unix_text
+from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
+GIVE_TOPIC: Final = "give topic where the tool takes it"
 MOST_TRIED: Final = 20
 """Topics of unknown content that are looked into for poses."""
 _CLOCKS_DIFFER_NS: Final[Ns] = 60 * NS_PER_S
@@ -32,8 +37,10 @@ ON_DISK_S: Final = 3
 
 
 def seconds(duration: Ns) -> str:
-    """Returns a duration for a sentence: three digits, and never less exact than to the second."""
+    """Returns a duration for a sentence: three digits, and to the second or better up to a week."""
     length = unix_from_ns(duration)
+    if duration > LONGEST_OFF_NS:
+        return f"{length / 86_400:.0f} days"
     return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
 
 
@@ -83,7 +90,7 @@ def resolve_pose_topic(
             detail += (
                 f"; {those} are on {listed(topics)}: set data.pose_topic"
                 f"{'=' if len(topics) == 1 else ' '}{which}, "
-                "or give topic where the tool takes it"
+                f"or {GIVE_TOPIC}"
             )
         elif what == "position" and (fixes := topics_with(view, "geodetic")):
             advice = "give topic" if degrees else "get_position_at answers them by topic"
@@ -220,10 +227,14 @@ def no_data_at(
     with their distances, and what to do.
     """
     older, newer = _neighbours(view, topics, at, at + 1)
+    is_between = bool(older and newer)
+    elsewhere = _only_elsewhere(view, topics, TimeWindow(at, at + 1))
+    if elsewhere:
+        older, newer = _of_this_time(older, at), _of_this_time(newer, at)
     when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
     if around is not None:
         when = f"within {seconds(around)} of"
-    detail = [f"no message of {' or '.join(topics)} {when} {unix_text(at)}"]
+    detail = [f"no message of {' or '.join(topics)} {when} {unix_text(at)}", *elsewhere]
     if older:
         ago = seconds(at - older.time)
         detail.append(f"the nearest older one is {ago} before it, at {unix_text(older.time)}")
@@ -233,7 +244,7 @@ def no_data_at(
     before = tolerance if around is None else around
     start = MIN_NS if before is None else max(at - before, MIN_NS)
     window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
-    reason = between(view, window) if older and newer else beyond(view, at)
+    reason = between(view, window) if is_between else beyond(view, at)
     detail += _advice(view, reason)
     if _is_to_come(view, at):
         detail.append(_to_come(view, at))
@@ -246,15 +257,19 @@ def no_data_at(
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
     """Returns the error for no message of these topics in a window."""
     older, newer = _neighbours(view, topics, window.start - 1, window.stop)
+    is_between = bool(older and newer)
+    elsewhere = _only_elsewhere(view, topics, window)
+    if elsewhere:
+        older, newer = _of_this_time(older, window.start), _of_this_time(newer, window.stop)
     start, end = window.asked()
     names = " or ".join(topics)
-    detail = [f"no message of {names} between {unix_text(start)} and {unix_text(end)}"]
+    detail = [f"no message of {names} between {unix_text(start)} and {unix_text(end)}", *elsewhere]
     if older:
         detail.append(f"the last one before is at {unix_text(older.time)}")
     if newer:
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     newest = min(end, max(start, view.memory.clock.now()))
-    reason = between(view, window) if older and newer else beyond(view, newest)
+    reason = between(view, window) if is_between else beyond(view, newest)
     detail += _advice(view, reason)
     if _is_to_come(view, start):
         detail.append(_to_come(view, start))
@@ -275,6 +290,54 @@ def _neighbours(
         view.stream.first(topics, TimeWindow.until(until), newest_first=True),
         view.stream.first(topics, TimeWindow(since, MAX_NS)),
     )
+
+
+def _of_this_time(found: StoredMessage | None, at: Ns) -> StoredMessage | None:
+    """Returns a message that is not of another time altogether, as of another robot's bag."""
+    return found if found is not None and abs(found.time - at) <= LONGEST_OFF_NS else None
+
+
+def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> list[str]:
+    """Returns a sentence where the recordings of a window have none of these topics at all.
+
+    It names topics there that carry what these do (poses, velocities). In a folder with the bags of
+    several robots, the nearest message of a topic may be another robot's.
+    """
+    timeline, whole = view.snapshot.timeline, view.snapshot.metadata_folders
+    names: dict[str, None] = {}
+    held: set[str] = set()
+    for bag in timeline.overlapping(window):
+        if is_carried(bag.file):
+            continue
+        held.update(bag.summary.schema.positions)
+        if is_named_after_folder(bag.file) or str(bag.recording) in whole:
+            if any(bag.recording in timeline.recordings(topic) for topic in topics):
+                return []
+            names[bag.recording.name] = None
+        else:
+            names[short_name(bag.path)] = None
+    if not names or not held.isdisjoint(topics):
+        return []
+    alike = _alike(view, topics, held)
+    verb = "has" if len(names) == 1 else "have"
+    recordings = counted(len(names), "recording").removeprefix("1 ")
+    sentence = f"the {recordings} of that time, {listed(sorted(names))}, {verb} no such topic"
+    return [sentence + (f"; similar there: {listed(alike)}; give topic" if alike else "")]
+
+
+def _alike(view: View, topics: tuple[str, ...], held: set[str]) -> list[str]:
+    """Returns which of the `held` topics carry all that some topics do, or else some of it."""
+
+    def carried(topic: str) -> set[str]:
+        return {
+            kind
+            for each in view.snapshot.timeline.types_of(topic)
+            for kind in view.memory.extractor.kinds_of(each)
+        }
+
+    wanted = {kind for topic in topics for kind in carried(topic)}
+    some = [topic for topic in sorted(held) if carried(topic) & wanted]
+    return [topic for topic in some if carried(topic) >= wanted] or some
 
 
 def between(view: View, window: TimeWindow) -> NoDataReason:

@@ -125,11 +125,8 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     folders: dict[str, list[BagFile]] = {}
     whole = {*snapshot.metadata_folders}
     for bag in snapshot.bags:
-        folder, _, name = bag.file.rpartition("/")
-        is_split = (
-            name.startswith(f"{folder.rpartition('/')[2]}_") or name.partition(".")[0].isdigit()
-        )
-        if not is_split and folder not in whole:
+        folder = folder_of(bag.file)
+        if folder not in whole and not is_named_after_folder(bag.file):
             folders.setdefault(folder, []).append(bag)
     found: dict[str, str] = {}
     for bags in folders.values():
@@ -140,6 +137,12 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
             is_one = _follow(members)
             found.update({bag.file: name if is_one else stem_of(bag.file) for bag in members})
     return found
+
+
+def is_named_after_folder(file: str) -> bool:
+    """Returns whether a bag is named as a split of the recording of its folder, or by a number."""
+    folder, _, name = file.rpartition("/")
+    return name.startswith(f"{folder.rpartition('/')[2]}_") or name.partition(".")[0].isdigit()
 
 
 def folder_of(file: str) -> str:

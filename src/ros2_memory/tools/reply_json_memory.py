@@ -141,7 +141,7 @@ def _status(answer: results.Status) -> JsonObject:
     reply: JsonObject = {
         "trust": "; ".join(_doubts(answer)) or "nothing is known to be missing",
         "recorder": answer.recorder,
-        "recorder_alive": answer.live,
+        "recorder_alive": answer.live if answer.recorder or answer.budget.most else None,
         "restarts": answer.restarts,
         **({"lost_last_hour": dict(answer.lost)} if answer.lost else {}),
         "now": moment(answer.now),

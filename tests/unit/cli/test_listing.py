@@ -114,6 +114,22 @@ class TestPaths:
             assert "data_time_range" not in shown
             assert "list_recorded_topics" not in shown
 
+    def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
+        self, folder: Path, capsys: Capture
+    ) -> None:
+        bag = folder / "a" / "a_0.mcap"
+        bag.write_bytes(bag.read_bytes()[:-20])
+        os.utime(bag, (1.7e9, 1.7e9))
+        _, shown = run(capsys, "topics", folder)
+        assert shown.count("left open by a crash") == 1
+        assert "2 topics: 1 bag left open" in shown
+        _, shown = run(capsys, "topics", folder, "--json")
+        assert [len(row["notes"]) for row in json.loads(shown)] == [1, 1]
+
+    def test_errors_have_no_control_characters(self, folder: Path, capsys: Capture) -> None:
+        assert cli.main(["cat", "/\x1b[31m", str(folder)]) == 2
+        assert "\x1b" not in capsys.readouterr().err
+
     def test_a_topic_after_the_folder_is_told_its_place(
         self, folder: Path, capsys: Capture
     ) -> None:

@@ -11,6 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from ros2_memory import cli
+from ros2_memory.cli.output import format_time
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import battery, boolean, odom, text, write_mcap
@@ -50,6 +51,22 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MEMORY_DEPLOYMENT", raising=False)
     monkeypatch.delenv("MEMORY_BAG_DIR", raising=False)
+
+
+def test_where_the_poses_are_on_another_topic_it_names_the_option(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    write_mcap(tmp_path / "bag.mcap", [odom(T0, 0.0, 0.0, topic="/base/odometry")])
+    assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 2
+    assert "set data.pose_topic=/base/odometry, or give --topic" in capsys.readouterr().err
+
+
+def test_times_in_errors_are_printed_as_they_are_typed(bags: Path, capsys: Capture) -> None:
+    words = ["plot", "path", str(bags), "--start", "1700000040", "--end", "1700000050"]
+    assert cli.main([*words, "--out", str(bags / "none.svg")]) == 2
+    shown = capsys.readouterr().err
+    assert format_time(1_700_000_060.0) in shown
+    assert "1700000060" not in shown
 
 
 def scene_of(bags: Path) -> scene.Scene:

@@ -127,6 +127,39 @@ def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s
     assert reply.sample.time == T0
 
 
+@pytest.mark.parametrize("loose", [False, True])
+def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robots(
+    tmp_path: Path, loose: bool
+) -> None:
+    """Years apart: what the recording of that time has is named, and where to look in it."""
+    names = ("robin", "wren") if loose else ("robin/robin_0", "wren/wren_0")
+    year = 365 * 86_400
+    own = [odom(T0 + n * NS_PER_S, 0.0, 0.0, topic="/base/odometry") for n in range(10)]
+    write_mcap(tmp_path / f"{names[0]}.mcap", [*own, text(T0, "one")])
+    write_mcap(tmp_path / f"{names[1]}.mcap", [odom(T0 + year * NS_PER_S, 0.0, 0.0)])
+    memory = memory_of(tmp_path)
+    with pytest.raises(NoDataError) as caught:
+        queries.position(memory, Call(), after(5))
+    detail = caught.value.detail
+    assert "robin" in detail
+    assert "has no such topic; similar there: /base/odometry; give topic" in detail
+    assert "nearest" not in detail
+    with pytest.raises(NoDataError, match="similar there: /base/odometry"):
+        queries.topic_range(memory, Call(), "/odom", TimeRange(T0_S + 1, T0_S + 3))
+    # Between the two there is nothing to tell them apart by.
+    with pytest.raises(NoDataError, match="nearest newer one is 364 days after"):
+        queries.position(memory, Call(), after(86_400))
+
+
+def test_a_topic_that_a_recording_lacks_is_near_in_the_next_one(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "one" / "one_0.mcap", [text(T0, "a"), text(T0 + 9 * NS_PER_S, "b")])
+    write_mcap(tmp_path / "two" / "two_0.mcap", [odom(T0 + 20 * NS_PER_S, 0.0, 0.0)])
+    with pytest.raises(NoDataError) as caught:
+        queries.position(memory_of(tmp_path), Call(), after(5))
+    assert "the recording of that time, one, has no such topic" in caught.value.detail
+    assert "the nearest newer one is 15 s after it" in caught.value.detail
+
+
 def test_what_never_had_a_message_before_a_time_is_reported_in_words(tmp_path: Path) -> None:
     frames_that_part(tmp_path)
     with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):

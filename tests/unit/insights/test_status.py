@@ -139,10 +139,10 @@ def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("now", "told"), [("wall", ("recording", False)), ("latest", (None, False))]
+    ("now", "told"), [("wall", ("recording", False)), ("latest", (None, None))]
 )
 def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
-    now: Literal["wall", "latest"], told: tuple[str | None, bool], tmp_path: Path
+    now: Literal["wall", "latest"], told: tuple[str | None, bool | None], tmp_path: Path
 ) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=1e6)
     memory = replace(memory, limits=replace(memory.limits, now=now))

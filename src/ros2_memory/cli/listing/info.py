@@ -26,6 +26,7 @@ from ros2_memory.cli.options import (
 )
 from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
@@ -66,7 +67,11 @@ def topics(
     if as_json:
         print_line(json.dumps(rows) if rows else answer.text)
     elif rows:
-        print_reply(stdout_console(), rows)
+        console = stdout_console()
+        shown, notes = _notes_apart(rows)
+        print_reply(console, shown)
+        if notes:
+            print_reply(console, {"notes": notes})
     elif is_error(reply):
         print_reply(stdout_console(), reply)
     else:
@@ -87,6 +92,26 @@ def _topic_row(memory: Memory, reply: JsonValue, known: TopicRow) -> JsonValue:
         row["notes"] = [*known.notes]
     row["rate_hz"] = usual_rate(memory.index.snapshot(), known.topic, memory.limits.latching)
     return row
+
+
+def _notes_apart(rows: list[JsonValue]) -> tuple[list[JsonValue], list[JsonValue]]:
+    """Returns the rows without their notes, and the notes, each once with how many topics it is on.
+
+    What is wrong with one bag is noted on each topic in it.
+    """
+    on: dict[str, list[str]] = {}
+    shown: list[JsonValue] = []
+    for row in rows:
+        if not isinstance(row, dict):
+            continue
+        notes = row.get("notes")
+        for note in notes if isinstance(notes, list) else []:
+            on.setdefault(str(note), []).append(str(row["topic"]))
+        shown.append({key: value for key, value in row.items() if key != "notes"})
+    return shown, [
+        f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
+        for note, topics in on.items()
+    ]
 
 
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
@@ -211,21 +236,21 @@ def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, N
 
 
 def _with_budget_sentence(reply: JsonValue) -> JsonValue:
-    """Returns a reply of `memory_status` whose budget is a sentence; any other as it is."""
+    """Returns a reply of `memory_status` whose budget is a sentence; any other as it is.
+
+    Bags that are only looked at have no budget, and their size is told already.
+    """
     budget = reply.get("budget") if isinstance(reply, dict) else None
     if not isinstance(reply, dict) or not isinstance(budget, dict):
         return reply
-    return {**reply, "budget": describe_budget(budget)}
+    rest = {key: value for key, value in reply.items() if key != "budget"}
+    return rest if budget.get("max_gb") is None else {**reply, "budget": describe_budget(budget)}
 
 
 def describe_budget(budget: dict[str, JsonValue]) -> str:
     """Returns how much of the budget the bags take, and how long it lasts."""
-    most, growth = budget.get("max_gb"), budget.get("growth_gb_per_day")
-    text = f"{format_value(budget.get('used_gb'))} GB"
-    if most is None:
-        text += "; recorder=none: nothing is recorded or deleted here, so no budget and no growth"
-    else:
-        text += f" of {format_value(most)} GB"
+    growth = budget.get("growth_gb_per_day")
+    text = f"{format_value(budget.get('used_gb'))} of {format_value(budget.get('max_gb'))} GB"
     if budget.get("foreign_gb"):
         foreign = format_value(budget["foreign_gb"])
         text += f"; bags that the recorder did not make take {foreign} GB more"

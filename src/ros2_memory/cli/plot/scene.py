@@ -19,7 +19,7 @@ from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import recording_gaps
-from ros2_memory.history.no_data import require_bags
+from ros2_memory.history.no_data import GIVE_TOPIC, require_bags
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
@@ -198,6 +198,11 @@ def path_in(
                 max_waypoints=_MOST_WAYPOINTS,
             )
             break
+        except NoDataError as error:
+            detail = error.detail.replace(GIVE_TOPIC, "give --topic").replace(
+                "; give topic", "; give --topic"
+            )
+            raise NoDataError(error.reason, detail, error.notes) from error
         except InvalidArgumentsError:
             if each is None or each == frame:
                 raise
