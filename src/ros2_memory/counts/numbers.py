@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.counts.field_numbers import FieldReader
-from ros2_memory.history.bag_groups import groups_of
+from ros2_memory.history.bag_fold import shares_of
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.view import open_span
 
@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
     from ros2_memory.counts.field_numbers import FieldNumbers, Numbers, NumberTable
+    from ros2_memory.history.bag_fold import Share
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
@@ -82,21 +84,62 @@ def _extreme(times: Times, which: Callable[[Iterable[Ns]], Ns]) -> Ns | None:
 
 
 def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times, Times]:
-    """Returns for each piece how many messages it holds, and when the first and the last came.
-
-    Messages are read where recordings overlap; the times of messages where a bag lies in several
-    pieces.
-    """
+    """Returns for each piece how many messages it holds, and when the first and the last came."""
     edges = binned.bins.edges[1:-1].tolist()
     size = len(binned.bins.member)
     counts, first, last = [0] * size, [MAX_NS] * size, [MIN_NS] * size
+    for share in shares_of(view, topic, binned.asked):
+        view.bags.check_deadline()
+        for held in _held(view, topic, share, binned.asked, edges):
+            piece = bisect_right(edges, held.first)
+            counts[piece] += held.messages
+            first[piece] = min(first[piece], held.first)
+            last[piece] = max(last[piece], held.last)
+    return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
 
-    def add(piece: int, count: int, begin: Ns, end: Ns) -> None:
-        counts[piece] += count
-        first[piece] = min(first[piece], begin)
-        last[piece] = max(last[piece], end)
 
-    for group in groups_of(view.stream, topic, binned.asked):
+class _Held(NamedTuple):
+    """How many messages were recorded between two times, both of messages."""
+
+    messages: int
+    first: Ns
+    last: Ns
+
+
+def _held(
+    view: View, topic: str, share: Share, window: TimeWindow, edges: Sequence[Ns]
+) -> Sequence[_Held]:
+    """Returns the messages of a share between edges; remembered where a window covers the share."""
+    digests = view.bags.digests_of(share.segment)
+    inner = tuple(edge for edge in edges if share.first < edge <= share.last)
+    if digests is None or not share.is_covered_by(window):
+        return _counted_in(view, topic, share, window, inner)
+    # A list of none or one: what cannot be read now is counted again.
+    known: list[Sequence[_Held]] = digests.derived(f"counts {topic} {inner} {share.key}", list)
+    if known:
+        return known[0]
+    with view.notes.isolated():
+        found = _counted_in(view, topic, share, window, inner)
+        if view.notes.complete:
+            known.append(found)
+    return found
+
+
+def _counted_in(
+    view: View, topic: str, share: Share, window: TimeWindow, edges: Sequence[Ns]
+) -> list[_Held]:
+    """Counts the messages of a share between edges.
+
+    Messages are read where recordings overlap; the times of messages where a bag lies on both
+    sides of an edge.
+    """
+    found: dict[int, _Held] = {}
+
+    def add(piece: int, count: int, first: Ns, last: Ns) -> None:
+        known = found.get(piece, _Held(0, first, last))
+        found[piece] = _Held(known.messages + count, min(known.first, first), max(known.last, last))
+
+    for group in share.groups(view, topic, window):
         begin = min(each.first for each in group.bags)
         end = max(each.last for each in group.bags)
         piece = bisect_right(edges, begin)
@@ -106,7 +149,7 @@ def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times
         for piece, times in groupby(group.times(), key=partial(bisect_right, edges)):
             here = [*times]
             add(piece, len(here), here[0], here[-1])
-    return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
+    return [*found.values()]
 
 
 def _count(view: View, topic: str, group: Group) -> int:

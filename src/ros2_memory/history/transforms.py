@@ -7,7 +7,8 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.transform_tree import (
     TF_CACHE_NS,
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
+    from ros2_memory.index.timeline import Timeline
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read; the last is the length of tf2's cache."""
@@ -70,6 +72,11 @@ _BORROWED: Final = Reason(
 )
 
 _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
+
+
+_Connection: TypeAlias = "tuple[tuple[str, str], tuple[str, ...], tuple[str, ...], Session | None]"
+_CONNECTED: Final[WeakKeyDictionary[Timeline, set[_Connection]]] = WeakKeyDictionary()
+"""Frames that are connected by what some topics recorded, static ones first, in a session."""
 
 
 class FoundTransform(NamedTuple):
@@ -402,6 +409,10 @@ def connects(
         QueryTimeoutError: the call's time is over before that is known.
     """
     limits = view.memory.limits
+    known_to = _CONNECTED.setdefault(view.snapshot.timeline, set())
+    asked = (frames, limits.tf_static_topics, limits.tf_topics, among)
+    if asked in known_to:
+        return True
     pairs: set[tuple[str, str]] = set()
     unread: list[tuple[Ns, Ns, tuple[str, ...]]] = []
     for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window)):
@@ -410,6 +421,8 @@ def connects(
         pairs |= known
         unread += [(stop, start, recorded) for start, stop in dict.fromkeys(unknown)]
     if _link(pairs, frames):
+        if window is None:
+            known_to.add(asked)
         return True
     for stop, start, recorded in sorted(unread, reverse=True):
         view.bags.check_deadline()

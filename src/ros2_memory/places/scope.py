@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -74,7 +74,11 @@ class Scope:
             if self._inside is None:
                 yield part, topics
                 continue
-            for start, stop in reversed(self._inside):
+            # Those that begin in the part or before, down to the last that ended before it: they
+            # are in order, and do not overlap.
+            first = bisect_left(self._inside, part.start, key=lambda each: each[1])
+            until = bisect_left(self._inside, part.stop, key=lambda each: each[0])
+            for start, stop in reversed(self._inside[first:until]):
                 cut = part.intersect(TimeWindow(start, stop + 1))
                 if not cut.empty:
                     yield cut, topics
