@@ -260,8 +260,8 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
     for name, each in given.items():
         if not load_topics(recording.topics_file).matches(each.topic):
             raise ConfigError(
-                f"{path}: the rule {name!r}: {each.topic} is not recorded, so nothing would be "
-                f"known of it: list it in {recording.topics_file}"
+                f"{path}: the rule {name!r}: {each.topic} is not recorded, so its value would be "
+                f"unknown at all times: list it in {recording.topics_file}"
             )
         condition = _condition_of(settings, each, f"{path}: the rule {name!r}")
         rules.append(

@@ -119,7 +119,7 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
     kind, context = fault["type"], fault.get("ctx", {})
     if kind == "unexpected_keyword_argument":
         known = ", ".join(_known_keys(model, fault, nodes))
-        return f"{key}: there is no such key; use one of: {known}"
+        return f"{key}: unknown key; use one of: {known}"
     if kind in {"missing", "union_tag_not_found"}:
         return f"{key}: missing; give it a value"
     if kind in {"dataclass_type", "model_attributes_type", "dict_type"}:

@@ -215,8 +215,8 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
         raise ConfigError(
-            f"{text!r} is no override ({reason_of(error)}; set {source}); write key=value, such as "
-            "server.port=9300, and key='value' where special characters are in it"
+            f"{text!r} is not an override ({reason_of(error)}; set {source}); write key=value, "
+            "such as server.port=9300, and key='value' where special characters are in it"
         ) from error
     key = override.key_or_group
     is_group = key in options

@@ -564,7 +564,7 @@ class ThingStay:
 
 @dataclass(frozen=True, slots=True)
 class StillThere:
-    """What is known of a thing since it was last seen, in the words of the reply.
+    """The state of a thing since it was last seen, as in the reply.
 
     Attributes:
         state: `in_view`, `seen_since`, `not_looked_at_since` or `not_seen_where_expected`.
@@ -710,10 +710,10 @@ class Comparison(AnswerWithNotes):
         lengths: of the windows (s), and `recorded` how much of each was recorded.
         frame_id: of the things' places.
         way: numbers by name: metres, m/s, seconds and counts.
-        way_frame_id: of the places where the robot stood, and of points of the way.
+        way_frame_id: frame of the places where the robot stood, and of the points of the path.
         stood: where it stood in one window longer than in the other.
         farthest: the points of this way, and of the other one, that are farthest from the other
-            and from this; None where the ways are the same.
+            and from this; None where the paths are the same.
         places: minutes in each named place.
         errors: reports of each error.
         silences: seconds for which each topic was silent.

@@ -42,8 +42,8 @@ class TestConfigFolder:
         ("old", "new", "fragments"),
         [
             ("now: wall ", "now: walls ", ["data.now: 'walls'", "wall, latest"]),
-            ("now: wall ", "new: wall ", ["data.new: there is no such key", "data.now: missing"]),
-            ("server:", "servers:", ["servers: there is no such key", "server: missing"]),
+            ("now: wall ", "new: wall ", ["data.new: unknown key", "data.now: missing"]),
+            ("server:", "servers:", ["servers: unknown key", "server: missing"]),
             ("port: 9203", "port: [", ["config.yaml", "line"]),
             ("port: 9203", "name: again", ["config.yaml", "duplicate key name"]),
             ("- storage: mcap ", "- storage: tape ", ["storage/tape", "mcap rosbag2"]),
@@ -110,7 +110,7 @@ class TestMessageSchemas:
             ("schemas: {a/msg/B: position}", "schemas.a/msg/B: 'position'"),
             ("schemas: {a/msg/B: {'': position}}", "must not be empty"),
             ("schemas: {a/msg/B: {x: y}, a/msg/B: {x: z}}", "duplicate key a/msg/B"),
-            ("schema: {}", "schema: there is no such key"),
+            ("schema: {}", "schema: unknown key"),
             ("schemas: [", "line 1"),
             ("- a list", "['a list'] is not allowed"),
             ("", "schemas: missing"),
@@ -174,7 +174,7 @@ class TestLabels:
             ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
             ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
             ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
-            ("label: {}", "label: there is no such key; use one of: labels"),
+            ("label: {}", "label: unknown key; use one of:  labels"),
             ("", "labels: missing"),
         ],
     )

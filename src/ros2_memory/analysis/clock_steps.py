@@ -24,7 +24,7 @@ BESIDE_NS: Final[Ns] = NS_PER_S
 """How the robot drives beside a hole is measured over this long."""
 _DRIVING_MPS: Final = 0.1
 _MOVED: Final = 0.3
-"""Of the way that it would have driven in the hole, it drove less than this share."""
+"""It drove less than this share of the distance that it would have driven in the hole."""
 
 
 class ClockStep(NamedTuple):

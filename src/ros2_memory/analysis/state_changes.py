@@ -56,7 +56,7 @@ _DIGITS: Final = re.compile(r"\d+")
 
 
 class StateLevel(NamedTuple):
-    """A level that one message states; `text` says more of it."""
+    """A level reported in one message; `text` describes it."""
 
     name: str
     value: int

@@ -148,7 +148,7 @@ class TopicEvents:
 
 
 NO_EVENTS: Final = TopicEvents(0, 0)
-"""Stands for the events of messages without any, whenever they were."""
+"""The events of messages that have none."""
 
 
 def has_events(type_name: str) -> bool:

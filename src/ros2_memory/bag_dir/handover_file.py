@@ -257,7 +257,7 @@ def sure_handover(recording: Path) -> HandoverReading:
         reason = _unreadable(error)
     # json raises RecursionError for a file of nothing but brackets.
     except (ValueError, RecursionError) as error:
-        reason = f"{HANDOVER_FILE} is no sidecar of a recording: {error}"
+        reason = f"{HANDOVER_FILE} is not a valid sidecar: {error}"
     return HandoverReading(Handover(), reason)
 
 

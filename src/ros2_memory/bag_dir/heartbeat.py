@@ -128,7 +128,7 @@ def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
         return HeartbeatReading(None, f"{HEARTBEAT_FILE} cannot be read: {error.strerror or error}")
     # json raises RecursionError for a file of nothing but brackets.
     except (ValueError, RecursionError) as error:
-        return HeartbeatReading(None, f"{HEARTBEAT_FILE} is no heartbeat: {error}")
+        return HeartbeatReading(None, f"{HEARTBEAT_FILE} is not a valid heartbeat: {error}")
 
 
 def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:

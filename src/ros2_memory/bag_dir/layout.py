@@ -76,7 +76,7 @@ _RECORDING_NAME: Final = re.compile(r"rec_(\d{8}T\d{6}Z)(?:_\d+)?")
 
 
 def has_recorded(bag_dir: Path) -> bool:
-    """Returns whether a recorder of this program has been at work here, by its own files.
+    """Returns whether a recorder of this program has run here: whether its own files exist.
 
     Only there is anything written beside bags. Nothing behind a link counts.
     """

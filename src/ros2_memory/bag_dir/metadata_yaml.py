@@ -394,7 +394,7 @@ def _parse(text: str) -> object:
     try:
         value: object = yaml.load(text, _LOADER)  # noqa: S506 - a safe one
     except (yaml.YAMLError, RecursionError) as error:
-        raise ValueError("it is no YAML") from error
+        raise ValueError("it is not YAML") from error
     return value
 
 

@@ -98,7 +98,7 @@ class SavedMoment:
 
     `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
     were not saved. By default nothing is saved yet. `rule` is the rule that asked for it, and
-    `matches` how often that fired in it; None where somebody asked.
+    `matches` how often that fired in it; None for a moment that was requested.
     """
 
     request: _Request

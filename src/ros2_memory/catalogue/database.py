@@ -31,7 +31,7 @@ RETRY_S: Final = 10.0
 """How often a file that could not be opened is tried again."""
 
 _SHORT_MS: Final = 20
-"""How long SQLite waits in one attempt: whoever asks a question waits for it too."""
+"""How long SQLite waits in one attempt; queries wait as long."""
 _PAUSE_S: Final = 0.02
 ROW_ID_BITS: Final = 40
 """An entry's number is the row's id in these low bits, and in the others which database it is of.
@@ -85,7 +85,7 @@ class OpenDatabase:
     """An open connection, and the path of its file; None in memory.
 
     `identities` are device and inode of the file, of its write-ahead log and of the log's index:
-    they tell these files from others of the same names.
+    they distinguish these files from others of the same names.
     """
 
     connection: sqlite3.Connection
@@ -348,7 +348,7 @@ def open_file(
     Args:
         paths: where it may lie, in order of preference.
         again: whether this was tried before, so that what is logged already is logged at debug.
-        previous: where it lay until now. That file, or else the one at the next path, is copied
+        previous: its path until now. That file, or else the one at the next path, is copied
             to a path that has none yet.
     """
     reason = ""
@@ -553,7 +553,7 @@ def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:
 
 
 def _set_aside(path: Path, reason: str) -> None:
-    """Renames a file so that a new one can be made; the old one stays for whoever wants to look."""
+    """Renames a file so that a new one can be made; the old one stays for inspection."""
     aside = path.with_name(f"{path.name}.aside")
     log.warning("catalogue_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
     for each in _files_of(path)[1:]:

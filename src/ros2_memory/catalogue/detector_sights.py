@@ -57,7 +57,7 @@ _MAX_DETECTIONS: Final = 1_000_000
 
 @dataclass(slots=True)
 class _Topic:
-    """What is known of one topic of the bag.
+    """The detections of one topic of the bag.
 
     Attributes:
         is_detector: whether its type is named for detections, or a message has held one.

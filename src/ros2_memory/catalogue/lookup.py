@@ -39,7 +39,7 @@ _MAX_DERIVED: Final = 8192
 _MAX_BOUNDS: Final = 8
 """Fields whose bounds stay in memory."""
 _UNKNOWN_STATE: Final = -1
-"""Stands for the state of a catalogue that could not be read."""
+"""The state of a catalogue that could not be read."""
 
 
 class FieldBounds:
@@ -177,7 +177,7 @@ class SegmentDigests:
         """Returns what is computed from the entries of this segment once, by name.
 
         It lives as long as the segment is in use, but for what was asked for longest ago of very
-        much. A name always stands for one type of value.
+        much. A name always has one type of value.
         """
         self._cache.mark_derived(self, name)
         # The type is the caller's: each name is used in one place.

@@ -1,4 +1,4 @@
-"""What one bag says about the map: where the robot was in it, and what it saw there.
+"""The digest of one bag in the map: where the robot was, and what it saw there.
 
 Made from the bag's own messages and from the static transforms of its session, which are its
 context: an entry made under others is of no use, so a hash of them is stored with it.

@@ -1,4 +1,4 @@
-"""Packs what bags say of one topic, most of which is the same from bag to bag.
+"""Compresses the digests of one topic, which are mostly the same from bag to bag.
 
 What is stored is compressed against a model: the first of its kind that was stored of the topic. So
 what equals the model takes some ten bytes, and names and texts that both have take nearly none.

@@ -1,4 +1,4 @@
-"""Has a catalogue's file forget bags, so that no byte of it tells of what they held.
+"""Deletes bags from a catalogue file, so that no byte of it reveals their content.
 
 Deleting rows is not enough: answers were computed from them, payloads and models are shared between
 bags, and SQLite leaves deleted rows in free pages and in its write-ahead log. A model is what the
@@ -93,7 +93,7 @@ def _purge(file: Path, bags: Sequence[str]) -> None:
 
 
 def _done(base: sqlite3.Connection, statement: str) -> bool:
-    """Executes a statement; returns whether nobody was in its way."""
+    """Executes a statement; returns whether no lock was in its way."""
     try:
         row = base.execute(statement).fetchone()
     except sqlite3.OperationalError as error:
@@ -104,7 +104,7 @@ def _done(base: sqlite3.Connection, statement: str) -> bool:
 
 
 def _renew_model(base: sqlite3.Connection, topic: int, kind: str, model: bytes) -> None:
-    """Replaces a model that nothing which is left says, and packs that with another."""
+    """Replaces a model that no remaining row equals, and compresses the rows against another."""
     if topic == NO_TOPIC and kind not in PACKED_IN:  # of answers, which were deleted
         base.execute("DELETE FROM models WHERE topic = ? AND kind = ?", (topic, kind))
         return

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 NO_TOPIC: Final = 0
-"""Stands for the topic of models of what belongs to no topic."""
+"""The topic of models that belong to no topic."""
 OWN_CONFIG: Final = "(SELECT id FROM configs WHERE text = ?)"
 _TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"

@@ -103,7 +103,7 @@ class BagKey(NamedTuple):
 class Catalogue(CatalogueDatabase):
     """Stores digests under one configuration. Safe for several threads and several processes.
 
-    Nothing is ever raised because of the file: where it fails, nothing is known of any bag.
+    No error of the file is raised: if it fails, the catalogue has no bag.
 
     Args:
         paths: where the file may lie, in order of preference; a database in memory serves where

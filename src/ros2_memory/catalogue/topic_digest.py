@@ -88,8 +88,8 @@ class TopicDigest:
 class _Sample(NamedTuple):
     """What one message contributes to the digest besides its numbers and edges.
 
-    `detections` are known where somebody asked for them, and the message was decoded alone;
-    `pairs` are the frames of its valid transforms then, None where nobody asked.
+    `detections` are present if they were requested, and the message was decoded alone;
+    `pairs` are the frames of its valid transforms then, None if not requested.
     """
 
     pose: Pose | None

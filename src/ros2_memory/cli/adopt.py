@@ -83,7 +83,7 @@ def adopt(
     if new:
         print_line("retention deletes them from now on, by its limits, oldest first")
     if not found:
-        print_line("no bag files lie there")
+        print_line("there are no bag files")
         for link in islice(_links(given), _MAX_LINKS_NAMED):
             name = str(link.relative_to(root))
             print_line(f"{name} is a symbolic link, which is not followed: {_INSTEAD}")
@@ -109,7 +109,7 @@ def _below(root: Path, directory: Path) -> Path:
             raise InvalidArgumentsError(f"{link} is a symbolic link, which is not followed")
         return inside
     raise InvalidArgumentsError(
-        f"{directory} is no directory below {root}: move the bags there, then adopt them"
+        f"{directory} is not a directory below {root}: move the bags there, then adopt them"
     )
 
 

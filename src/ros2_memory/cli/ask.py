@@ -143,15 +143,15 @@ def parse_arguments(given: Sequence[str], schema: Mapping[str, object]) -> dict[
     if len(given) == 1 and given[0].lstrip().startswith("{"):
         value = _from_json(given[0], None)
         if not isinstance(value, dict):
-            raise InvalidArgumentsError(f"{given[0]} is no JSON object")
+            raise InvalidArgumentsError(f"{given[0]} is not a JSON object")
         return {**value}
     arguments: dict[str, object] = {}
     for word in given:
         key, equals, text = word.partition("=")
         if not equals or not key:
             raise InvalidArgumentsError(
-                f"{word!r} is no argument; write key=value, such as seconds_ago=10, or one JSON "
-                "object"
+                f"{word!r} is not an argument; write key=value, such as seconds_ago=10, or one "
+                "JSON object"
             )
         arguments[key] = text if _takes_text(schema, key) else _from_json(text, text)
     return arguments
@@ -160,9 +160,9 @@ def parse_arguments(given: Sequence[str], schema: Mapping[str, object]) -> dict[
 def with_times(
     arguments: Mapping[str, object], schema: Mapping[str, object], now: float
 ) -> dict[str, object]:
-    """Returns the arguments of a tool with Unix seconds, or seconds, for the words of people.
+    """Returns a tool's arguments, with times and durations as people write them in seconds.
 
-    What is no time stays as it is, and the tool says what it takes. `now` is in Unix seconds.
+    Other text is passed on unchanged, and the tool reports its error. `now` is in Unix seconds.
     """
     properties = schema.get("properties")
     known = properties if isinstance(properties, dict) else {}

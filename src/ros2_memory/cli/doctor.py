@@ -171,7 +171,7 @@ def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Findin
     if not bag_dir.is_dir():
         if not records:
             do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
-            yield _error("bag_dir", f"{bag_dir} is no directory", do)
+            yield _error("bag_dir", f"{bag_dir} is not a directory", do)
             return
         do = "the recorder makes it when it starts; is its disk mounted?"
         yield _warning("bag_dir", f"{bag_dir} is not there", do)
@@ -333,7 +333,7 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
             f"{iso_local(pair.end)}, and are answered together"
         )
         if topic is not None:
-            seen += f"; each has messages of its own on {topic}, as from two robots"
+            seen += f"; each has different messages on {topic}, as from two robots"
         yield _warning("bags", seen, do)
     for contradiction in contradicting_frames(memory, Call())[:MAX_NAMED]:
         yield _warning("bags", str(contradiction), do)
@@ -379,7 +379,9 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
             "over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the "
             "discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
         )
-        yield _warning("recorder", f"subscribed and never heard: {listed(heartbeat.silent)}", do)
+        yield _warning(
+            "recorder", f"subscribed, but no messages from: {listed(heartbeat.silent)}", do
+        )
     if heartbeat.age_held:
         do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
         yield _warning("recorder", heartbeat.age_held, do)
@@ -440,7 +442,7 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
         hint = f"is it {' or '.join(similar)}? " if similar else ""
         why = f"; {_UNOFFERED}" if entry in unoffered else ""
         seen = f"{entry} is in {file}, and not in the newest hour of data{why}"
-        do = "compare with `ros2 topic list`; a name that nobody publishes is recorded by nobody"
+        do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
         yield _warning("topics", seen, f"{hint}{do}")
     for entry in unoffered:
         if entry not in missing:
@@ -551,7 +553,7 @@ def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
 
     Raises:
         OSError: nothing answers.
-        HTTPException: what answers does not speak HTTP.
+        HTTPException: the reply is not HTTP.
         ValueError: the reply is not a JSON object with a status.
         ConfigError: the token to show cannot be read.
     """

@@ -157,7 +157,7 @@ class _Taking:
         settings: of this deployment.
         memory: over its bags.
         recorder: why a recorder holds the bag directory; None where none does.
-        dry_run: whether it only says what would be done.
+        dry_run: whether it only reports what it would do.
     """
 
     def __init__(
@@ -258,8 +258,8 @@ class _Taking:
         size = sum(path.stat().st_size for path in {each.paths[0] for each in survey.holders})
         what = (
             f"{counted(survey.counts.total(), 'message')} of "
-            f"{counted(len(survey.counts), 'topic')}, by writing "
-            f"{counted(len(survey.holders), 'bag')} anew ({size / MB:.1f} MB)"
+            f"{counted(len(survey.counts), 'topic')}, by rewriting "
+            f"{counted(len(survey.holders), 'bag')} ({size / MB:.1f} MB)"
         )
         print_line(f"would be deleted: {what}" if self._dry_run else f"to be deleted: {what}")
         for topic, count in sorted(survey.counts.items()):
@@ -347,7 +347,7 @@ def _reason_to_keep(
         closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
         return f"a crash left it open{closes}"
     if bag.path.is_relative_to(bag_dir / MOMENTS_FOLDER):
-        return "it was asked to be kept; delete the moment's folder to forget it"
+        return "it belongs to a saved moment; delete the moment's folder to forget it"
     return None if window.covers(bag.start, bag.end) else "it reaches beyond the window"
 
 
@@ -392,8 +392,8 @@ def _kept_elsewhere(
     linked = _with_other_links(plan.to_delete)
     if linked:
         yield (
-            f"{counted(len(linked), 'bag')} of these under other names too, as in moments that "
-            "were to be kept: delete the moment's folder to forget it"
+            f"{counted(len(linked), 'bag')} of these, also in saved moments or "
+            "under other names: delete the moment's folder to forget it"
         )
 
 

@@ -54,7 +54,7 @@ def index(
     """Index every bag now, so that questions about a week take milliseconds.
 
     Fills the catalogue of the bags, with the settings of the server. The server also does this in
-    the background; the catalogue changes how fast answers are, not what they say.
+    the background; the catalogue changes only the speed of answers.
     """
     settings = load_for(bag_dir, overrides)
     if for_server is None:
@@ -74,8 +74,8 @@ def _fill_for_people(settings: Settings, *, verbose: bool) -> Progress:
     backfill = build_backfill(settings, memory)
     if backfill.catalogue.path is None:
         raise ConfigError(
-            "no catalogue can be written, neither beside the bags nor in the cache folder: "
-            "give XDG_CACHE_HOME a folder that can be"
+            "the catalogue can be written neither beside the bags nor in the cache folder: "
+            "set XDG_CACHE_HOME to a writable folder"
         )
     with progress_bar() as bar:
         task = bar.add_task("", total=None)

@@ -190,7 +190,7 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
         return file.parent, recording
     if bag_kind(file.name) is None:
         kinds = ", ".join(BAG_KINDS)
-        raise InvalidArgumentsError(f"{file} is no bag: their names end in {kinds}")
+        raise InvalidArgumentsError(f"{file} is not a bag: their names end in {kinds}")
     if recording is not None:
         raise InvalidArgumentsError(f"--recording is for a folder, and {file} is one bag")
     real = file.resolve()
@@ -319,7 +319,7 @@ def parse_time(text: str, now: float) -> float:
             date = midnight - timedelta(days=clock[1] == "yesterday")
             return datetime.combine(date, time.fromisoformat(clock[2] or "00:00")).timestamp()
         return unix_from_text(text)
-    raise InvalidArgumentsError(f"{text!r} is no time; write {TIMES}")
+    raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
 
 
 @contextmanager

@@ -169,7 +169,7 @@ def watch(
 
 
 def _observations(memory: Memory, every_s: float, count: int | None) -> Iterator[Observation]:
-    """Yields what there is to see now, and again every so many seconds."""
+    """Yields the current state, now and every so many seconds."""
     for number in itertools.count(1):
         snapshot, wall = memory.index.snapshot(), memory.clock.now()
         status = memory_status(memory, Call())

@@ -55,7 +55,7 @@ class NoDataReason(StrEnum):
 
 
 class NoDataError(EpisodicError):
-    """There is no data; `detail` is a sentence on what there is instead and what to ask.
+    """There is no data; `detail` says what exists instead and what to ask.
 
     `notes` are sentences on what could not be read, and may contain what was asked for.
     """

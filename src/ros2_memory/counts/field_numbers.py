@@ -186,7 +186,7 @@ class FieldReader:
 
 
 _AT_FIRST: Final[Ns] = -1
-"""Stands for the time of the first message."""
+"""A placeholder for the time of the first message."""
 
 
 def _numbers(times: Sequence[Ns], samples: Sequence[Sequence[float]]) -> FieldNumbers:

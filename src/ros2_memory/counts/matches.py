@@ -145,7 +145,7 @@ class _WithoutLabel:
         self._condition = condition
 
     def of(self, group: Group) -> Digested[TopicEvents | None] | None:
-        """Returns events of a group that cannot have the label: whatever is stored of its bags."""
+        """Returns the stored events of a group that cannot have the label."""
         if group.may_be_relatched:
             return None
         builder = TopicEventsBuilder()

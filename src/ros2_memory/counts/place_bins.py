@@ -32,7 +32,7 @@ UNKNOWN: Final = "(unknown)"
 
 
 def place_bins(view: View, window: TimeWindow) -> TimeBins:
-    """Returns the named places as bins: when the robot was in each; notes say what is not known.
+    """Returns the named places as bins: when the robot was in each; notes list unknown times.
 
     Raises:
         InvalidArgumentsError: no place is named in the frame of places.

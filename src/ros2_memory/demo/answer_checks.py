@@ -34,7 +34,7 @@ _SAME_MOMENT_S: Final = 2e-6
 
 
 class WrongAnswerError(Exception):
-    """The answer is wrong; the text says what was expected."""
+    """The answer is wrong; the text has the expected one."""
 
 
 @dataclass(frozen=True, slots=True)

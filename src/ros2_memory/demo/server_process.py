@@ -77,7 +77,7 @@ def running_server(
     """Yields a server that answers, and ends it after the block.
 
     Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
-    into a folder that is removed at the end: nobody else will ask for it.
+    into a folder that is removed at the end: no one else uses it.
 
     Raises:
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.

@@ -129,7 +129,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
     totals = path.totals
     if path.invalid:
         poses = counted(path.invalid, "pose")
-        yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
+        yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
     if path.is_noisy:
         yield (
             f"the positions are noisy: all steps add up to {totals.path_sum_m:.2f} m; "

@@ -80,7 +80,7 @@ class _Truths:
         )
 
     def of(self, extractor: SchemaExtractor, condition: Condition) -> dict[int, bool]:
-        """Returns what is known of a condition, to be added to."""
+        """Returns the stored knowledge about a condition, to be extended."""
         with self._lock:
             known = self._known.setdefault(extractor, OrderedDict())
             question = repr(condition)  # 1 and True are equal, and not the same condition
@@ -145,7 +145,7 @@ class ReverseSearch:
             back_to, budget_s = unix_text(searched_to), self._view.call.deadline.budget_s
             raise QueryTimeoutError(
                 f"no match back to {back_to}, and {budget_s:g} s are over; "
-                f"{self._view.bags.backfill_progress()}to go on from there, ask again with "
+                f"{self._view.bags.backfill_progress()}to continue from there, ask again with "
                 f"before={back_to}",
                 searched_back_to=searched_to,
             ) from error

@@ -166,7 +166,7 @@ def _described(memory: Memory, call: Call) -> Iterator[str]:
         first = mixed[0]
         yield (
             f"robots are mixed: {listed(names)} overlap in time (from "
-            f"{iso_local(first.pair.start)}), each with messages of its own on {first.topic}, but "
+            f"{iso_local(first.pair.start)}), each with different messages on {first.topic}, but "
             f"answers treat them as one robot{ADVICE}"
         )
     contradictions = contradicting_frames(memory, call)

@@ -115,7 +115,7 @@ class Sessions:
         return self._of(self.folder(recording))
 
     def are_joined(self, one: Path, other: Path) -> bool:
-        """Whether two recordings are of one session, whatever they hold."""
+        """Whether two recordings are of one session."""
         if self.of(one) == self.of(other):
             return True
         return other.name in _neighbours(one) or one.name in _neighbours(other)

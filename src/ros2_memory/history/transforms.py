@@ -269,8 +269,8 @@ def children_moving(view: View, among: Session) -> set[str]:
 def edges(view: View) -> tuple[FrameEdge, ...]:
     """Returns every parent and child pair that was recorded, sorted; `static` where published so.
 
-    A pair that was published both ways is in it once, as moving. A pair in which a frame has no
-    name is none to tf2, and left out with a note.
+    A pair that was published in both directions appears once, as moving. A pair with an unnamed
+    frame is invalid in tf2, and is left out with a note.
     """
     limits = view.memory.limits
     pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)

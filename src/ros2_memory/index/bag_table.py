@@ -213,7 +213,7 @@ class BagTable:
             self._classified[path] = self._counted[path] = classification
 
     def _forget(self, paths: Iterable[str]) -> set[str]:
-        """Drops what is known of files; returns those that were classified."""
+        """Drops the state of files; returns those that were classified."""
         forgotten = set()
         for path in paths:
             self._watched.discard(path)

@@ -144,7 +144,7 @@ class ScanContext:
 
 @dataclass(slots=True)
 class FileNotes:
-    """What is known of one bag file, from outside and, as far as it was read, from inside.
+    """One bag file: its metadata and, as far as it was read, its content.
 
     Attributes:
         file: its path as a string, to save memory.

@@ -62,7 +62,7 @@ SLACK_NS: Final = NS_PER_S // 2
 """When a standstill began is known to half a second: what changed by then counts as before."""
 _MOST_CHANGES: Final = 20
 _AFTER_NS: Final = 5 * NS_PER_S
-"""How long after a moment a change is told: what was the cause is often reported late."""
+"""How long after a time changes are listed: causes are often reported late."""
 _MOST_AFTER: Final = 3
 _MAX_LOG_CHARS: Final = 100
 

@@ -124,7 +124,7 @@ def _things(
 
 
 def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
-    """Returns the numbers of the way; None for what is not known."""
+    """Returns the numbers of the path; None for unknown ones."""
     known = drive.known
     if known is None:
         return dict.fromkeys(_LEAST)
@@ -149,7 +149,7 @@ def _placement(view: View) -> MapPlacement | None:
 
 
 class _WaysApart(NamedTuple):
-    """What differs between two ways in space, and the frame of its places."""
+    """The differences between two paths in space, and the frame of their places."""
 
     frame_id: str = ""
     stood: tuple[Standing, ...] = ()
@@ -194,7 +194,7 @@ def _ways_apart(
 
 
 def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther | None:
-    """Returns a point with the place that it is in; None where the ways are one."""
+    """Returns a point with its named place; None where the paths are equal."""
     if point.away_m < _LEAST_APART_M:
         return None
     inside = place_at(places, frame, point.x, point.y)

@@ -249,7 +249,7 @@ def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
 
 
 def _with_way_there(view: View, answer: Recap, window: TimeWindow, there: _There) -> Recap:
-    """Returns a recap with the way in a region, and how often and how long the robot was there."""
+    """Returns a recap with the path in a region, and how often and how long the robot was there."""
     way = driven_way(view, resolve_pose_topic(view), window)
     driven = None if way is None else way.totals(there.spans)
     return replace(

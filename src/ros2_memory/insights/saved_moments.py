@@ -94,8 +94,8 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
         raise RefusedError(unlisted(error)) from error
     if name not in stored:
         near = get_close_matches(name, stored, n=3, cutoff=0.3)
-        hint = f"do you mean {' or '.join(near)}?" if near else f"{len(stored)} are kept"
-        raise InvalidArgumentsError(f"no moment {abbreviate(name)} is kept; {hint}")
+        hint = f"do you mean {' or '.join(near)}?" if near else f"{len(stored)} moments are saved"
+        raise InvalidArgumentsError(f"there is no moment {abbreviate(name)}; {hint}")
     return ShownMoment(stored[name], _now(memory, call))
 
 

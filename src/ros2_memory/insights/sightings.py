@@ -232,7 +232,7 @@ def _collect(
         found.cut = True
         view.notes.complete = False
         view.notes.add(
-            f"the search ran out of time at {unix_text(before)}: to go on, ask with end there"
+            f"the search ran out of time at {unix_text(before)}: to continue, pass that time as end"
         )
         return
     for topic in found.open_topics():

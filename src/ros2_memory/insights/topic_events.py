@@ -121,7 +121,7 @@ def add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMess
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:
-    """Notes what of a topic is not told, since it is too much or cannot be decoded."""
+    """Adds a note on events of a topic that are left out: too many, or undecodable."""
     if events.undecodable:
         messages = counted(events.undecodable, "message")
         view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))

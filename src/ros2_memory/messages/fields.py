@@ -1,4 +1,4 @@
-"""The only attribute walk: a decoded message as named fields, whatever decoder made it.
+"""The only attribute walk: a decoded message of any decoder as named fields.
 
 A message is what rosbags decodes (a dataclass that carries `__msgtype__`, numbers in numpy arrays,
 messages in lists) or a plain JSON value. A dot-path walks it: over a list or an array, a segment

@@ -165,7 +165,7 @@ class ExactJson:
         if isinstance(node, float):
             return self._float(node)
         if depth >= MAX_DEPTH:
-            note = f"{_named(path)}: what lies deeper than {MAX_DEPTH} levels is left out"
+            note = f"{_named(path)}: parts deeper than {MAX_DEPTH} levels are left out"
             self.note("depth", path, note)
             return None
         return self._container(node, path, depth + 1)

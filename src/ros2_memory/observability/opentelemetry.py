@@ -139,7 +139,7 @@ def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerPr
 def traces_from_environment(*, arguments: bool) -> Traces:
     """Sets the provider of this process, which receives the MCP library's spans too.
 
-    The standard `OTEL_*` variables say where spans are sent to, and how. `arguments` is as for
+    The standard `OTEL_*` variables set where and how spans are sent. `arguments` is as for
     `provider_to`.
 
     Raises:

@@ -63,7 +63,7 @@ _OF_SEGMENTS: Final[WeakKeyDictionary[Segment, dict[Topics, dict[str, _Gathered]
 
 @dataclass(slots=True)
 class _OfTimeline:
-    """What is known of a timeline: a new bag makes a new one.
+    """The static transforms of a timeline: a new bag makes a new one.
 
     Attributes:
         folders: the segments with static transforms of each folder.

@@ -119,7 +119,7 @@ class InsideTotals(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DrivenWay:
-    """The drawn way of a window, with the metres driven up to each of its vertices.
+    """The drawn path of a window, with the metres driven up to each of its vertices.
 
     Attributes:
         times: log times, ascending.
@@ -223,14 +223,14 @@ class DrivenWay:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """The way of some bags, and what joins it with those before and after."""
+    """The path of some bags, and what joins it with those before and after."""
 
     way: DrivenWay
     totals: MotionTotals
 
 
 def driven_way(view: View, topic: str, window: TimeWindow) -> DrivenWay | None:
-    """Returns the way by the poses of a topic in a window; None where there is no valid pose.
+    """Returns the path by the poses of a topic in a window; None if there is no valid pose.
 
     A note says how far back it is known where the time was over before all was read.
 
@@ -325,7 +325,7 @@ def _without_parts(row: Sequence[Vertex]) -> tuple[list[Vertex], list[bool]]:
 
 
 def _joined(parts: Sequence[_Part], fastest_mps: float) -> DrivenWay:
-    """Returns the ways of parts in order as one."""
+    """Returns the paths of parts in order as one."""
     motion = Motion(fastest_mps)
     metres: list[Floats] = []
     frames: dict[str, None] = {}

@@ -50,7 +50,7 @@ class RobotPlaces:
     map_frame: str
 
     def at(self, time: Ns) -> tuple[float, float] | None:
-        """Returns where the robot was (m) in `frame_id`; None where the track does not say."""
+        """Returns where the robot was (m) in `frame_id`; None outside the track."""
         if self.frame_id != self.map_frame:
             return None
         return _on_track(self._track, time)

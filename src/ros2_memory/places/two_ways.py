@@ -1,4 +1,4 @@
-"""Two ways of the robot by its tracks: where they are farthest apart, and where it stood in each.
+"""Compares two paths by the robot's tracks: where they are farthest apart, and where it stood.
 
 Both are told in one frame, so they are of use where that is the map, or where odometry did not
 begin anew between the two.
@@ -178,7 +178,7 @@ def placed_stands(
 
 
 def _is_known(track: RobotTrack, at: Times) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Returns whether a track says where the robot was at some times."""
+    """Returns whether a track covers some times."""
     last = np.searchsorted(track.times, at, side="right") - 1
     following = np.minimum(last + 1, len(track.times) - 1)
     before = (last >= 0) & (at - track.times[last] <= SILENCE_NS)

@@ -454,7 +454,7 @@ class _VisitSearch:
         return self._placement.in_poses(held.bag.recording, held.first, self._x, self._y)
 
     def _distance(self, found: StoredMessage, position: Vector3) -> float | None:
-        """Returns how far (m) a pose is from the target; None where no transform tells."""
+        """Returns how far (m) a pose is from the target; None if no transform connects them."""
         recording = found.bag.recording
         target = self._placement.in_poses(recording, found.time, self._x, self._y)
         if target is not None:

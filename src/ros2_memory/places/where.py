@@ -87,7 +87,7 @@ def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
     ends = [_number(each) for each in value] if isinstance(value, list) else []
     if len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
         raise InvalidArgumentsError(
-            f"where: {axis} was {abbreviate(value)}, which is no range [from, to]; {_EXPECTED}"
+            f"where: {axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
         )
     return ends[0], ends[1]
 

@@ -1,4 +1,4 @@
-"""Recording, and what is known of the bag directory."""
+"""Recording, and the state of the bag directory."""
 
 import sys
 

@@ -246,8 +246,8 @@ class Housekeeping(Housekeeper):
         bags = counted(self._collected.held, "bag is", "bags are")
         limit = f"{self._max_age_h:g} h"
         return (
-            f"{bags} older than {limit} (retention.max_age_h) by date, and kept: the clock is not "
-            "known to be right. They are deleted when it is synchronised with a time server "
+            f"{bags} older than {limit} (retention.max_age_h) by date, but not deleted: the clock "
+            "is not known to be right. They are deleted when it is synchronised with a time server "
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
 

@@ -140,7 +140,7 @@ def space_action(
 def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: str) -> str:
     """Describes what a recorder waits for that has received nothing.
 
-    `advice` is on publishers that are subscribed to and not heard.
+    `advice` is for subscriptions that receive nothing.
     """
     if simulated:
         return (

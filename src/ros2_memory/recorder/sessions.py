@@ -74,7 +74,7 @@ class RecordingSessions:
         reader: reads splits that are closed.
         events: where everything is reported.
         own: the list of recordings that were made here.
-        reception: measures closed splits, and is told of publishers that were refused.
+        reception: measures closed splits, and receives the publishers that were refused.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.

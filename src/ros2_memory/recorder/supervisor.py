@@ -294,7 +294,7 @@ class Supervisor:
         self._events.fail(
             "recording_paused",
             f"recording is paused: {free} bytes are free on the disk, and "
-            f"{self._orders.min_free_bytes} are the least (retention.min_free_gb); it resumes "
+            f"{self._orders.min_free_bytes} are required (retention.min_free_gb); it resumes "
             f"by itself at {resume_bytes(self._orders.min_free_bytes)}",
         )
         self._write_heartbeat()

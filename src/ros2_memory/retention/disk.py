@@ -34,7 +34,7 @@ def device_of(directory: Path) -> int:
             return existing.stat().st_dev
         except FileNotFoundError:
             continue
-    raise FileNotFoundError(f"{directory} lies nowhere")
+    raise FileNotFoundError(f"{directory} has no existing parent")
 
 
 class HomeDisk:

@@ -217,7 +217,7 @@ class Eraser:
         return Kept(tuple(kept), tuple(notes))
 
     def _tell(self, erasure: Erasure) -> None:
-        """Has answers say that messages were deleted.
+        """Records the deletion, so that answers report it.
 
         Raises:
             OSError: it cannot be written down.

@@ -1,4 +1,4 @@
-"""Measures how long was recorded since each recording ended, whatever the wall clock did.
+"""Measures the time recorded since each recording ended, independently of the wall clock.
 
 The monotonic clock starts again at every boot, so recorded time is added up and stored in
 `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,

@@ -270,7 +270,7 @@ class MomentKeeper:
                 moment = self._begin(SavedMoment(request), need)
             except OSError as error:
                 refused = (
-                    f"the bags cannot be kept in {moments_of(self._bag_dir)} by hard links: "
+                    f"the bags cannot be saved in {moments_of(self._bag_dir)} by hard links: "
                     f"{error.strerror or error}"
                 )
             else:
@@ -291,7 +291,7 @@ class MomentKeeper:
         most = MAX_MOMENTS // (1 + len(self._rule_bytes))
         if len(group) >= most:
             return (
-                f"there are {len(group)} moments, which is as many as are kept; delete folders in "
+                f"there are {len(group)} moments, the maximum; delete folders in "
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
@@ -311,7 +311,7 @@ class MomentKeeper:
         ]
 
     def _share_of(self, moment: SavedMoment) -> tuple[int, str]:
-        """Returns how much such moments may take together, in bytes, and the key that says so."""
+        """Returns how much such moments may take together, in bytes, and the key that sets it."""
         if moment.rule is not None and moment.rule in self._rule_bytes:
             return self._rule_bytes[moment.rule], f"max_gb of the rule {moment.rule}"
         return max(self._share - sum(self._rule_bytes.values()), 0), _SHARE
@@ -342,7 +342,7 @@ class MomentKeeper:
         try:
             missing, linked = self._link(stored.folder, need.bags, (files, share, key))
         except OSError as error:
-            missing, linked = (f"not all can be kept: {error.strerror or error}",), {}
+            missing, linked = (f"not all can be saved: {error.strerror or error}",), {}
         missing = tuple(dict.fromkeys((*before.missing, *missing, *_holes(before, need))))
         after = replace(before, pending=need.waits, missing=missing)
         files_now = {**stored.files, **linked}
@@ -442,7 +442,7 @@ def _gone(name: str) -> str:
 
 def _used_up(key: str) -> str:
     what = f"the share of moments ({key})" if key == _SHARE else key
-    return f"{what} was used up: only part of the moment is kept"
+    return f"{what} was used up: only part of the moment is saved"
 
 
 def _holes(moment: SavedMoment, need: NeededBags) -> tuple[str, ...]:

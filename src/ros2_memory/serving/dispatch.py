@@ -271,8 +271,8 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     if name in tools:
         return tools[name]
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
-    hint = f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(tools)}"
-    raise InvalidArgumentsError(f"there is no tool {abbreviate(name)}; {hint}")
+    hint = f"do you mean {' or '.join(near)}?" if near else f"the tools are: {', '.join(tools)}"
+    raise InvalidArgumentsError(f"unknown tool {abbreviate(name)}; {hint}")
 
 
 class _Wait:

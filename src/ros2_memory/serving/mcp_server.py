@@ -139,7 +139,7 @@ class EpisodicServer(MCPServer[object]):
         instructions: str,
         catalogue: Callable[[], Progress] | None = None,
     ) -> None:
-        """Makes the server; `catalogue` says how far the catalogue is filled."""
+        """Makes the server; `catalogue` returns how far the catalogue is filled."""
         super().__init__(
             name,
             version=version,
@@ -222,7 +222,7 @@ class EpisodicServer(MCPServer[object]):
             return TOOLS_OF_RESOURCES[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
         known = ", ".join([*offered, *(each.uri_template for each in self._templates)])
-        raise ResourceNotFoundError(f"there is no resource {shown}; what can be read: {known}")
+        raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {known}")
 
     async def _complete(
         self,

@@ -1,6 +1,6 @@
-"""The latest questions with their answers, in memory alone: what the page shows of a planner.
+"""The planner's latest questions with their answers, in memory only, for the page.
 
-Off unless `server.keep_questions` says how many are kept. They go when the server ends.
+Off by default; `server.keep_questions` sets how many are stored.
 """
 
 from __future__ import annotations

@@ -443,4 +443,4 @@ def require_plain_tables(base: sqlite3.Connection) -> None:
     computed = [name for name in _READ if base.execute(_COMPUTED, (name,)).fetchone()[0]]
     if odd or computed:
         name = odd[0][0] if odd else computed[0]
-        raise UnreadableError(f"not a rosbag2 file: its {name} is no plain table")
+        raise UnreadableError(f"not a rosbag2 file: its {name} is not a plain table")

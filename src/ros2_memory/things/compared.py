@@ -137,7 +137,7 @@ class ThingsBetween:
         return "unknown", self._thing(instance, last, None)
 
     def _fresh(self, instance: Instance, after: _Seen) -> tuple[str, ComparedThing | None] | None:
-        """Returns what is known of a thing that was seen in the later window alone."""
+        """Returns the state of a thing that was seen only in the later window."""
         stays = [each for each in instance.stays if each.first < self._earlier.stop]
         if not self._is_there(instance, after) or after.stay.place in {e.place for e in stays}:
             return None

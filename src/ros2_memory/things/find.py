@@ -260,7 +260,7 @@ class _Finder:
         return tuple(sorted(counts, key=lambda each: (-counts[each], each))[:_MOST_NAMES])
 
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere:
-        """Returns what is known of a thing since it was last seen in the window."""
+        """Returns the state of a thing since it was last seen in the window."""
         spots = self.known.estimate.sights.spots
         last = int(spots[rows, Spot.LAST].max())
         if stay.last > last:
@@ -306,13 +306,13 @@ def _notes(
     sights = known.estimate.sights
     if len(known.frames) > 1 + bool(known.frames[0]):
         yield (
-            "without a map, each run of odometry has coordinates of its own: a thing may be listed "
+            "without a map, each run of odometry has its own coordinates: a thing may be listed "
             "once for each run"
         )
     if not sights.topics and known.since is None:
         yield (
-            "nothing is known of things: no message of a detector was found "
-            "(a type such as vision_msgs/msg/Detection3DArray); find_matches finds words in texts"
+            "no things are known: there is no message of a detector "
+            "(a type such as vision_msgs/msg/Detection3DArray); find_matches searches text"
         )
     if label is None or asked is None:
         return

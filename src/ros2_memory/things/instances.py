@@ -108,7 +108,7 @@ class Instance:
     epoch: int
     stays: list[PlacedStay]
     chance: float = 1.0
-    """How likely it is that it is still there, and was missed since; 1 where nobody looked."""
+    """How likely it is that it is still there, and was missed since; 1 without a look."""
     looks: int = 0
     """Detector messages since it was last seen, from where it would have been."""
     missed_by: Ns | None = None
@@ -144,7 +144,7 @@ class Estimate:
     """The name to show of each key."""
     cells: Cells
     evidence: dict[tuple[str, int], dict[int, Evidence]]
-    """By key and epoch: what is known of each place."""
+    """By key and epoch: the evidence for each place."""
 
     def missing(self, instance: Instance, stay: PlacedStay) -> tuple[float, int, Ns | None]:
         """Returns `chance_of_missing` a thing after one of its stays."""

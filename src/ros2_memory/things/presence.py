@@ -153,7 +153,7 @@ def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
 
 
 class Evidence(NamedTuple):
-    """What is known of one place: looks at it, and what of them saw the label there.
+    """The evidence for one place: the looks at it, and those that saw the label there.
 
     Attributes:
         looks: numbers of looks from cells that saw it at least once, in order of time.

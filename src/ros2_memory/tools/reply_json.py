@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.tools.reply_size import JsonObject
 
 LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
-"""What spans no more is told by the clock, or by its age."""
+"""Shorter spans have no local times."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
 

@@ -154,17 +154,20 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
         drawn = sum(point.jump for point in path.waypoints)
         if drawn:
             longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
-            yield f"of the jumps {longest} to a waypoint with jump: true; no way was driven there"
+            yield (
+                f"of the jumps {longest} to a waypoint with jump: true; "
+                "that distance was not driven"
+            )
     if path.poses and path.max_speed_from == "positions":
-        yield "max_speed is measured from positions: the messages state no speed"
+        yield "max_speed is measured from positions: the messages have no speed"
     # By more than the rounding of both.
     if path.avg_speed > path.max_speed + 0.01:
         yield (
-            "avg_speed, by the positions, is above max_speed, which the messages state: "
+            "avg_speed, by the positions, is above max_speed of the messages: "
             "one of the two is wrong"
         )
     if path.waypoint_error_m > FINE_PATH_M:
-        yield f"the path lies within {path.waypoint_error_m:.2f} m of the waypoints' line"
+        yield f"the path is within {path.waypoint_error_m:.2f} m of the waypoints' line"
 
 
 @render.register(results.Visits)

@@ -50,7 +50,7 @@ class ExclusionRule:
 
 
 class HeardRecording(NamedTuple):
-    """What one recording heard of a topic, in the order in which it was written.
+    """The values of a topic in one recording, in the order in which they were written.
 
     `end` is None while it is being written.
     """
@@ -147,7 +147,7 @@ def _unknown(
 
 
 def _valid_until(run: Heard, following: Heard | None, recording: HeardRecording, stale: Ns) -> Ns:
-    """Returns until when a recording itself knows what it heard."""
+    """Returns until when a recording itself knows the value."""
     stop = recording.stop
     if following is not None and following.first >= run.last:
         stop = following.first

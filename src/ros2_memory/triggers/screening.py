@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 MOST_AT_ONCE: Final = 16
 """So many splits are released in one step, which is then written down."""
 DONE_KEPT: Final = 2
-"""Recordings that are done and still tell those after them something."""
+"""Recordings that are done but still matter to later ones."""
 MOST_EXCLUDED: Final = 1000
 """Stretches that are remembered, the newest ones."""
 RETRY_S: Final = 30.0
@@ -254,7 +254,7 @@ class Screening:
             BagError: it cannot be read, or not be written anew.
         """
         if path.suffix != ".mcap" or not summary.complete:
-            raise BagError(str(path), "it is no whole MCAP file")
+            raise BagError(str(path), "it is not a complete MCAP file")
         if summary.empty:
             return
         for rule in self._rules:

@@ -208,7 +208,7 @@ class SplitSearch:
     def _times(
         self, rules: Sequence[Rule], bag: BagFile, topic: str, window: TimeWindow
     ) -> Sequence[Ns]:
-        """Returns when a topic spoke, as far as that can matter to rules."""
+        """Returns the times of a topic's messages, as far as they can matter to rules."""
         spans = [(each.first, each.last) for each in bag.summary.topics if each.topic == topic]
         first, last = min(each[0] for each in spans), max(each[1] for each in spans)
         shortest = min(

@@ -244,7 +244,7 @@ class Triggers:
         return taken
 
     def _note_lacking(self, state: TriggerState) -> None:
-        """Says that bags were deleted before the rules could use them."""
+        """Logs that bags were deleted before the rules could use them."""
         with self._lock:
             bags, self._deleted = self._deleted, 0
         if not bags:
@@ -329,7 +329,7 @@ class Triggers:
         return name in self._reported and abs(at - self._reported[name]) < HOUR_NS
 
     def _judge(self, name: str, state: TriggerState) -> None:
-        """Says once that a rule has matched for so long that it distinguishes nothing."""
+        """Logs once that a rule has matched for too long to be useful."""
         record = state.rules[name]
         runs = [each for each in record.runs.values() if each.fired]
         longest = min(

@@ -114,13 +114,13 @@ def test_without_a_file_the_reason_says_that_nobody_records(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "no heartbeat"),
-        (b"\xff\xfe\x00", "no heartbeat"),
-        (b"{", "no heartbeat"),
+        (b"", "not a valid heartbeat"),
+        (b"\xff\xfe\x00", "not a valid heartbeat"),
+        (b"{", "not a valid heartbeat"),
         (b"[]", "not a JSON object"),
         (b"null", "not a JSON object"),
-        (b"[" * 100_000, "no heartbeat"),
-        (b'{"pid": ' + b"9" * 5000 + b"}", "no heartbeat"),
+        (b"[" * 100_000, "not a valid heartbeat"),
+        (b'{"pid": ' + b"9" * 5000 + b"}", "not a valid heartbeat"),
         (b" " * 2_000_000, "larger than"),
     ],
 )

@@ -112,7 +112,7 @@ def test_what_cannot_be_corrected_is_refused(
 
 
 def test_what_is_no_yaml_is_refused() -> None:
-    with pytest.raises(ValueError, match="no YAML"):
+    with pytest.raises(ValueError, match="not YAML"):
         without("[", {"r_0.mcap": {}})
 
 

@@ -84,7 +84,7 @@ class TestPaths:
         [
             ("gone", "no such file or folder"),
             ("gone=5", "no such file or folder"),
-            ("notes.txt", "is no bag"),
+            ("notes.txt", "is not a bag"),
             ("a b", "one file or fol"),
         ],
     )

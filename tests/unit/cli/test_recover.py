@@ -105,7 +105,7 @@ class TestMetadata:
     @pytest.mark.parametrize(
         ("text", "reason"),
         [
-            ("{", "no YAML"),
+            ("{", "not YAML"),
             ("rosbag2_bagfile_information: {}", "not of plain MCAP files"),
             ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "plain MCAP"),
             (

@@ -189,7 +189,7 @@ def test_a_time_that_occurs_twice_is_the_first_of_the_two(berlin: str) -> None:
 def test_unix_seconds_in_quotes_are_read_where_they_can_be_no_date() -> None:
     assert unix_from_text("1795161600.25") == 1_795_161_600.25
     assert unix_from_text("20261120T080000Z") == 1_795_161_600.0
-    with pytest.raises(ValueError, match="no time"):
+    with pytest.raises(ValueError, match="not a valid time"):
         unix_from_text("20261120")
 
 
@@ -199,7 +199,7 @@ def test_unix_seconds_in_quotes_are_read_where_they_can_be_no_date() -> None:
      "2026-11-20T14:05:03 and later", "٢٠٢٦-11-20", "2026-11-20T14:05\x00", "x" * 100_000],
 )  # fmt: skip
 def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="is no time in ISO 8601, or none that exists"):
+    with pytest.raises(ValueError, match="is not a valid time in ISO 8601"):
         unix_from_text(text)
 
 

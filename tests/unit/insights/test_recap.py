@@ -346,11 +346,13 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
         memory = recalling(replace(memory), tmp_path)
     none = over(memory, 0, 9.95)
     assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
-    assert none.notes == ("100 poses left out: the coordinates are no place (NaN or beyond)",)
+    assert none.notes == (
+        "100 poses left out: their coordinates are not valid (NaN or out of range)",
+    )
     some = over(memory, 10, 30)
     assert some.distance_m == pytest.approx(0.05 * 168, abs=0.06)
     assert some.stood == 0
-    assert "30 poses left out: the coordinates are no place (NaN or beyond)" in some.notes
+    assert "30 poses left out: their coordinates are not valid (NaN or out of range)" in some.notes
     assert any("1 gap without a valid pose" in note for note in some.notes)
     assert not any("nothing was recorded" in note for note in some.notes)
     summary = trajectory_summary(

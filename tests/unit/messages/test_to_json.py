@@ -164,7 +164,7 @@ def test_nesting_beyond_reason_is_cut_with_a_note() -> None:
         node = [node]
     value, notes = shown(node, path="a")
     assert json.dumps(value).count("[") == MAX_DEPTH
-    assert notes == (f"a: what lies deeper than {MAX_DEPTH} levels is left out",)
+    assert notes == (f"a: parts deeper than {MAX_DEPTH} levels are left out",)
     assert json.dumps(exact(node)).count("[") == MAX_DEPTH
 
 

@@ -400,7 +400,7 @@ class TestAdopt:
     def test_a_directory_without_a_bag_is_said(self, tmp_path: Path, capsys: Capture) -> None:
         (tmp_path / "a").mkdir()
         assert cli.main(["adopt", "a"]) == 1
-        assert "no bag files lie there" in capsys.readouterr().out
+        assert "there are no bag files" in capsys.readouterr().out
 
     def test_links_are_neither_adopted_nor_counted(self, tmp_path: Path, capsys: Capture) -> None:
         [target] = foreign(tmp_path, "old/x_0.mcap")
@@ -411,7 +411,7 @@ class TestAdopt:
         (tmp_path / "b" / "old").symlink_to(target.parent)
         assert cli.main(["adopt", "a", "b"]) == 1
         output = capsys.readouterr().out
-        assert "no bag files lie there" in output
+        assert "there are no bag files" in output
         for link in ("a/x_0.mcap", "a/y_0.mcap", "b/old"):
             assert f"{link} is a symbolic link, which is not followed" in output
         assert "adopted" not in output

@@ -140,7 +140,7 @@ async def test_a_resource_that_is_not_offered_is_told_with_those_that_are(tmp_pa
             with pytest.raises(MCPError) as refused:
                 await client.read_resource(uri)
             assert refused.value.error.code == INVALID_PARAMS
-            assert refused.value.error.message.endswith("what can be read: episodic://topics")
+            assert refused.value.error.message.endswith("the resources are: episodic://topics")
             assert len(refused.value.error.message) < 300
 
 
@@ -171,7 +171,7 @@ async def test_what_is_only_read_is_no_tool_and_named_by_none(
     [block] = result.content
     assert isinstance(block, TextContent)
     detail = json.loads(block.text)["detail"]
-    assert f'there is no tool "{name}"' in detail
+    assert f'unknown tool "{name}"' in detail
     assert name not in detail.partition(";")[2]
 
 

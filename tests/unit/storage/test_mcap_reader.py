@@ -294,7 +294,7 @@ class TestIndexesThatAreWrong:
         at = last.chunk_start_offset + last.chunk_length + last.message_index_length
         path.write_bytes(data[:at] + behind)
         assert any(
-            "declares a channel or a type in more than one way" in note
+            "declares a channel or a type twice" in note
             for note in McapReader().summarize(path).notes
         )
 

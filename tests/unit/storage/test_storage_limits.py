@@ -298,14 +298,14 @@ class TestSqlite:
             "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1"
             " FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n",
         )
-        with pytest.raises(BagError, match="its messages is no plain table"):
+        with pytest.raises(BagError, match="its messages is not a plain table"):
             Rosbag2Reader().summarize(path)
 
     def test_a_computed_column_is_refused(self, tmp_path: Path) -> None:
         path = self.edited(
             tmp_path, "ALTER TABLE messages ADD COLUMN more AS (zeroblob(900000000))"
         )
-        with pytest.raises(BagError, match="its messages is no plain table"):
+        with pytest.raises(BagError, match="its messages is not a plain table"):
             Rosbag2Reader().summarize(path)
 
     def test_a_table_of_messages_without_their_columns_is_refused(self, tmp_path: Path) -> None:

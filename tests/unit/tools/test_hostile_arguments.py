@@ -109,7 +109,7 @@ def test_too_many_arguments_are_told_before_any_is_looked_at(
 def test_an_unknown_tool_is_told_in_few_words(dispatcher: Dispatcher, name: str) -> None:
     shown = held(asked(dispatcher, name, {}))
     assert shown["error"] == "invalid_arguments"
-    assert "there is no tool" in shown["detail"]
+    assert "unknown tool" in shown["detail"]
 
 
 def test_a_reversed_window_is_told(dispatcher: Dispatcher) -> None:

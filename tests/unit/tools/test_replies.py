@@ -518,7 +518,7 @@ def test_a_jump_is_marked_at_the_waypoint_it_led_to() -> None:
     assert [point.get("jump") for point in shown["waypoints"]] == [None, True]
     assert shown["notes"] == [
         ("1 jump of 90.00 m in all, faster than is plausible, left out of distance and speed"),
-        "of the jumps each leads to a waypoint with jump: true; no way was driven there",
+        "of the jumps each leads to a waypoint with jump: true; that distance was not driven",
     ]
     shown = said(trajectory(waypoints=waypoints, totals=driven(9, 99.0)))
     assert shown["notes"][1].startswith("of the jumps the longest lead to a waypoint")
@@ -539,7 +539,9 @@ def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
     assert [shown[key] for key in ("distance_m", "avg_speed", "max_speed", "duration_s")] == [
         None
     ] * 4
-    assert shown["notes"] == ["1 pose left out: the coordinates are no place (NaN or beyond)"]
+    assert shown["notes"] == [
+        "1 pose left out: their coordinates are not valid (NaN or out of range)"
+    ]
 
 
 def test_a_mean_above_the_highest_speed_is_told() -> None:

@@ -370,7 +370,7 @@ def test_a_search_that_got_somewhere_says_how_far_the_catalogue_is(bag_dir: Path
     with pytest.raises(QueryTimeoutError) as late:
         queries.find_last_match(memory, call, "/*", "contains", "never")
     assert late.value.searched_back_to is not None
-    assert "has 0 of 3 bags so far: wait for it, or to go on from there" in str(late.value)
+    assert "has 0 of 3 bags so far: wait for it, or to continue from there" in str(late.value)
 
 
 def test_without_a_catalogue_a_shorter_window_is_all_that_is_advised(bag_dir: Path) -> None:

@@ -355,7 +355,7 @@ def test_one_moment_or_several_are_given() -> None:
 def test_what_is_no_time_is_told() -> None:
     told = refusal("get_position_at", timestamp="yesterday")
     assert told == (
-        'timestamp was "yesterday", which is no time in ISO 8601, or none that exists; '
+        'timestamp was "yesterday", which is not a valid time in ISO 8601; '
         "expected Unix seconds or ISO 8601 text, e.g. 1784023200.5"
     )
     assert "is a Fri, not a Wed" in refusal("recap", start="Wed 2026-11-20", end=2e9)

@@ -174,7 +174,7 @@ class StandstillDigest:
 
 @dataclass(frozen=True, slots=True)
 class StandstillRun:
-    """Consecutive bags, joined as far as no bag before or after them has a say.
+    """Consecutive bags, joined as far as no bag before or after them matters.
 
     Attributes:
         lead: the first bags, up to one at whose end no standstill is open; all where there is none.

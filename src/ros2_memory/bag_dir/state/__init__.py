@@ -1,1 +1,1 @@
-"""The files below `.episodic/`: what the recorder remembers, and what it is asked to do."""
+"""The files below `.episodic/`: the recorder's state, and requests to it."""

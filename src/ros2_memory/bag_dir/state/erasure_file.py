@@ -107,7 +107,7 @@ def read_erasure(bag_dir: Path) -> Erasure | None:
 
 
 def write_erasure(bag_dir: Path, erasure: Erasure) -> None:
-    """Says durably what is about to go.
+    """Writes to disk what is about to be deleted.
 
     Raises:
         OSError: it cannot be written.
@@ -118,7 +118,7 @@ def write_erasure(bag_dir: Path, erasure: Erasure) -> None:
 
 
 def remove_erasure(bag_dir: Path) -> None:
-    """Says durably that nothing is left of it.
+    """Removes the file: everything in it is deleted.
 
     Raises:
         OSError: it cannot be removed.

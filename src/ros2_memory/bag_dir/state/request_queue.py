@@ -184,7 +184,7 @@ class RequestQueue:
         self._foreign = foreign
 
     def _delete_left_over(self, names: list[str], now: Ns) -> None:
-        """Deletes answers that nobody fetched, and files that were never finished."""
+        """Deletes answers that were never fetched, and unfinished files."""
         for name in names:
             if _OWN_NAME.fullmatch(name) and name.endswith((".answer", ".tmp")):
                 with suppress(OSError):

@@ -58,7 +58,7 @@ class FileStep(StrEnum):
 
 @dataclass(slots=True)
 class RecordingScreen:
-    """What is known of one recording.
+    """The state of one recording.
 
     Attributes:
         done: nothing of it is held back any more.

@@ -57,7 +57,7 @@ class RuleMoment:
 
 @dataclass(slots=True)
 class RuleRecord:
-    """What is known of one rule.
+    """The state of one rule.
 
     Attributes:
         fired: how often it fired.

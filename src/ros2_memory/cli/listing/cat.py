@@ -90,7 +90,7 @@ def cat(
         raise InvalidArgumentsError("give --limit or --tail, not both")
     if words and Path(topic).exists() and not Path(words[0]).exists():
         raise InvalidArgumentsError(
-            f"the topic comes first: `ros2-memory cat {words[0]} {topic}`; {topic} is no topic"
+            f"the topic comes first: `ros2-memory cat {words[0]} {topic}`; {topic} is not a topic"
         )
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     view = View(memory, Call())

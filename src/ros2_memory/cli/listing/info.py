@@ -207,7 +207,7 @@ def _has_files(snapshot: Snapshot) -> bool:
 
 
 def _for_people(reply: JsonValue) -> dict[str, JsonValue]:
-    """Returns a reply without what is empty, told twice, or of a recorder that is not there."""
+    """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
     row = _with_budget_sentence(reply)
     if not isinstance(row, dict):
         return {}

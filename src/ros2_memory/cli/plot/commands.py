@@ -236,7 +236,7 @@ def _check(out: Path) -> None:
         )
     if out.suffix.lower() not in FORMATS:
         kinds = ", ".join(FORMATS)
-        raise InvalidArgumentsError(f"--out {out} is no picture: its name must end in {kinds}")
+        raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
 
 
 def _finish(picture: "Picture", out: Path, notes: Sequence[str], *, as_json: bool) -> None:

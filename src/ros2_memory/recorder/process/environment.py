@@ -106,13 +106,13 @@ def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
 
 
 def advice_on_silence(env: Mapping[str, str]) -> str:
-    """Returns what to do where publishers are subscribed to and not heard, by the environment.
+    """Returns advice for subscriptions that receive nothing, by the environment.
 
     rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
     FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
     """
     if "fastrtps" not in env.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"):
-        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall lie between?"
+        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
     local = env.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     if local or env.get("ROS_LOCALHOST_ONLY") == "1":
         return (
@@ -126,7 +126,7 @@ def advice_on_silence(env: Mapping[str, str]) -> str:
             "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
             "for the recorder: Fast DDS does not share memory between users"
         )
-    return "do the publishers publish, and does a firewall lie between?"
+    return "do the publishers publish, and does a firewall block DDS?"
 
 
 def find_ros2(env: Mapping[str, str]) -> str:

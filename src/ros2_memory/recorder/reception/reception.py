@@ -1,4 +1,4 @@
-"""Follows how topics arrive, plans their QoS, and says when only a new recording can mend it.
+"""Measures how topics arrive, plans their QoS, and decides when that needs a new recording.
 
 `ros2 bag record` never changes a subscription. So a deeper queue, or a weaker QoS for a publisher
 that came later, takes a rotation. What the splits show is measured beside the recorder's loop.
@@ -169,7 +169,7 @@ class Reception:
     def refused(self, recording: str, topic: str) -> None:
         """Notes that a publisher does not fit how a recording subscribed to the topic.
 
-        What was known of the topic is forgotten: the next recording adapts to its publishers anew.
+        The state of the topic is dropped: the next recording adapts to its publishers again.
         """
         with self._lock:
             known = self._recordings.get(recording)

@@ -65,7 +65,7 @@ _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
 
 class Shown(NamedTuple):
-    """A part of an answer, and what could not be said of it."""
+    """A part of an answer, and the reason if it is incomplete."""
 
     part: JsonObject
     notes: tuple[str, ...] = ()

@@ -360,7 +360,7 @@ class ChunkHead(NamedTuple):
 
 
 CHUNK_HEAD_BYTES: Final = 96
-"""The front of the body of a chunk record: all its fields, whatever its compression is called."""
+"""The front of the body of a chunk record: all its fields, for any compression."""
 _SMALL_BYTES: Final = 48 << 10
 
 

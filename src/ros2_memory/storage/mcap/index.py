@@ -69,7 +69,7 @@ _NEVER: Final = 1 << 64
 
 
 class McapIndex(NamedTuple):
-    """What is known of a file without its payloads.
+    """The index of a file, without its payloads.
 
     Attributes:
         channels: the channels by their number in the file.

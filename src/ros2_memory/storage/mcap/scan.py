@@ -127,7 +127,7 @@ class _Scan:
     def _add_chunk(self, record: FileRecord) -> None:
         opened = self.opener.open(record)
         if opened.content.usable < len(opened.data):
-            self.damaged.append("damaged: a chunk holds something that is no record")
+            self.damaged.append("damaged: a chunk has bytes that are not a record")
         self._add_content(opened.content, record.offset, record.end, None)
 
     def _add_cut_chunk(self, record: FileRecord) -> None:
@@ -185,7 +185,7 @@ class _Scan:
         if differing and not note.startswith(OTHER_DECLARED):
             notes.append(OTHER_DECLARED)
         if self.redeclared:
-            notes.append("it declares a channel or a type in more than one way: the last counts")
+            notes.append("it declares a channel or a type twice, differently: the last one is used")
         return McapIndex(
             channels,
             unshared_bytes(channels),
