@@ -73,9 +73,9 @@ from ros2_memory.insights.field_extremes import (
 )
 from ros2_memory.insights.silences import describe_silences, silences_of
 from ros2_memory.insights.status import (
+    bags_with_remarks,
     clock_faults,
     left_open,
-    odd_bags,
     undecodable_topics,
     undecodable_types,
 )
@@ -592,6 +592,6 @@ def _topics_of(bag: BagFile) -> frozenset[str]:
 
 def _note_odd_bags(view: View) -> None:
     """Notes what is odd about the newest odd bags, but for crashes and wrong clocks."""
-    odd = [(bag, "; ".join(bag.summary.notes)) for bag in odd_bags(view.snapshot)]
+    odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(view.snapshot)]
     for sentence in by_remark(odd, _MAX_ODD_BAGS):
         view.notes.add(sentence)

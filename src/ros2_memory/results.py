@@ -681,7 +681,7 @@ class Pair(NamedTuple):
     other: float | None
 
 
-class Standing(NamedTuple):
+class StandstillPlace(NamedTuple):
     """A place (m) and the named one it is in: seconds for which the robot stood, since when first.
 
     `since` has no time where it did not stand there.
@@ -728,7 +728,7 @@ class Comparison(AnswerWithNotes):
     errors: tuple[tuple[str, Pair], ...]
     silences: tuple[tuple[str, Pair], ...]
     way_frame_id: str = ""
-    stood: tuple[Standing, ...] = ()
+    stood: tuple[StandstillPlace, ...] = ()
     farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
 
 

@@ -68,7 +68,7 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     )
 
 
-def told_exits() -> str:
+def exit_table() -> str:
     """Each command, what it is for, and what its exit codes say."""
     common = "; ".join(f"{code}: {why}" for code, why in COMMON_EXIT_CODES.items())
     rows = [
@@ -79,7 +79,7 @@ def told_exits() -> str:
     return f"{table(columns, rows)}\n\nWhere nothing else is said, {common}."
 
 
-def told_tools(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
+def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
     """Each tool: what it answers, its arguments, a call and the reply."""
     return "\n\n".join(_tool(tool, replies[tool.name]) for tool in tools)
 
@@ -171,7 +171,7 @@ def _kind(schema: Mapping[str, Any]) -> str:
     return " ".join([kind, ", ".join(bounds)]).strip()
 
 
-def told_configuration() -> str:
+def documented_settings() -> str:
     """Every key: what it may hold, its default and what its file says of it."""
     folder = ROOT / "config"
     rows = []
@@ -271,7 +271,7 @@ def _is_log(node: ast.AST) -> bool:
     return name in {"log", "_log", "_events"} or is_own_method
 
 
-def told_events(page: str) -> str:
+def event_table(page: str) -> str:
     """The table of log events; their meaning is what the page says already."""
     written = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]+) \|$", page, re.MULTILINE))
     every = events()

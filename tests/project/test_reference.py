@@ -69,7 +69,7 @@ def test_every_tool_stands_there_with_its_arguments_a_call_and_its_reply(
     answers: Mapping[str, str],
 ) -> None:
     assert list(CALLS) == [tool.name for tool in TOOLS]
-    compare("tools", "tools", reference.told_tools(TOOLS, answers))
+    compare("tools", "tools", reference.tool_sections(TOOLS, answers))
 
 
 @pytest.mark.parametrize("name", sorted(set(CALLS)))
@@ -78,7 +78,7 @@ def test_every_call_that_is_shown_has_an_answer(name: str, answers: Mapping[str,
 
 
 def test_every_key_stands_there_with_its_default_and_what_it_may_hold() -> None:
-    documented = reference.told_configuration()
+    documented = reference.documented_settings()
     named = set(re.findall(r"^\| `([\w.]+)` \|", documented, re.MULTILINE))
     assert named == reference.configured_keys(), "each key in config/ has a comment on its line"
     compare("configuration", "keys", documented)
@@ -106,11 +106,11 @@ def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
 
 
 def test_every_command_stands_there_with_its_exit_codes() -> None:
-    compare("commands", "exits", reference.told_exits())
+    compare("commands", "exits", reference.exit_table())
 
 
 def test_every_log_event_stands_there_with_its_fields() -> None:
-    expected = reference.told_events(page("log-events"))
+    expected = reference.event_table(page("log-events"))
     compare("log-events", "events", expected)
     assert "| ? |" not in expected, "say in docs/reference/log-events.md what the event means"
 

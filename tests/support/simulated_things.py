@@ -12,7 +12,7 @@ from functools import lru_cache
 from random import Random
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.sights import SeenThing, Sights, SightsBuilder
+from ros2_memory.analysis.sights import PlacedDetection, Sights, SightsBuilder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -263,7 +263,7 @@ def _detect(
     pose: tuple[float, float, float],
     drift: Point,
     truth: list[tuple[float, str, Point, int]],
-) -> list[SeenThing]:
+) -> list[PlacedDetection]:
     targets: list[tuple[int, str, Point, float]] = []
     for nth, each in enumerate(things):
         place = each.place_at(time)
@@ -291,5 +291,5 @@ def _detect(
         if number >= 0:
             things[number].detected.append(time)
         truth.append((time, shown, (x, y), number))
-        seen.append(SeenThing(shown, (x, y, z), score))
+        seen.append(PlacedDetection(shown, (x, y, z), score))
     return seen

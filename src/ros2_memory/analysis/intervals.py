@@ -149,7 +149,7 @@ class IntervalTable(NamedTuple):
             chosen |= (rows["first"] <= stop) & (rows["last"] >= start)
         return IntervalTable(self.labels, rows[chosen].tobytes())
 
-    def as_one(self, label: str) -> IntervalTable:
+    def under_one_label(self, label: str) -> IntervalTable:
         """Returns the intervals of all labels under one label; these may overlap."""
         rows = _rows(self.rows).copy()
         rows["label"] = 0

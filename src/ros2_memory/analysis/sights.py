@@ -133,7 +133,7 @@ _TIMES: Final = (
 )
 
 
-class SeenThing(NamedTuple):
+class PlacedDetection(NamedTuple):
     """A detection in the frame of the sights: `place` (m) is None where that is not known."""
 
     label: str
@@ -391,7 +391,7 @@ class SightsBuilder:
         topic: str,
         time: Ns,
         robot: tuple[float, float, float] | None,
-        things: Sequence[SeenThing],
+        things: Sequence[PlacedDetection],
     ) -> None:
         """Adds a message; `robot` is the robot's x, y (m) and yaw (rad), if that is known."""
         number = self._topics.setdefault(topic, len(self._topics))

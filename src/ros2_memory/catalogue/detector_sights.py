@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SeenThing, SightsBuilder, encode_sights
+from ros2_memory.analysis.sights import PlacedDetection, SightsBuilder, encode_sights
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import Detection, detections_of
@@ -158,7 +158,7 @@ class DetectorSights:
                 of_topic.log_times, of_topic.detections, places, *columns, strict=True
             ):
                 seen = [
-                    SeenThing(each.label, place, each.score)
+                    PlacedDetection(each.label, place, each.score)
                     for each, place in zip(found, placed, strict=True)
                 ]
                 builder.add(topic, log_time, (x, y, yaw) if valid else None, seen)

@@ -51,7 +51,7 @@ from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import nothing_here, odd_bags
+from ros2_memory.insights.status import bags_with_remarks, nothing_here
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.retention.policy import GB
@@ -284,7 +284,7 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         files = counted(len(covered.unread), "file is", "files are")
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
         yield _warning("bags", f"{files} not read: {names}", do)
-    if odd := odd_bags(snapshot):
+    if odd := bags_with_remarks(snapshot):
         bags = counted(len(odd), "bag is not whole", "bags are not whole")
         names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
         do = "answers use the readable part; copy the bags again for the rest"

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.time_bins import Held, TimeBins
+    from ros2_memory.counts.time_bins import TimeBins, TrueIntervals
     from ros2_memory.history.view import View
     from ros2_memory.results import BinColumn
 
@@ -105,7 +105,7 @@ class BinnedWindow:
         counts = self.bins.among(times).sum(axis=0)
         self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
-    def add_held(self, held: Held) -> None:
+    def add_held(self, held: TrueIntervals) -> None:
         """Adds how often something began, how long it held, and its first and last time."""
         starts, stops = held.starts.clip(*self._ends), held.stops.clip(*self._ends)
         begins = starts[held.begun]

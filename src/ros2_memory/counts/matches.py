@@ -22,7 +22,7 @@ from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
 from ros2_memory.counts.bins import BinnedWindow
 from ros2_memory.counts.segment_fold import Digested, SegmentFold
-from ros2_memory.counts.time_bins import Held
+from ros2_memory.counts.time_bins import TrueIntervals
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
@@ -92,7 +92,7 @@ def count_matches(
         binned.note_since(since if held is not None else None)
     if held is None:
         spans, since = read_sightings(view, topic, condition, Scope(view, asked, where, during))
-        held = Held.of([(first, last, True) for first, last in spans])
+        held = TrueIntervals.of([(first, last, True) for first, last in spans])
         binned.note_since(since)
     binned.add_held(held)
     return binned.answer()
@@ -100,7 +100,7 @@ def count_matches(
 
 def _by_events(
     binned: BinnedWindow, topic: str, condition: Condition, value: JsonValue
-) -> tuple[Held | None, Ns | None]:
+) -> tuple[TrueIntervals | None, Ns | None]:
     """Returns when a condition held, by the events of a topic, and since when these are known.
 
     None where events do not show it.
@@ -195,7 +195,7 @@ def _note_limits(view: View, topic: str, folded: Folded[TopicEvents]) -> None:
         view.notes.add(f"messages of {topic} that could not be decoded: {undecodable}")
 
 
-def _label_held(folded: Folded[TopicEvents], condition: Condition) -> Held | None:
+def _label_held(folded: Folded[TopicEvents], condition: Condition) -> TrueIntervals | None:
     """Returns when a thing with a label was in view; None where there are no labels at all."""
     if not any(each.visible.labels for each in folded.parts):
         return None
@@ -205,13 +205,13 @@ def _label_held(folded: Folded[TopicEvents], condition: Condition) -> Held | Non
         if each.first <= each.last
     ]
     seen = joined(parts).visible.intervals()
-    return Held.of([(each.first, each.last, True) for each in seen])
+    return TrueIntervals.of([(each.first, each.last, True) for each in seen])
 
 
 def _of_label(visible: IntervalTable, condition: Condition) -> IntervalTable:
     """Returns the intervals of all labels that meet a condition, as those of one label."""
     others = [label for label in visible.labels if not condition.test.matches(label)]
-    return visible.without(others).as_one("")
+    return visible.without(others).under_one_label("")
 
 
 def _flag_held(
@@ -220,7 +220,7 @@ def _flag_held(
     gaps: Sequence[tuple[Ns, Ns]],
     *,
     wanted: bool,
-) -> Held | None:
+) -> TrueIntervals | None:
     """Returns when a boolean held; None where it is not clear which boolean is meant."""
     builder = TopicEventsBuilder()
     for part in folded.parts:
@@ -228,12 +228,12 @@ def _flag_held(
             builder.join(replace(part, visible=IntervalTable(), errors=()))
     events = builder.events()
     if events is None:
-        return Held.of([])
+        return TrueIntervals.of([])
     meant = [each for each in events.known if condition.field in {None, each.path}]
     if len(meant) != 1:
         return None
     spans = _spans_of(events, meant[0], wanted=wanted)
-    return Held.of([part for each in spans for part in _without_gaps(*each, gaps)])
+    return TrueIntervals.of([part for each in spans for part in _without_gaps(*each, gaps)])
 
 
 def _spans_of(

@@ -185,8 +185,8 @@ def _name(key: int, by: ClockBin) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
-    """Times in which something held, in order.
+class TrueIntervals:
+    """Intervals in which something was true, in order.
 
     Attributes:
         starts: when each began.
@@ -199,7 +199,7 @@ class Held:
     begun: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> Held:
+    def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> TrueIntervals:
         """Returns them of tuples."""
         starts, stops, begun = zip(*spans, strict=True) if spans else ((), (), ())
         return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))

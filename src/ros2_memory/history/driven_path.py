@@ -135,7 +135,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
             f"the positions are noisy: all steps add up to {totals.path_sum_m:.2f} m; "
             "distance_m leaves out what noise adds"
         )
-    if totals.in_doubt:
+    if totals.is_uncertain:
         yield (
             "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "
             "of the steps: distance_m may be too long, because noise cannot be removed"

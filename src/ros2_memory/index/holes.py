@@ -62,8 +62,8 @@ def _rounded(period: Ns) -> Ns:
     return round(float(np.exp2(part / _PARTS_OF_AN_OCTAVE)))
 
 
-def stretched(bags: Sequence[BagFile], rates: Rates) -> Iterator[SuspectedHole]:
-    """Yields the bags in which all of these topics that go through them lack messages."""
+def bags_with_holes(bags: Sequence[BagFile], rates: Rates) -> Iterator[SuspectedHole]:
+    """Yields the bags in which all of these topics have a hole, if they go through the bag."""
     groups: dict[int, list[BagFile]] = {}
     for bag in bags:
         groups.setdefault(id(bag.summary.schema), []).append(bag)

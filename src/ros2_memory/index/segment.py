@@ -15,7 +15,7 @@ import numpy as np
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import between, stretched
+from ros2_memory.index.holes import bags_with_holes, between
 from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
 
@@ -291,7 +291,7 @@ class Segment:
         """Returns where no topic may have a message, by the usual rates of some topics."""
         known = self._suspected
         if known is None or known[0] != rates:
-            known = rates, (*stretched(self.bags, rates), *between(self.bags, rates))
+            known = rates, (*bags_with_holes(self.bags, rates), *between(self.bags, rates))
             self._suspected = known
         return known[1]
 

@@ -22,9 +22,9 @@ from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, track_in
-from ros2_memory.places.two_ways import farthest_apart, placed_stands, stood_at
+from ros2_memory.places.two_paths import farthest_apart, placed_stands, stood_at
 from ros2_memory.places.where import parse_where, times_inside
-from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, Standing
+from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.insights.drive import Drive
     from ros2_memory.places.map_placement import MapPlacement
-    from ros2_memory.places.two_ways import FarPoint
+    from ros2_memory.places.two_paths import FarPoint
     from ros2_memory.places.where import Where
 
 _SHARE: Final = 0.1
@@ -80,7 +80,7 @@ def compare(
     placement = _placement(view)
     elapsed = [each.elapsed for each in drives]
     places = _places(view, placement, windows, region, elapsed)
-    apart = _ways_apart(view, placement, drives, windows, region)
+    apart = _paths_apart(view, placement, drives, windows, region)
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
     for each in windows:
         note_unread(view, each)
@@ -152,11 +152,11 @@ class _WaysApart(NamedTuple):
     """The differences between two paths in space, and the frame of their places."""
 
     frame_id: str = ""
-    stood: tuple[Standing, ...] = ()
+    stood: tuple[StandstillPlace, ...] = ()
     farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
 
 
-def _ways_apart(
+def _paths_apart(
     view: View,
     placement: MapPlacement | None,
     drives: Sequence[Drive],
@@ -181,12 +181,12 @@ def _ways_apart(
         [*placed_stands(track, ((each.start, each.end) for each, _ in drive.standstills), region)]
         for track, drive in zip(tracks, drives, strict=True)
     ]
-    stood: list[Standing] = []
+    stood: list[StandstillPlace] = []
     for at in stood_at(*stands):
         this, other = (unix_from_ns(each) for each in at.durations)
         if differ(this, other, _LEAST["stood_s"]):
             inside = place_at(places, frame, at.x, at.y)
-            stood.append(Standing((at.x, at.y), inside, Pair(this, other), at.since))
+            stood.append(StandstillPlace((at.x, at.y), inside, Pair(this, other), at.since))
     stood.sort(key=lambda each: -abs((each.seconds.this or 0.0) - (each.seconds.other or 0.0)))
     points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
     one, two = (None if each is None else _far(places, frame, each) for each in points)

@@ -72,7 +72,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         moments=moments,
         problems=(
             *problems_of(snapshot, heartbeat, wall),
-            *lacking_in(view),
+            *missing_data(view),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
         notes=(
@@ -109,8 +109,8 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield heartbeat.held_back
 
 
-def lacking_in(view: View) -> Iterator[str]:
-    """Yields what is known to be missing from answers, each with its count.
+def missing_data(view: View) -> Iterator[str]:
+    """Yields the kinds of data known to be missing from answers, each with its count.
 
     Damaged files and a directory that cannot be read are among `problems_of`.
     """
@@ -123,7 +123,7 @@ def lacking_in(view: View) -> Iterator[str]:
     if snapshot.unread:
         files = counted(len(snapshot.unread), "file is not read", "files are not read")
         yield f"{files}; data_time_range says why"
-    if odd := len(odd_bags(snapshot)):
+    if odd := len(bags_with_remarks(snapshot)):
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} not whole or contradictory; data_time_range says how"
     yield from describe_absent(absent_splits(snapshot, view.memory.index.bag_dir))
@@ -196,7 +196,7 @@ def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
     )
 
 
-def odd_bags(snapshot: Snapshot) -> list[BagFile]:
+def bags_with_remarks(snapshot: Snapshot) -> list[BagFile]:
     """Returns the bags with remarks other than on a crash or a clock, in bag order."""
     bags = snapshot.timeline.faulty(TimeWindow.everything())
     return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]

@@ -104,8 +104,10 @@ class MapPlacement:
         pose = self._pose(recording, time)
         return None if pose is None else transform_point(pose, position)
 
-    def in_poses(self, recording: Path, at: Ns, x: float, y: float) -> tuple[float, float] | None:
-        """Returns a place of the plane (m) in the own frame of a recording's poses.
+    def to_pose_frame(
+        self, recording: Path, at: Ns, x: float, y: float
+    ) -> tuple[float, float] | None:
+        """Transforms a point (m) from the map into the frame of a recording's poses.
 
         None where that frame moves in its session, or is tilted.
         """

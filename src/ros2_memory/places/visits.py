@@ -451,12 +451,12 @@ class _VisitSearch:
 
     def _target_in(self, held: BagSpan) -> tuple[float, float] | None:
         """Returns the target in the frame of a bag's poses; None where that frame moves."""
-        return self._placement.in_poses(held.bag.recording, held.first, self._x, self._y)
+        return self._placement.to_pose_frame(held.bag.recording, held.first, self._x, self._y)
 
     def _distance(self, found: StoredMessage, position: Vector3) -> float | None:
         """Returns how far (m) a pose is from the target; None if no transform connects them."""
         recording = found.bag.recording
-        target = self._placement.in_poses(recording, found.time, self._x, self._y)
+        target = self._placement.to_pose_frame(recording, found.time, self._x, self._y)
         if target is not None:
             return _away(position, target)
         placed = self._placement.of(recording, found.time, position)

@@ -209,14 +209,14 @@ class Eraser:
             for path in files:
                 self._remove_leftover(path)
             forgotten(erasure)
-            self._tell(erasure)
+            self._record_deletion(erasure)
             if not kept:
                 remove_erasure(self._bag_dir)
         except (EpisodicError, OSError) as error:
             kept.append(_reason_of(error))
         return Kept(tuple(kept), tuple(notes))
 
-    def _tell(self, erasure: Erasure) -> None:
+    def _record_deletion(self, erasure: Erasure) -> None:
         """Records the deletion, so that answers report it.
 
         Raises:

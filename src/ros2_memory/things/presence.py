@@ -104,8 +104,8 @@ class Cells:
         found = np.flatnonzero(known[self.cell])
         return found, (np.cumsum(known) - 1)[self.cell[found]]
 
-    def in_vain_again(self, looks: Ints, hits: Ints) -> Flags:
-        """Returns which looks without a hit go on where the one before looked in vain.
+    def repeated_misses(self, looks: Ints, hits: Ints) -> Flags:
+        """Returns which looks without a hit repeat the previous one, which had none either.
 
         `looks` are as of `looks_like`; the one before, from the same cell, is no older than the
         bag before.
@@ -252,7 +252,7 @@ def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
     odds = np.where(evidence.fair, n * for_miss[cell], 0.0)
     own = hits * for_hit[cell[hit]] + (n[hit] - hits) * for_miss[cell[hit]]
     odds[hit] = np.where(evidence.fair[hit], own, own.clip(_LEAST_BLIND))
-    again = cells.in_vain_again(looks, evidence.hits)
+    again = cells.repeated_misses(looks, evidence.hits)
     np.multiply(odds, _STANDING, out=odds, where=again)
     by_bag = np.bincount(at, odds, len(bags))
     messages = np.bincount(at[hit], n[hit], len(bags))

@@ -136,7 +136,7 @@ def _compared(answer: results.Comparison, most: int) -> JsonObject:
         "duration_s": _pair(answer.lengths, 1),
         "recorded_s": _pair(answer.recorded, 1),
     }
-    things, way = _compared_things(answer.things, most), _ways_apart(answer, most)
+    things, way = _compared_things(answer.things, most), _paths_apart(answer, most)
     frames = [answer.frame_id or None] * bool(things) + [answer.way_frame_id] * bool(way)
     if frames:
         reply["frame_id"] = frames[0]
@@ -161,7 +161,7 @@ def _compared(answer: results.Comparison, most: int) -> JsonObject:
     return reply
 
 
-def _ways_apart(answer: results.Comparison, most: int) -> JsonObject:
+def _paths_apart(answer: results.Comparison, most: int) -> JsonObject:
     reply: JsonObject = {}
     _list(reply, "stood_at", [_standing(each) for each in answer.stood], most)
     far: JsonObject = {}
@@ -206,7 +206,7 @@ def _compared_mover(mover: results.ComparedMover) -> JsonObject:
     return reply
 
 
-def _standing(stood: results.Standing) -> JsonObject:
+def _standing(stood: results.StandstillPlace) -> JsonObject:
     reply = {**_point(stood.place, stood.inside), **_pair(stood.seconds, 0)}
     for key, since in zip(("this_since", "with_since"), stood.since, strict=True):
         if since is not None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.bag_dir.state.screened_file import Excluded, Heard
+from ros2_memory.bag_dir.state.screened_file import ConditionInterval, Excluded
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.spans import lies_inside, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -49,7 +49,7 @@ class ExclusionRule:
     excludes_unknown: bool = True
 
 
-class HeardRecording(NamedTuple):
+class RecordingConditions(NamedTuple):
     """The values of a topic in one recording, in the order in which they were written.
 
     `end` is None while it is being written.
@@ -57,7 +57,7 @@ class HeardRecording(NamedTuple):
 
     start: Ns
     end: Ns | None
-    heard: Sequence[Heard]
+    heard: Sequence[ConditionInterval]
     unclear: Sequence[tuple[Ns, Ns]] = ()
 
     @property
@@ -66,8 +66,10 @@ class HeardRecording(NamedTuple):
         return MAX_NS if self.end is None else self.end + 1
 
 
-def hear(heard: list[Heard], time: Ns, holds: bool | None, *, latched: bool, stale: Ns) -> None:
-    """Takes the next message; `holds` is None where it cannot be read.
+def add_message(
+    heard: list[ConditionInterval], time: Ns, holds: bool | None, *, latched: bool, stale: Ns
+) -> None:
+    """Adds the next message; `holds` is None if it cannot be read.
 
     A message that lies before the last one was logged out of order, and changes nothing unless the
     condition holds.
@@ -88,11 +90,13 @@ def hear(heard: list[Heard], time: Ns, holds: bool | None, *, latched: bool, sta
     ):
         last.last = time
     else:
-        heard.append(Heard(time, time, holds, latched))
+        heard.append(ConditionInterval(time, time, holds, latched))
 
 
-def excluded_stretches(rule: ExclusionRule, recordings: Sequence[HeardRecording]) -> list[Excluded]:
-    """Returns of which stretches nothing stays, with the margin, in order of time.
+def excluded_intervals(
+    rule: ExclusionRule, recordings: Sequence[RecordingConditions]
+) -> list[Excluded]:
+    """Returns the intervals to cut out, with the margin, in order of time.
 
     Those in which the condition held, and those in which it was not known, are apart, and may
     overlap. Recordings come in the order in which they began; one that begins before the one before
@@ -127,7 +131,7 @@ def excluded_stretches(rule: ExclusionRule, recordings: Sequence[HeardRecording]
 
 
 def _unknown(
-    recordings: Sequence[HeardRecording], held: Spans, free: Sequence[Spans]
+    recordings: Sequence[RecordingConditions], held: Spans, free: Sequence[Spans]
 ) -> Iterator[tuple[Ns, Ns]]:
     """Yields where recordings did not know, by themselves or by others, whether it holds."""
     for at, each in enumerate(recordings):
@@ -146,7 +150,12 @@ def _unknown(
         yield from without([(each.start, each.stop)], united(known))
 
 
-def _valid_until(run: Heard, following: Heard | None, recording: HeardRecording, stale: Ns) -> Ns:
+def _valid_until(
+    run: ConditionInterval,
+    following: ConditionInterval | None,
+    recording: RecordingConditions,
+    stale: Ns,
+) -> Ns:
     """Returns until when a recording itself knows the value."""
     stop = recording.stop
     if following is not None and following.first >= run.last:
@@ -157,12 +166,12 @@ def _valid_until(run: Heard, following: Heard | None, recording: HeardRecording,
     return stop if run.lasts else min(stop, run.last + stale)
 
 
-def _is_taken_over(ended: HeardRecording, others: Iterable[HeardRecording]) -> bool:
+def _is_taken_over(ended: RecordingConditions, others: Iterable[RecordingConditions]) -> bool:
     """Returns whether another recording ran when one ended."""
     return any(ended.start <= each.start < ended.stop < each.stop for each in others)
 
 
-def _carried(ended: HeardRecording, others: Iterable[HeardRecording], stale: Ns) -> Spans:
+def _carried(ended: RecordingConditions, others: Iterable[RecordingConditions], stale: Ns) -> Spans:
     """Returns where a condition that held at the end of a recording goes on after it."""
     spans: Spans = []
     until: Ns | None = None

@@ -23,8 +23,8 @@ from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE, bag_kind, named_start
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state.screened_file import (
+    ConditionInterval,
     FileStep,
-    Heard,
     RecordingScreen,
     ScreenState,
     read_screen_state,
@@ -46,10 +46,10 @@ from ros2_memory.retention.rewriting import left_in, rewritten
 from ros2_memory.storage.base import Closing
 from ros2_memory.triggers.exclusion import (
     Cut,
-    HeardRecording,
+    RecordingConditions,
     add_excluded,
-    excluded_stretches,
-    hear,
+    add_message,
+    excluded_intervals,
 )
 from ros2_memory.triggers.splits import LEAST_NEAR_NS
 
@@ -234,7 +234,7 @@ class Screening:
                 for heard in screen.heard.values():
                     if heard and not heard[-1].holds:
                         at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)
-                        heard.append(Heard(at, at, None))
+                        heard.append(ConditionInterval(at, at, None))
                 screen.files[path.name] = FileStep.UNREADABLE
                 self._report(path, error)
         return found
@@ -262,7 +262,7 @@ class Screening:
             for record in self._reader.records(path, (rule.topic,), TimeWindow.everything()):
                 holds = self._test(rule, record)
                 latched = record.channel.latched
-                hear(heard, record.log_time, holds, latched=latched, stale=rule.stale)
+                add_message(heard, record.log_time, holds, latched=latched, stale=rule.stale)
         # Latched messages may be written again with the times that they had.
         start = min((each.first for each in summary.topics if not each.latched), default=MAX_NS)
         is_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
@@ -329,7 +329,7 @@ class Screening:
         found: list[Excluded] = []
         for rule in self._rules:
             recordings = [
-                HeardRecording(
+                RecordingConditions(
                     each.start,
                     None if name in live else each.end,
                     each.heard.get(rule.name, ()),
@@ -338,7 +338,7 @@ class Screening:
                 for name, each in state.recordings.items()
                 if each.start is not None
             ]
-            found += excluded_stretches(rule, recordings)
+            found += excluded_intervals(rule, recordings)
         return found
 
     def _cut(self, ready: _Ready, state: ScreenState, live: Collection[str]) -> list[Excluded]:

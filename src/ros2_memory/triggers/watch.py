@@ -280,7 +280,7 @@ class Triggers:
             self._refuse(rule.name, record, f"{MOST_WAITING} of its moments wait to be stored")
             return
         record.begun.append(firing.at)
-        if not self._said_lately(rule.name, firing.at):
+        if not self._was_logged_recently(rule.name, firing.at):
             record.problem = None
         number = uuid.uuid5(uuid.NAMESPACE_OID, f"{rule.name}/{firing.topic}/{firing.at}").hex
         record.newest.append(RuleMoment(number, window.start, window.stop))
@@ -319,12 +319,12 @@ class Triggers:
     def _report(self, name: str, record: RuleRecord, problem: str) -> None:
         """Notes why a rule keeps nothing, and logs it once for as long as that goes on."""
         at = record.last_fired or 0
-        if record.problem != problem or not self._said_lately(name, at):
+        if record.problem != problem or not self._was_logged_recently(name, at):
             _log.warning("trigger_not_kept", rule=name, reason=problem)
         record.problem = problem
         self._reported[name] = at
 
-    def _said_lately(self, name: str, at: Ns) -> bool:
+    def _was_logged_recently(self, name: str, at: Ns) -> bool:
         """Whether a problem was noted in the hour before a rule fired."""
         return name in self._reported and abs(at - self._reported[name]) < HOUR_NS
 

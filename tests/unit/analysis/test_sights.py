@@ -11,8 +11,8 @@ from ros2_memory.analysis.sights import (
     Beside,
     Hit,
     Look,
+    PlacedDetection,
     Score,
-    SeenThing,
     Sights,
     SightsBuilder,
     Spot,
@@ -29,7 +29,7 @@ SECOND = 10**9
 
 
 def sights_of(
-    *messages: list[SeenThing], robot: tuple[float, float, float] | None = HERE
+    *messages: list[PlacedDetection], robot: tuple[float, float, float] | None = HERE
 ) -> Sights:
     builder = SightsBuilder()
     for nth, things in enumerate(messages):
@@ -37,8 +37,8 @@ def sights_of(
     return builder.sights()
 
 
-def mug(x: float, y: float = 0.0, score: float | None = None) -> SeenThing:
-    return SeenThing("mug", (x, y, 0.7), score)
+def mug(x: float, y: float = 0.0, score: float | None = None) -> PlacedDetection:
+    return PlacedDetection("mug", (x, y, 0.7), score)
 
 
 def test_detections_that_lie_together_are_one_spot_at_their_mean() -> None:
@@ -92,7 +92,9 @@ def test_without_a_pose_of_the_robot_a_detection_counts_and_no_look_does() -> No
 
 
 def test_detections_without_a_place_are_counted_apart() -> None:
-    found = sights_of([SeenThing("mug", None)], [SeenThing("mug", (math.inf, 0, 0)), mug(1.0)])
+    found = sights_of(
+        [PlacedDetection("mug", None)], [PlacedDetection("mug", (math.inf, 0, 0)), mug(1.0)]
+    )
     assert found.spots[:, Spot.N].tolist() == [1]
     assert found.unplaced[:, Unplaced.N].tolist() == [2]
 
@@ -104,7 +106,7 @@ def test_scores_are_counted_in_bins_and_the_best_is_kept() -> None:
 
 
 def test_other_labels_beside_a_detection_of_the_same_message_are_counted() -> None:
-    cup = SeenThing("cup", (1.2, 0.0, 0.7))
+    cup = PlacedDetection("cup", (1.2, 0.0, 0.7))
     found = sights_of([mug(1.0), cup], [mug(1.0)], [cup, mug(3.0)])
     by_spot = {
         (
@@ -123,10 +125,10 @@ def test_what_moves_through_a_bag_makes_a_bounded_number_of_spots() -> None:
 
 
 def test_joined_sights_name_bags_topics_and_labels_once() -> None:
-    one = sights_of([mug(1.0), SeenThing("cup", (3, 0, 0))])
+    one = sights_of([mug(1.0), PlacedDetection("cup", (3, 0, 0))])
     builder = SightsBuilder()
     builder.add("/other", 5, HERE, [])
-    builder.add("/detections", 7, HERE, [SeenThing("cup", (3, 0, 0)), mug(1.0)])
+    builder.add("/detections", 7, HERE, [PlacedDetection("cup", (3, 0, 0)), mug(1.0)])
     both = joined([one, builder.sights()])
     assert both.topics == ("/detections", "/other")
     assert both.labels == ("mug", "cup")
@@ -138,7 +140,7 @@ def test_joined_sights_name_bags_topics_and_labels_once() -> None:
 
 coordinates = st.floats(-20, 20, allow_nan=False)
 things = st.builds(
-    SeenThing,
+    PlacedDetection,
     st.sampled_from(["mug", "Mug", "cup"]),
     st.none() | st.tuples(coordinates, coordinates, coordinates),
     st.none() | st.floats(0, 1),
@@ -154,7 +156,9 @@ messages = st.lists(
 )
 
 
-def built(bag: list[tuple[str, int, tuple[float, float, float] | None, list[SeenThing]]]) -> Sights:
+def built(
+    bag: list[tuple[str, int, tuple[float, float, float] | None, list[PlacedDetection]]],
+) -> Sights:
     builder = SightsBuilder()
     for topic, time, robot, seen in bag:
         builder.add(topic, time, robot, seen)
@@ -162,16 +166,18 @@ def built(bag: list[tuple[str, int, tuple[float, float, float] | None, list[Seen
 
 
 @given(messages)
-def test_sights_survive_being_stored(bag: list[tuple[str, int, None, list[SeenThing]]]) -> None:
+def test_sights_survive_being_stored(
+    bag: list[tuple[str, int, None, list[PlacedDetection]]],
+) -> None:
     sights = built([*bag])
     assert decode_sights(encode_sights(sights)) == sights
 
 
 @given(messages, messages, messages)
 def test_joining_is_associative(
-    a: list[tuple[str, int, None, list[SeenThing]]],
-    b: list[tuple[str, int, None, list[SeenThing]]],
-    c: list[tuple[str, int, None, list[SeenThing]]],
+    a: list[tuple[str, int, None, list[PlacedDetection]]],
+    b: list[tuple[str, int, None, list[PlacedDetection]]],
+    c: list[tuple[str, int, None, list[PlacedDetection]]],
 ) -> None:
     one, two, three = built([*a]), built([*b]), built([*c])
     assert joined([joined([one, two]), three]) == joined([one, joined([two, three])])
@@ -180,7 +186,7 @@ def test_joining_is_associative(
 
 @given(st.lists(messages, max_size=5))
 def test_stored_bags_are_decoded_together_as_they_are_joined_one_by_one(
-    bags: list[list[tuple[str, int, None, list[SeenThing]]]],
+    bags: list[list[tuple[str, int, None, list[PlacedDetection]]]],
 ) -> None:
     every = [built([*bag]) for bag in bags]
     found, which, frames = decode_joined([encode_sights(each) for each in every])

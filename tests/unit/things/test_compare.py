@@ -20,7 +20,7 @@ from ros2_memory.results import (
     FarFromOther,
     MoverSeen,
     Pair,
-    Standing,
+    StandstillPlace,
     ThingStay,
 )
 from ros2_memory.tools.reply_json import render
@@ -289,7 +289,7 @@ def test_a_comparison_is_cut_to_6_kb_however_much_differs() -> None:
         errors=many,
         silences=many,
         way_frame_id="odom",
-        stood=(Standing(point.place, name, pair, (at, at)),) * 20,
+        stood=(StandstillPlace(point.place, name, pair, (at, at)),) * 20,
         farthest=(point, point),
         notes=("a note " * 50,) * 3,
     )

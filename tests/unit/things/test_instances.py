@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.sights import SeenThing, Sights, SightsBuilder, Spot, joined
+from ros2_memory.analysis.sights import PlacedDetection, Sights, SightsBuilder, Spot, joined
 from ros2_memory.things.instances import Estimate, estimate, most_at_once
 from ros2_memory.things.labels import Labels
 from tests.support.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
@@ -169,15 +169,19 @@ def test_people_are_tracks_and_no_places() -> None:
         assert most_at_once(result.sights.spots[result.movers[0].spots]) in {2, 3}
 
 
-def bag_of(*messages: tuple[tuple[float, float, float], list[SeenThing]], start: int = 0) -> Sights:
+def bag_of(
+    *messages: tuple[tuple[float, float, float], list[PlacedDetection]], start: int = 0
+) -> Sights:
     builder = SightsBuilder()
     for nth, (robot, things) in enumerate(messages):
         builder.add("/detections", (start + nth) * 10**9, robot, things)
     return builder.sights()
 
 
-def seen_at(x: float, y: float, label: str = "mug", score: float | None = None) -> list[SeenThing]:
-    return [SeenThing(label, (x, y, 0.7), score)]
+def seen_at(
+    x: float, y: float, label: str = "mug", score: float | None = None
+) -> list[PlacedDetection]:
+    return [PlacedDetection(label, (x, y, 0.7), score)]
 
 
 def test_a_thing_that_was_not_looked_for_since_is_not_missed() -> None:

@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import parse_condition
-from ros2_memory.bag_dir.state.screened_file import Excluded, Heard
+from ros2_memory.bag_dir.state.screened_file import ConditionInterval, Excluded
 from ros2_memory.core.spans import lies_inside, united, without
 from ros2_memory.triggers.exclusion import (
     Cut,
     ExclusionRule,
-    HeardRecording,
+    RecordingConditions,
     add_excluded,
-    excluded_stretches,
-    hear,
+    add_message,
+    excluded_intervals,
 )
 
 if TYPE_CHECKING:
@@ -46,11 +46,11 @@ def rule(*, margin: int = 0, excludes_unknown: bool = True) -> ExclusionRule:
     )
 
 
-def heard_by(past: Past, *, latched: bool) -> HeardRecording:
-    heard: list[Heard] = []
+def heard_by(past: Past, *, latched: bool) -> RecordingConditions:
+    heard: list[ConditionInterval] = []
     for time, holds in past.said:
-        hear(heard, time, holds, latched=latched, stale=STALE)
-    return HeardRecording(past.start, None if past.live else past.end, heard)
+        add_message(heard, time, holds, latched=latched, stale=STALE)
+    return RecordingConditions(past.start, None if past.live else past.end, heard)
 
 
 def knows(past: Past, time: int, *, latched: bool) -> bool | None:
@@ -110,7 +110,7 @@ def histories(draw: st.DrawFn) -> list[Past]:
 def test_nothing_stays_while_it_holds_or_is_not_known(
     pasts: list[Past], latched: bool, unknown: bool, margin: int
 ) -> None:
-    stretches = excluded_stretches(
+    stretches = excluded_intervals(
         rule(margin=margin, excludes_unknown=unknown),
         [heard_by(past, latched=latched) for past in pasts],
     )
@@ -131,24 +131,24 @@ def test_nothing_stays_while_it_holds_or_is_not_known(
 
 
 def test_a_value_out_of_order_only_adds() -> None:
-    heard: list[Heard] = []
+    heard: list[ConditionInterval] = []
     for time, holds in ((1, False), (5, False), (4, True), (6, False), (5, False)):
-        hear(heard, time, holds, latched=True, stale=STALE)
-    recording = HeardRecording(0, 9, heard)
-    assert excluded_stretches(rule(), [recording]) == [Excluded(4, 6, True), Excluded(0, 1, False)]
+        add_message(heard, time, holds, latched=True, stale=STALE)
+    recording = RecordingConditions(0, 9, heard)
+    assert excluded_intervals(rule(), [recording]) == [Excluded(4, 6, True), Excluded(0, 1, False)]
 
 
 def test_nothing_is_known_across_a_clock_that_was_set_back() -> None:
     before = Past(20, 30, ((20, False),))
     after = Past(10, 28, ())
-    found = excluded_stretches(rule(), [heard_by(each, latched=True) for each in (before, after)])
+    found = excluded_intervals(rule(), [heard_by(each, latched=True) for each in (before, after)])
     assert Excluded(10, 29, False) in found
     # What a recording knew whose clock was set back tells another one nothing.
-    jumped = HeardRecording(5, 30, [Heard(5, 30, False, True)], [(5, 8)])
-    found = excluded_stretches(rule(), [jumped, HeardRecording(6, 20, [])])
+    jumped = RecordingConditions(5, 30, [ConditionInterval(5, 30, False, True)], [(5, 8)])
+    found = excluded_intervals(rule(), [jumped, RecordingConditions(6, 20, [])])
     assert found == [Excluded(5, 21, False)]
-    unclear = HeardRecording(0, 9, [Heard(0, 9, False, True)], [(3, 5)])
-    assert excluded_stretches(rule(excludes_unknown=False), [unclear]) == [Excluded(3, 5, False)]
+    unclear = RecordingConditions(0, 9, [ConditionInterval(0, 9, False, True)], [(3, 5)])
+    assert excluded_intervals(rule(excludes_unknown=False), [unclear]) == [Excluded(3, 5, False)]
 
 
 def test_latched_messages_go_by_when_they_were_published() -> None:

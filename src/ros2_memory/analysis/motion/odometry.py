@@ -198,7 +198,7 @@ class Leg(NamedTuple):
         return self.length_m + sum(end.creep.length_m for end in ends if end.creep is not None)
 
     @property
-    def in_doubt(self) -> bool:
+    def is_uncertain(self) -> bool:
         """Whether noise may be much of its length: poses too rare to distinguish it from turns."""
         if self.poses < FEWEST or self.period_ns is None or self.period_ns <= _DENSE_NS:
             return False
@@ -318,9 +318,9 @@ class MotionTotals:
         return self.sum_m + sum(leg.sum_m for leg in self._ends())
 
     @property
-    def in_doubt(self) -> bool:
+    def is_uncertain(self) -> bool:
         """Whether noise may be much of the length of its first or last leg."""
-        return any(leg.in_doubt for leg in self._ends())
+        return any(leg.is_uncertain for leg in self._ends())
 
     @property
     def duration_s(self) -> float:

@@ -32,8 +32,8 @@ _READABLE: Final = 0o644  # the two programs may run as different users
 
 
 @dataclass(slots=True)
-class Heard:
-    """What a topic showed for some time in one recording.
+class ConditionInterval:
+    """An interval in which a topic's condition kept its value, in one recording.
 
     Attributes:
         first: log time of the first message of it.
@@ -65,7 +65,7 @@ class RecordingScreen:
         start: log time of its first message; None before one was read.
         end: log time of its last message that was read; None likewise.
         files: its closed files, by name.
-        heard: what each rule knows, in the order in which it was written.
+        heard: for each rule the values of its topic, in the order in which they were written.
         unclear: spans of log time in which the clock was set back, so that no order is known.
     """
 
@@ -73,7 +73,7 @@ class RecordingScreen:
     start: Int64 | None = None
     end: Int64 | None = None
     files: dict[str, FileStep] = field(default_factory=dict)
-    heard: dict[str, list[Heard]] = field(default_factory=dict)
+    heard: dict[str, list[ConditionInterval]] = field(default_factory=dict)
     unclear: list[tuple[Int64, Int64]] = field(default_factory=list)
 
 

@@ -133,7 +133,7 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     return QueuePlan(depths, short)
 
 
-def lacking_depth(
+def too_shallow_topics(
     flows: Mapping[str, TopicFlow], planned: QueuePlan, active: QueuePlan
 ) -> frozenset[str]:
     """Returns the topics whose queues hold less than `HOLD_S`, and would be deeper as planned."""

@@ -22,9 +22,9 @@ from ros2_memory.recorder.reception.measure import measure_split
 from ros2_memory.recorder.reception.profiles import (
     QueuePlan,
     TopicFlow,
-    lacking_depth,
     plan_queues,
     qos_overrides,
+    too_shallow_topics,
 )
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ class Reception:
                 return None
             flows = self._planned_for()
             plan = plan_queues(flows, self._queue_bytes)
-            shallow = lacking_depth(flows, plan, known.plan)
+            shallow = too_shallow_topics(flows, plan, known.plan)
             return Rotation("queues_deepened", _deeper(shallow), shallow) if shallow else None
 
     def rotation_begun(self, rotation: Rotation, now_s: float) -> None:

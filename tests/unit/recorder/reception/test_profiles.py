@@ -12,10 +12,10 @@ from ros2_memory.recorder.reception.profiles import (
     OfferedQos,
     QueuePlan,
     TopicFlow,
-    lacking_depth,
     offered_by_all,
     plan_queues,
     qos_overrides,
+    too_shallow_topics,
 )
 
 MIB = 2**20
@@ -95,7 +95,7 @@ def test_only_topics_that_would_be_deeper_want_a_new_recording() -> None:
     }
     planned = plan_queues(flows, 64 * MIB)
     active = QueuePlan({"/deep": 100, "/huge": 1})
-    assert lacking_depth(flows, planned, active) == {"/fast"}
+    assert too_shallow_topics(flows, planned, active) == {"/fast"}
 
 
 def test_an_override_names_the_whole_profile_but_no_deadline() -> None:

@@ -40,7 +40,7 @@ class FarPoint(NamedTuple):
     away_m: float
 
 
-class Stand(NamedTuple):
+class PlacedStandstill(NamedTuple):
     """A standstill at a place (m)."""
 
     x: float
@@ -156,7 +156,7 @@ def _away(point: Floats, steps: _Steps) -> float:
 
 def placed_stands(
     track: RobotTrack, spans: Iterable[tuple[Ns, Ns]], region: Region | None = None
-) -> Iterator[Stand]:
+) -> Iterator[PlacedStandstill]:
     """Yields the standstills of some times where the track was then; in a region, if one is given.
 
     What the track does not know is left out.
@@ -174,7 +174,7 @@ def placed_stands(
             for column in (track.x, track.y)
         )
         if region is None or region.contains(x, y):
-            yield Stand(x, y, start, stop - start)
+            yield PlacedStandstill(x, y, start, stop - start)
 
 
 def _is_known(track: RobotTrack, at: Times) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -187,14 +187,14 @@ def _is_known(track: RobotTrack, at: Times) -> np.ndarray[tuple[int], np.dtype[n
     return np.asarray(between | before | after)
 
 
-def stood_at(this: Iterable[Stand], other: Iterable[Stand]) -> list[StoodAt]:
+def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]) -> list[StoodAt]:
     """Returns the places where the robot stood in two windows, and how long in each.
 
     A place is where it stood longest within `SAME_STAND_M`.
     """
     every = [(0, each) for each in this] + [(1, each) for each in other]
     every.sort(key=lambda each: (-each[1].duration, each[1]))
-    middles: list[Stand] = []
+    middles: list[PlacedStandstill] = []
     sums: list[list[Ns]] = []
     since: list[list[Ns | None]] = []
     for side, stand in every:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Rectangle
-from ros2_memory.places.two_ways import Stand, farthest_apart, placed_stands, stood_at
+from ros2_memory.places.two_paths import PlacedStandstill, farthest_apart, placed_stands, stood_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -106,15 +106,19 @@ def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> Non
     way = track([(0.0, 1.0, 2.0), (20.0, 1.0, 2.0)], [(100.0, 7.0, 2.0), (120.0, 7.0, 2.0)])
     spans = [(2 * S, 18 * S), (50 * S, 70 * S), (105 * S, 115 * S)]
     assert [*placed_stands(way, spans)] == [
-        Stand(1.0, 2.0, 2 * S, 16 * S),
-        Stand(7.0, 2.0, 105 * S, 10 * S),
+        PlacedStandstill(1.0, 2.0, 2 * S, 16 * S),
+        PlacedStandstill(7.0, 2.0, 105 * S, 10 * S),
     ]
     assert len([*placed_stands(way, spans, Rectangle(5.0, 8.0, 0.0, 3.0))]) == 1
 
 
 stands = st.lists(
     st.builds(
-        Stand, st.floats(0, 3), st.floats(0, 3), st.integers(0, 10**9), st.integers(1, 10**9)
+        PlacedStandstill,
+        st.floats(0, 3),
+        st.floats(0, 3),
+        st.integers(0, 10**9),
+        st.integers(1, 10**9),
     ),
     max_size=8,
 )
@@ -123,7 +127,7 @@ stands = st.lists(
 @settings(max_examples=40, deadline=None)
 @given(stands, stands)
 def test_every_standstill_is_of_one_place_and_near_to_it(
-    one: list[Stand], two: list[Stand]
+    one: list[PlacedStandstill], two: list[PlacedStandstill]
 ) -> None:
     found = stood_at(one, two)
     for side, given_ones in enumerate((one, two)):
@@ -135,6 +139,6 @@ def test_every_standstill_is_of_one_place_and_near_to_it(
 
 
 def test_standstills_at_one_place_add_up_and_have_the_first_time() -> None:
-    here, again = Stand(1.0, 1.0, 50, 10), Stand(1.2, 1.1, 5, 7)
+    here, again = PlacedStandstill(1.0, 1.0, 50, 10), PlacedStandstill(1.2, 1.1, 5, 7)
     [at] = stood_at([here, again], [])
     assert (at.durations, at.since) == ((17, 0), (5, None))
