@@ -74,7 +74,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class DataTimeRange(AnswerWithNotes):
-    """What the memory spans, and the files that do not answer; no times where it is empty."""
+    """The recorded time range, and unreadable files; no times if nothing is recorded."""
 
     earliest: Ns | None
     latest: Ns | None
@@ -94,9 +94,9 @@ class DataTimeRange(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class TopicValue(AnswerWithNotes):
-    """One message of one topic; with `latched` it holds, however old it is.
+    """One message of one topic; with `latched` it is valid at any age.
 
-    `age` counts back from now for a relative question, else from the moment asked about.
+    `age` counts back from now for a relative question, else from the time asked about.
     """
 
     topic: str
@@ -108,7 +108,7 @@ class TopicValue(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class Extremes:
-    """The least and the greatest number that a field held, and when it first did."""
+    """The minimum and maximum of a field, and the first time of each."""
 
     field: str
     least: float
@@ -122,7 +122,7 @@ class TopicRange(AnswerWithNotes):
     """Samples of a window, evenly spaced over all `total` messages in it, with the first and last.
 
     Their values are objects by `fields`, if any were requested. `extremes` are those of all
-    messages, for the requested fields that hold numbers.
+    messages, for the requested numeric fields.
     """
 
     topic: str
@@ -178,7 +178,7 @@ MomentAnswer: TypeAlias = TopicValue | Position | Velocity | TransformAt
 
 @dataclass(frozen=True, slots=True)
 class NothingAt(AnswerWithNotes):
-    """The answer about one of several moments, at which there is nothing: why."""
+    """The answer for one of several times without data: the reason."""
 
     at: Ns
     reason: NoDataReason
@@ -187,7 +187,7 @@ class NothingAt(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class AtEach(AnswerWithNotes):
-    """The answers about several moments, in the order in which these were asked."""
+    """The answers for several times, in the order given."""
 
     answers: tuple[MomentAnswer | NothingAt, ...]
 
@@ -211,7 +211,7 @@ class Match(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class ValueWhen(AnswerWithNotes):
-    """A match on one topic and the value of another then; None where it had none yet."""
+    """A match on one topic, and the value of another at that time; None if it had none yet."""
 
     matched: TopicValue | None
     value: TopicValue | None = None
@@ -234,7 +234,7 @@ class TrajectorySummary(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class DrivenInside(AnswerWithNotes):
-    """What was driven inside of a region in a window.
+    """The path driven inside a region in a window.
 
     Attributes:
         topic: of the poses.
@@ -245,7 +245,7 @@ class DrivenInside(AnswerWithNotes):
         end: at which the last one ended.
         distance_m: metres driven inside.
         max_speed: over a second (m/s).
-        waypoints: of the drawn way; `jump` marks the first of a visit.
+        waypoints: of the drawn path; `jump` marks the first of a visit.
     """
 
     topic: str
@@ -277,7 +277,7 @@ class Sighting:
         topic: of the messages.
         first: log time of the first of them; of the earliest one read where `begun` is False.
         last: of the last.
-        messages: how many there are; 0 for a goal of an action, which is no run of messages.
+        messages: how many there are; 0 for a goal of an action.
         begun: whether the message before the first is known not to belong.
         robot: where the robot was at the last.
         thing: where the thing itself was then, if the message has that.
@@ -303,9 +303,9 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Sightings(AnswerWithNotes):
-    """Sightings in the order asked for; `more`: there are others. `start` and `end` were searched.
+    """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
 
-    `total` is how many there are; None where the search ended before it had counted all.
+    `total` is how many there are; None if the search ended before it had counted all.
     """
 
     sightings: tuple[Sighting, ...]
@@ -325,17 +325,17 @@ class PastChange(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Before(AnswerWithNotes):
-    """What changed before a moment.
+    """What changed before a time.
 
     Attributes:
         at: the moment.
         length: how long before it changes count.
         changes: nearest first.
         more: how many others there are.
-        recorded: the topics on which a change would show, as far as they are recorded at the time.
+        recorded: the topics that would show a change and were recorded at the time.
         robot: where the robot was; None where that is not known.
-        speed_mps: what its pose topic states.
-        state: booleans, statuses that are not ok and the goal of each action, as of the moment.
+        speed_mps: from its pose topic.
+        state: booleans, statuses that are not ok and the goal of each action, at that time.
         after: the first changes in the seconds after, nearest first; their `before` is negative.
     """
 
@@ -352,9 +352,9 @@ class Before(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened at `start`, and went on until `end` where it took time.
+    """Something that happened at `start`, and lasted until `end` if it took time.
 
-    With `goes_on`, `end` is only as far as is known. `before`: what changed before, nearest first.
+    With `goes_on`, the real end is not known. `before`: what changed before, nearest first.
     `place`: the named place that the robot was in. `score`: the best one of a thing in view.
     `skipped`: how much of its time the clock skipped. `point`: where it happened (m), in the frame
     of the recap, where that is known of the robot itself.
@@ -386,12 +386,12 @@ class Recap(AnswerWithNotes):
             that goes on outside of the window counts as far as it is inside, so the times of
             windows that follow each other add up. None where poses are there, but too noisy or too
             few to know.
-        shortest_stop: what is shorter is no standstill.
+        shortest_stop: shorter stops do not count.
         frame_id: of the places in texts.
         events: what happened, in order of time.
-        throughout: things that a detector saw all the time of the window at its usual rate.
+        throughout: things that a detector saw during the whole window at its usual rate.
         counts: how many events of each kind there were, also of those that are left out.
-        path_sum_m: the length with what the noise of positions adds, where that is much.
+        path_sum_m: the plain sum of distances, if noise adds much to it.
         gap_m: the path across gaps in the recording, in straight lines; None without a gap.
         where: the region's name, where only what happened there was asked for.
         visits: how often the robot was there; `inside` is how long in all.
@@ -428,7 +428,7 @@ class SilentTopic:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Bytes of all bags, how many may be kept, and what a day adds; None where not known.
+    """The bytes of all bags, the limit, and the growth per day; None where not known.
 
     `foreign`: the bytes of bags that the recorder did not make; they are in none of the others.
     """
@@ -442,27 +442,27 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Status(AnswerWithNotes):
-    """How complete and how current the memory is.
+    """How complete and how recent the recorded data is.
 
     Attributes:
         now: what ages count from.
-        earliest: the oldest moment that can be asked about; None where the memory is empty.
+        earliest: the oldest recorded time; None if nothing is recorded.
         latest: the newest one.
         recorder: its state; None where no recorder has written here.
         live: whether it is running.
         restarts: how often it had to restart `ros2 bag record`; 0 where there is none.
-        missing: topics that it is to record by name, and that no publisher has offered to it.
+        missing: topics that it should record by name, and that no publisher offers.
         never_heard: topics it subscribed to that brought no message.
         lost: how many messages of each topic are known to be missing of the recorder's last hour.
-        fell_silent: topics that brought some, and none lately.
+        fell_silent: topics that had messages, but not lately.
         silences: when topics with a usual rate were silent although the robot was on.
         clock_steps: when the clock was set by 2 s or more.
         damaged: files that cannot be read.
         incomplete: bags that a crash left open.
         unread: files of a kind that is not read here.
-        budget: how long the disk lasts.
+        budget: the use of the disk budget.
         moments: the newest saved moments; None where they cannot be listed.
-        problems: why answers may be missing something.
+        problems: why answers may be incomplete.
     """
 
     now: Ns
@@ -490,9 +490,9 @@ class Visit:
     """A time in which the robot was near a place.
 
     Attributes:
-        arrived: log time of its first pose there; None where it was there before what was searched.
-        departed: of its last one; None where it is there still, by a pose recent enough to know.
-        duration: between the first and the last that are known.
+        arrived: log time of its first pose there; None if it was there before the searched time.
+        departed: of its last one; None if it is still there, by a recent pose.
+        duration: from the first to the last known pose there.
         closest_m: distance (m, in the plane) of the nearest recorded pose; the robot may have been
             nearer between two messages. None where the place is no circle.
         closest_at: log time of that pose; None likewise.
@@ -553,7 +553,7 @@ class Visits(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class ThingStay:
-    """A time at which a thing was at a place (m): first and last seen there, and how often."""
+    """An interval in which a thing was at a place (m): first and last seen there, and how often."""
 
     start: Ns
     end: Ns
@@ -627,11 +627,11 @@ class Things(AnswerWithNotes):
 
 @dataclass(frozen=True, slots=True)
 class ComparedThing:
-    """What became of a thing: where it was in the earlier window, and in the later.
+    """A thing in both windows: where it was in the earlier, and in the later.
 
     Attributes:
         before: None where it was not known then; `after`: None where it was not seen then.
-        missed: when it was known not to be seen where it was expected.
+        missed: when it was not seen where expected.
         looks: detector messages that should have had it.
     """
 
@@ -644,7 +644,7 @@ class ComparedThing:
 
 @dataclass(frozen=True, slots=True)
 class MoverSeen:
-    """What moves by itself in a window: the most at once, how often, and where it was last seen."""
+    """A mover in a window: the most at once, how often it was seen, and where last."""
 
     at_once: int
     count: int
@@ -655,7 +655,7 @@ class MoverSeen:
 
 @dataclass(frozen=True, slots=True)
 class ComparedMover:
-    """What moves by itself, in the earlier window and in the later; None where it was not seen."""
+    """A mover in the earlier window and in the later; None where it was not seen."""
 
     label: str
     before: MoverSeen | None
@@ -675,7 +675,7 @@ class ComparedThings:
 
 
 class Pair(NamedTuple):
-    """A number in the window that is asked about, and in that which it is compared with."""
+    """A number in both compared windows."""
 
     this: float | None
     other: float | None
@@ -694,7 +694,7 @@ class StandstillPlace(NamedTuple):
 
 
 class FarFromOther(NamedTuple):
-    """A point of a way (m): how far the other way is (m), and when the robot was there first."""
+    """A point of a path (m): its distance from the other, and when the robot was first there."""
 
     place: tuple[float, float]
     inside: str | None
@@ -712,7 +712,7 @@ class Comparison(AnswerWithNotes):
         way: numbers by name: metres, m/s, seconds and counts.
         way_frame_id: frame of the places where the robot stood, and of the points of the path.
         stood: where it stood in one window longer than in the other.
-        farthest: the points of this way, and of the other one, that are farthest from the other
+        farthest: the points of this path, and of the other one, that are farthest from the other
             and from this; None where the paths are the same.
         places: minutes in each named place.
         errors: reports of each error.
@@ -764,7 +764,7 @@ class FiredRule:
         name: of the rule.
         fired: how often it fired.
         moments: how many moments it made; a moment may hold several matches.
-        refused: how often nothing was kept.
+        refused: how often nothing was saved.
         last: log time at which it fired last; None where it never did.
         always_since: since when it matches without an end, where that is long; else None.
         problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
@@ -804,9 +804,9 @@ metres, plain numbers, log times."""
 
 @dataclass(frozen=True, slots=True)
 class Usual:
-    """The usual first time of a day, in seconds of local time since midnight; over `days` days.
+    """The usual first time of a day, in seconds since local midnight, over `days` days.
 
-    `of_days` is how many days there are of which something was recorded.
+    `of_days` is the number of days with recorded data.
     """
 
     median_s: int
@@ -818,7 +818,7 @@ class Usual:
 
 @dataclass(frozen=True, slots=True)
 class Bins(AnswerWithNotes):
-    """What was counted in each bin of a window.
+    """Counts for each bin of a window.
 
     Attributes:
         by: the kind of the bins.

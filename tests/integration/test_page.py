@@ -105,7 +105,7 @@ def test_a_first_look_is_four_requests(page: Browser) -> None:
 def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
     assert page.run("return state.view.range.gaps.length") == 1
     assert "damaged_0.mcap" in page.text("#state")
-    assert "Recorder\nnot heard of" in page.text("#state")
+    assert "Recorder\nno heartbeat yet" in page.text("#state")
     assert "GB" in page.text("#state")
     label = page.run("return document.getElementById('map').getAttribute('aria-label')")
     assert "30.0 m driven in odom" in label
@@ -258,7 +258,7 @@ def odd(chromium: Browser, replayed: Served) -> Iterator[Browser]:
 
 def test_of_bags_that_nobody_records_it_shows_neither_a_recorder_nor_a_budget(odd: Browser) -> None:
     state = odd.text("#state")
-    assert "Recorder\nnone belongs to this memory" in state
+    assert "Recorder\nnone in this deployment" in state
     assert "Size\n" in state
     assert "Budget" not in state
     assert "Growth" not in state

@@ -3,7 +3,7 @@
 A *spot* is where a detector saw one label: the mean of detections that lie together, never two of
 one message. A *look* is a cell of the robot's pose (`CELL_MM`, `CELL_DECIDEG`) from which a
 detector published, whether it saw anything or not. A *hit* counts how often a spot was seen in a
-look. So it is known what was seen, and what would have been.
+look. So it is known what was not seen, too.
 
 Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores in thousandths:
 integers, so that sums do not depend on their order. Tables of several bags are joined by
@@ -570,7 +570,7 @@ def decode_joined(packed: Sequence[bytes]) -> tuple[Sights, list[int], list[str]
     Returns with them which bags they are of, and the frame of each: much faster than one by one.
 
     Raises:
-        ValueError: the bytes of some bag are none.
+        ValueError: the bytes of some bag are invalid.
     """
     which = [nth for nth, each in enumerate(packed) if each]
     try:
@@ -688,7 +688,7 @@ def decode_sights(packed: bytes) -> Sights:
     """Decodes the sights of one bag.
 
     Raises:
-        ValueError: the bytes are none.
+        ValueError: the bytes are invalid.
     """
     if not packed:
         return no_sights()

@@ -36,7 +36,7 @@ class ConfigError(EpisodicError):
 
 
 class InvalidArgumentsError(EpisodicError):
-    """A tool call with invalid arguments; the sentence names the argument."""
+    """A call with invalid arguments; the sentence names the argument."""
 
     code = "invalid_arguments"
 

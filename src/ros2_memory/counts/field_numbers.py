@@ -100,7 +100,7 @@ class FieldReader:
         """Returns the numbers in a window, of times that no edge cuts.
 
         Raises:
-            QueryTimeoutError: the call's time is over before anything is known.
+            QueryTimeoutError: the call's time runs out before any result.
         """
         kind = DigestKind(f"numbers {json.dumps(self._fields)}", self._look_up, _encoded, _decoded)
         fold = SegmentFold(

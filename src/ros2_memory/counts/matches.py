@@ -72,8 +72,8 @@ def count_matches(
     Raises:
         InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or there
             are too many bins.
-        NoDataError: the memory holds nothing in the window, or no such topic.
-        QueryTimeoutError: the call's time is over before anything is known.
+        NoDataError: nothing is recorded in the window, or no such topic.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     condition = condition_of(memory.limits, condition_type, value, field, min_score)
     span = TimeRange(start_s, end_s, last_s)

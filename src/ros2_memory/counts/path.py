@@ -61,7 +61,7 @@ def count_path(
         InvalidArgumentsError: a message of the topic carries no position, or there are too many
             bins.
         NoDataError: there are no poses in the window.
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     view, asked = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)

@@ -37,7 +37,7 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
     Raises:
         InvalidArgumentsError: no place is named in the frame of places.
         NoDataError: there are no poses.
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     topic = resolve_pose_topic(view)
     frame_id = map_placement(view, pose_frame(view, topic), topic, None).frame_id

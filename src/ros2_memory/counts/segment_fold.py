@@ -87,7 +87,7 @@ class SegmentFold(Generic[T, R]):
         """Folds a window.
 
         Raises:
-            QueryTimeoutError: the call's time is over before anything is known.
+            QueryTimeoutError: the call's time runs out before any result.
         """
         reading = _Reading(view)
         parts: list[R] = []

@@ -46,8 +46,8 @@ def count_visits(
     Raises:
         InvalidArgumentsError: the place is none, the frame is another one, there are too many
             bins, or a place is given besides `by` place.
-        NoDataError: the memory holds nothing in the window, or no poses.
-        QueryTimeoutError: the call's time is over before anything is known.
+        NoDataError: nothing is recorded in the window, or no poses.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where)
     if by == "place" and place is not None:

@@ -1,4 +1,4 @@
-"""Coverage: notes on what of a question's window could not be read, as part of the answer.
+"""Coverage: notes in an answer on data of its window that could not be read.
 
 The first few of each kind are named, and the others counted:
 
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 def note_unread(
     view: View, window: TimeWindow, *, nothing: bool = False, search: bool = False
 ) -> None:
-    """Notes what of a window could not be read.
+    """Adds notes on data of a window that could not be read.
 
     With `nothing` the answer is that there is nothing. Then, and after a `search`, splits that are
     listed and missing count too.
@@ -83,7 +83,7 @@ def note_unread(
 
 
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on messages that are known to be missing of a window, one on forgotten."""
+    """Yields a sentence on messages known to be missing in a window, and one on deleted ones."""
     losses = read_losses(bag_dir, window.start, window.stop)
     for forgotten, what in (
         (False, "lost before they were recorded, or never published"),
@@ -106,7 +106,7 @@ def was_forgotten(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
 
 
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on the stretches of a window of which nothing was to be recorded."""
+    """Yields a sentence on the intervals of a window that were excluded."""
     found = united(
         (each.start, each.stop) for each in excluded_between(bag_dir, window.start, window.stop)
     )
@@ -117,7 +117,7 @@ def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 
 
 def note_edges(view: View, window: TimeWindow) -> None:
-    """Notes where a window reaches past the begin or the end of the memory."""
+    """Adds a note if a window reaches past the begin or the end of the recorded data."""
     snapshot = view.snapshot
     asked_from, asked_to = window.asked()
     earliest = snapshot.earliest
@@ -134,7 +134,7 @@ def note_edges(view: View, window: TimeWindow) -> None:
 
 
 def unix_text(at: Ns) -> str:
-    """Returns a log time for a sentence: Unix seconds that find it again, so rounded up."""
+    """Returns a log time as Unix seconds, rounded up so that a query at that time finds it."""
     return f"{unix_rounded_up(at):.6f}"
 
 

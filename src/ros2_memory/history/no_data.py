@@ -197,7 +197,7 @@ def not_recorded(view: View, name: str) -> NoDataError:
     """Returns the error for a topic of which no closed bag holds a message.
 
     Raises:
-        NoDataError: the memory holds nothing at all.
+        NoDataError: nothing is recorded at all.
     """
     require_bags(view)
     snapshot = view.snapshot

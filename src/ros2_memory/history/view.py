@@ -204,7 +204,7 @@ def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, N
 
     Raises:
         InvalidArgumentsError: the seconds are not finite, or negative where they count back.
-        NoDataError: the memory holds nothing, or no recorded time can lie so far back.
+        NoDataError: nothing is recorded, or no recorded time can lie so far back.
     """
     if moment.at_s is not None:
         at = ns_argument("timestamp", moment.at_s)
@@ -229,7 +229,7 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length.
-        NoDataError: the memory holds nothing.
+        NoDataError: nothing is recorded.
     """
     if span.last_s is not None:
         length = ns_argument("seconds", span.last_s)

@@ -332,7 +332,7 @@ def before(
 
     Raises:
         InvalidArgumentsError: the moment is not finite, or no transform leads to `frame_id`.
-        NoDataError: the memory holds nothing.
+        NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
     at, length = ns_argument("around", at_s), ns_argument("seconds_before", length_s)

@@ -22,7 +22,7 @@ from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, track_in
-from ros2_memory.places.two_paths import farthest_apart, placed_stands, stood_at
+from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import parse_where, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
@@ -66,7 +66,7 @@ def compare(
 
     Raises:
         InvalidArgumentsError: the bounds make no window, or `where` is no region.
-        NoDataError: the memory holds nothing.
+        NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
     region = None if where is None else parse_where(memory.limits.places, where)
@@ -178,7 +178,11 @@ def _paths_apart(
     region, places = None if where is None else where.region, view.memory.limits.places
     tracks = [track_in(view, frame, each) for each in windows]
     stands = [
-        [*placed_stands(track, ((each.start, each.end) for each, _ in drive.standstills), region)]
+        [
+            *placed_standstills(
+                track, ((each.start, each.end) for each, _ in drive.standstills), region
+            )
+        ]
         for track, drive in zip(tracks, drives, strict=True)
     ]
     stood: list[StandstillPlace] = []

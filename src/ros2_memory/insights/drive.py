@@ -106,7 +106,7 @@ class Drive:
 
 
 def drive_in(view: View, window: TimeWindow) -> Drive:
-    """Returns how the robot moved; nothing, with a note, where that is not known."""
+    """Returns how the robot moved; nothing, with a note, if that is unknown."""
     elapsed = elapsed_in(view, window)
     try:
         topic = resolve_pose_topic(view)

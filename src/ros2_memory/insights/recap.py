@@ -130,7 +130,7 @@ def recap(
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length, `where`
             is no region, or no position is given in `frame_id`.
-        NoDataError: the memory holds nothing.
+        NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
     region = None if where is None else parse_where(memory.limits.places, where)

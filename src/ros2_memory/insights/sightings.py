@@ -108,7 +108,7 @@ def find_matches(
     Raises:
         InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or no
             sighting has one of the fields.
-        NoDataError: the memory holds nothing, or no such topic.
+        NoDataError: nothing is recorded, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
     condition = condition_of(memory.limits, condition_type, value, field, min_score)

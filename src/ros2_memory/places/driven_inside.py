@@ -79,7 +79,7 @@ def driven_inside(
         InvalidArgumentsError: the topic carries no position, or `where` is no region of a frame
             that its poses can be placed in.
         NoDataError: there are no poses in the window.
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     region = parse_where(memory.limits.places, where)
     view, window = open_span(memory, call, span)
@@ -237,7 +237,7 @@ def driven_way(view: View, topic: str, window: TimeWindow) -> DrivenWay | None:
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
         NoDataError: no message can be decoded.
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []

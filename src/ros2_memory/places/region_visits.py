@@ -49,7 +49,7 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
     """Returns the robot's track in a window; a note says how far back it reaches, if not all.
 
     Raises:
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     joined = RobotTracks(view, frame_id).over(window)
     if joined.since is not None:
@@ -67,7 +67,7 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
     """Returns the visits to a region in a window.
 
     Raises:
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     track = track_in(view, frame_id, window)
     inside = robot_inside(track, where.region, window)

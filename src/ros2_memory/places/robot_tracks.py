@@ -74,7 +74,7 @@ class RobotTracks:
         """Returns the track in a window, and a little beyond.
 
         Raises:
-            QueryTimeoutError: the call's time is over before anything is known.
+            QueryTimeoutError: the call's time runs out before any result.
         """
         parts: list[RobotTrack] = []
         since: Ns | None = None

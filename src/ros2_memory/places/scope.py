@@ -1,4 +1,4 @@
-"""What bounds a search besides its window: where the robot was, and what held on another topic."""
+"""Bounds of a search besides its window: the robot's place, and a condition on another topic."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside
     Raises:
         InvalidArgumentsError: no pose is in the region's frame, and none can be placed there.
         NoDataError: no pose is recorded.
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     topic = resolve_pose_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)

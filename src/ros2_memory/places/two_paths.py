@@ -1,6 +1,6 @@
 """Compares two paths by the robot's tracks: where they are farthest apart, and where it stood.
 
-Both are told in one frame, so they are of use where that is the map, or where odometry did not
+Both results are in one frame, so they are useful only if that is the map, or if odometry did not
 begin anew between the two.
 """
 
@@ -32,7 +32,7 @@ _SAMPLES_OF_STAND: Final = 9
 
 
 class FarPoint(NamedTuple):
-    """A point of a way (m), when the robot was there first, and how far the other way is (m)."""
+    """A point of a path (m), when the robot was first there, and its distance from the other."""
 
     x: float
     y: float
@@ -72,9 +72,9 @@ def farthest_apart(
     other: tuple[RobotTrack, TimeWindow],
     region: Region | None = None,
 ) -> tuple[FarPoint | None, FarPoint | None]:
-    """Returns the point of each way that is farthest from the other one.
+    """Returns the point of each path that is farthest from the other one.
 
-    Of each way the part in a window counts, and of that the points in a region, if one is given.
+    Only the part of each path in its window counts, and in the region, if one is given.
     None where it has no point, or the other way has none at all.
     """
     one, two = _steps(*this), _steps(*other)
@@ -154,12 +154,12 @@ def _away(point: Floats, steps: _Steps) -> float:
     return float(np.hypot(*(nearest - point).T).min())
 
 
-def placed_stands(
+def placed_standstills(
     track: RobotTrack, spans: Iterable[tuple[Ns, Ns]], region: Region | None = None
 ) -> Iterator[PlacedStandstill]:
-    """Yields the standstills of some times where the track was then; in a region, if one is given.
+    """Yields standstills with their place on the track; those in a region, if one is given.
 
-    What the track does not know is left out.
+    Standstills outside the track are left out.
     """
     if not len(track.times):
         return

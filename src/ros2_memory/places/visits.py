@@ -89,8 +89,8 @@ def visits(
     Raises:
         InvalidArgumentsError: the pose topic carries no position, the place is none, the frame is
             another one, or the bounds are reversed.
-        NoDataError: the memory holds nothing, or no poses.
-        QueryTimeoutError: the call's time is over before anything is known.
+        NoDataError: nothing is recorded, or no poses.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where)
     wall = memory.clock.now()
@@ -144,7 +144,7 @@ def visits(
 
 
 class _Known(NamedTuple):
-    """The visits that are shown, and how many there are and how long in all."""
+    """The visits to show, and the number and duration of all."""
 
     shown: tuple[Visit, ...]
     total: int
@@ -160,7 +160,7 @@ def asked_place(
     radius_m: float | None,
     where: JsonValue,
 ) -> Where | None:
-    """Returns the place that is asked about; None for all named ones.
+    """Returns the requested place; None for all named ones.
 
     Raises:
         InvalidArgumentsError: the arguments name none, or two.
@@ -227,7 +227,7 @@ def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
 
 
 def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) -> tuple[Visit, ...]:
-    """Returns visits with how often odometry began anew since."""
+    """Returns visits with the number of odometry resets since."""
     if not shown:
         return shown
     last = shown[-1]
@@ -240,7 +240,7 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
 
 
 def _note_doubts(view: View, known: _Known, window: TimeWindow) -> None:
-    """Notes what visits may not be."""
+    """Adds notes on visits that are uncertain."""
     shown, newest = known.shown, known.newest
     note_unread(view, window, nothing=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
@@ -258,7 +258,7 @@ def _note_doubts(view: View, known: _Known, window: TimeWindow) -> None:
 def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     """Returns the times of the first poses after each reset of odometry since a moment.
 
-    None, with a note, where the time for the answer is over before they are known.
+    None, with a note, if the time for the answer runs out first.
     """
     try:
         path = driven_path(view, topic, TimeWindow(since, MAX_NS))
@@ -272,7 +272,7 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
 
 
 class _VisitSearch:
-    """Goes through the poses of a topic from the newest on, without bags that are ruled out."""
+    """Searches the poses of a topic, newest first, without bags that are ruled out."""
 
     def __init__(self, view: View, topic: str, placement: MapPlacement, region: Region) -> None:
         self._view = view
@@ -292,7 +292,7 @@ class _VisitSearch:
     def newest(self, limit: int) -> tuple[list[tuple[Dwell, Approach]], list[Dwell]]:
         """Returns the newest visits, each with its closest approach, and all that there are.
 
-        Where the time is over before the end, a note says how far back they were counted.
+        If the time runs out first, a note says how far back they were counted.
         """
         visits = DwellBuilder(limit)
         before = MAX_NS

@@ -108,7 +108,7 @@ def times_inside(view: View, where: Where, frame_id: str, window: TimeWindow) ->
     `frame_id` is the frame of regions that name none.
 
     Raises:
-        QueryTimeoutError: the call's time is over before anything is known.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     track = track_in(view, where.frame_id or frame_id, window)
     return robot_inside(track, where.region, window)

@@ -41,7 +41,7 @@ SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class RetentionLimits:
-    """How much is kept: bytes in all, age of the oldest, and what must stay free on the disk.
+    """The limits of retention: total bytes, maximum age, and minimum free disk space.
 
     `keeps_foreign`: bags that the recorder did not make are never deleted, and do not count.
     """
@@ -105,14 +105,14 @@ class StoredBag(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RetentionStock:
-    """All that this program put into the bag directory.
+    """Everything that this program wrote to the bag directory.
 
     Attributes:
         bags: those that may be deleted.
         now: the wall clock.
         sidecars: for each recording that goes with its last bag, the bytes that go with it.
         other_bytes: what must not be deleted: open bags, and files that are not worth deleting.
-        free_bytes: what the disk has left; None if that does not count.
+        free_bytes: free disk space; None if that does not count.
         saved: the files of moments, which are never deleted; bags may be other names of them.
         recorded_since: how long was recorded after each recording, by the monotonic clock; a
             recording that is missing counts as new.
@@ -145,7 +145,7 @@ class Ages(NamedTuple):
 
 
 class DeletionPlan(NamedTuple):
-    """What the limits require.
+    """The deletions that the limits require.
 
     `to_delete` has the oldest bag first. `total_bytes` is what the budget counted, each file once.
     `fits`: whether the limits are kept once those bags are deleted. `most_free`: how much of the

@@ -3,7 +3,7 @@
 The docstrings are the contract; one test suite holds every adapter to it.
 
 A reader takes single bag *files*; a rosbag2 directory is opened split by split, so that a deleted
-split or a wrong metadata.yaml costs nothing of the others. Adapters translate every foreign
+split or a wrong metadata.yaml does not affect the others. Adapters translate every foreign
 exception into `BagError`, `BagVanishedError` or `UndecodableError`, and never let another escape.
 A reader is safe to use from several threads at once.
 """
@@ -42,7 +42,7 @@ class Closing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """A message definition, as a bag holds it. Compared by content: ids are local to one file.
+    """A message definition of a bag. Compared by content: ids are local to one file.
 
     `encoding` is `ros2msg`, `ros2idl`, `jsonschema`, ... or empty where the recorder found none.
     """
@@ -73,7 +73,7 @@ class Channel:
 
     @property
     def memory_bytes(self) -> int:
-        """About how much memory its texts take, in bytes."""
+        """The approximate size of its texts in memory, in bytes."""
         size = len(self.topic) + len(self.schema.name) + len(self.schema.text)
         return size + sum(len(name) + len(text) for name, text in self.metadata)
 
@@ -97,7 +97,7 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CdrLayout:
-    """Where the numbers of a message lie: offsets in its little-endian payload.
+    """The offsets of the numbers of a message in its little-endian payload.
 
     It holds for every payload of `size` bytes that has the same bytes outside of these numbers.
 
@@ -156,7 +156,7 @@ class BagReader(ABC):
     ) -> Iterator[Record]:
         """Yields the undecoded messages of `topics` with log time inside the half-open window.
 
-        Ordered by log time whatever the order in the file, ties in file order; `newest_first`
+        Ordered by log time whatever the order in the file; ties in file order. `newest_first`
         yields exactly the reverse. Both channels of a topic that has two are read. Reads only
         what overlaps the window; keeps a chunk (and those that overlap it in time) in memory, never
         a file. Payloads are plain serialized messages: message compression is already undone.
@@ -222,7 +222,7 @@ class BagReader(ABC):
         """
 
     def layout(self, record: Record) -> CdrLayout | None:
-        """Returns where the numbers of this message lie; None if it must be decoded."""
+        """Returns the offsets of this message's numbers; None if it must be decoded."""
         del record
         return None
 
@@ -246,13 +246,13 @@ class Rewritten:
 class BagWriter(ABC):
     """Writes closed, indexed bag files.
 
-    Whatever goes wrong is raised as a `BagError` about the file that was to be written, with the
+    Every failure is raised as a `BagError` about the file to be written, with the
     `reason`, and nothing is left of that file.
     """
 
     @abstractmethod
     def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
-        """Writes a bag that holds these messages, in the order given, and nothing else.
+        """Writes a bag of these messages, in the order given.
 
         Payloads, both times, definitions and the metadata of channels are unchanged; ROS 2
         types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. The bag
@@ -269,7 +269,7 @@ class BagWriter(ABC):
         """Writes all that can be read of a file that was cut short into one that is whole.
 
         Schemas, channels, metadata, attachments, both times and sequence numbers are unchanged,
-        and so does the order; what makes no whole record is left out. The target was read back and
+        as is the order; incomplete records are left out. The target was read back and
         compared with the source, and is on the disk, when this returns. There must be no file of
         its name; the source is only read. `progress` is called with the bytes read so far.
 
@@ -285,7 +285,7 @@ class BagWriter(ABC):
         source: Path,
         target: Path,
         takes: Callable[[str, Ns, Ns], bool],
-        retell: Callable[[str], str],
+        edit_metadata: Callable[[str], str],
     ) -> Counter[str]:
         """Writes a whole file again, of any kind but compressed ones, without some messages.
 
@@ -297,7 +297,7 @@ class BagWriter(ABC):
             source: a file that its writer finished.
             target: the new one.
             takes: whether a message is left out, by topic, log time and publish time.
-            retell: returns the text of an embedded metadata.yaml as it is to be.
+            edit_metadata: returns the corrected text of an embedded metadata.yaml.
 
         Returns:
             How many messages of each topic were left out.

@@ -38,7 +38,7 @@ def cut_sqlite(
     target: Path,
     stream: IO[bytes],
     takes: Callable[[str, Ns, Ns], bool],
-    retell: Callable[[str], str],
+    edit_metadata: Callable[[str], str],
 ) -> Counter[str]:
     """Writes a file again without some messages; returns how many of each topic.
 
@@ -48,7 +48,7 @@ def cut_sqlite(
         stream: into the target, which is empty.
         takes: whether a message is left out, by topic, log time, and log time again: the format
             has no other.
-        retell: returns the text of an embedded metadata.yaml as it is to be.
+        edit_metadata: returns the text of an embedded metadata.yaml as it is to be.
 
     Raises:
         UnreadableError: the source has a journal or is no plain bag, or the target is not right.
@@ -83,7 +83,7 @@ def cut_sqlite(
             told = base.execute("SELECT rowid, metadata FROM metadata").fetchall()
             base.executemany(
                 "UPDATE metadata SET metadata = ? WHERE rowid = ?",
-                [(retell(str(text)), row) for row, text in told],
+                [(edit_metadata(str(text)), row) for row, text in told],
             )
         base.execute("COMMIT")
         base.execute("VACUUM")

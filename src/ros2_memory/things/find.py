@@ -57,8 +57,8 @@ def find_things(
     Raises:
         InvalidArgumentsError: the bounds make no window, `where` is no region, or `min_score` is
             above 1.
-        NoDataError: the memory holds nothing.
-        QueryTimeoutError: the call's time is over before anything is known.
+        NoDataError: nothing is recorded.
+        QueryTimeoutError: the call's time runs out before any result.
     """
     limits = memory.limits
     region = None if where is None else parse_where(limits.places, where)
@@ -96,7 +96,7 @@ def _frame_of(known: KnownThings, found: Sequence[Thing]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Finder:
-    """Selects what a question is about, and describes it."""
+    """Selects the things of a question, and describes them."""
 
     known: KnownThings
     window: TimeWindow
@@ -173,7 +173,7 @@ class _Finder:
         return number if number > 1 else None
 
     def _mover(self, mover: Mover) -> Thing | None:
-        """Returns what moves by itself: where it was last seen, inside of the region if one is."""
+        """Returns a mover: where it was last seen, inside the region if one is given."""
         rows = self._seen(mover.spots)
         result, frame = self.known.estimate, self.known.frames[mover.epoch]
         if self.where is not None:
@@ -302,7 +302,7 @@ def _by_place(
 def _notes(
     known: KnownThings, label: str | None, asked: str | None, *, found: bool
 ) -> Iterator[str]:
-    """Yields what else there is to know of a label, or of odometry that began anew."""
+    """Yields notes on a label, and on resets of odometry."""
     sights = known.estimate.sights
     if len(known.frames) > 1 + bool(known.frames[0]):
         yield (

@@ -78,7 +78,7 @@ class PlacedStay:
         left: the time by which it was seen to be gone; None if it was not.
         spots: rows of `Sights.spots`, in order of time.
         spellings: how often it was seen under each label.
-        weak: whether it was seen so rarely that it is no thing of its own.
+        weak: whether it was seen too rarely to be a thing.
         also: how often it was seen under the labels of other things.
     """
 
@@ -171,7 +171,7 @@ def estimate(
 ) -> Estimate:
     """Returns the things in the sights of bags that are in order of time.
 
-    `epochs` says, by bag, which coordinates it is in: bags of different ones are kept apart.
+    `epochs` has the coordinate system of each bag: bags of different ones are separate.
     Detections whose score lies below `min_score`, to 0.05, do not count.
     """
     spots = sights.spots
@@ -445,7 +445,7 @@ def _is_moved(instance: Instance) -> bool:
 
 
 def _split(stays: Sequence[PlacedStay], seen: _Seen) -> list[PlacedStay]:
-    """Splits stays where another one of the same label lies between two sightings."""
+    """Splits stays that have another one of the same label between two sightings."""
     found = []
     for stay in stays:
         others = [
@@ -478,7 +478,7 @@ def _split_at(stay: PlacedStay, others: Sequence[tuple[Ns, Ns]], seen: _Seen) ->
 
 
 def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
-    """Leaves out single sightings, which are false, at places that a thing has left."""
+    """Removes single sightings at places that a thing has left: they are false."""
     spots, found = seen.sights.spots, []
     for nth, stay in enumerate(stays):
         rows = stay.spots
@@ -517,7 +517,7 @@ def _moves_by_itself(group: _Group, linked: Sequence[Instance]) -> bool:
 
 
 def _is_seen(group: _Group, seen: _Seen) -> bool:
-    """Whether more than false detections were seen of what moves."""
+    """Whether a mover has more detections than false ones would give."""
     n = seen.counts[group.rows]
     return int(n[n >= _FEWEST].sum()) >= _FEWEST_OF_MOVERS
 

@@ -1,12 +1,13 @@
-"""When nothing recorded may stay: from what a topic showed, recording by recording. Pure.
+"""Computes which data to exclude, from the values of a topic in each recording. Pure.
 
-What a message says holds from its log time on: on a latched topic until the next one, on any other
-for `stale` after the last one. It holds no longer than its recording, which hears the topic anew,
-but for this: where the condition holds at the end, it goes on in the recordings that follow until
-one of them hears the topic, for `stale` at most; and where another recording has taken over by
-then, what was known holds for `stale` more, until that one must have heard it.
+A message is valid from its log time on: on a latched topic until the next one, on any other topic
+for `stale` after the last one. It is valid only in its own recording, since the next one receives
+the topic again. Exception: a condition that is true at the end of a recording stays true in the
+following ones, for at most `stale`, until one of them receives the topic. If another recording has
+taken over by then, the last value is valid for `stale` more, until that recording must have
+received the topic.
 
-Everything else is unknown, and so is what lies in a span in which the clock was set back.
+All other times are unknown, and so are spans in which the clock was set back.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExclusionRule:
-    """When nothing recorded may stay.
+    """A rule of `recording.exclude_when`.
 
     Attributes:
         name: unique among the rules.
-        topic: whose messages show it.
-        condition: what they must meet.
-        margin: for how long before and after nothing stays either.
-        stale: for how long a message holds where its topic is not latched.
-        excludes_unknown: nothing stays either while it is not known whether the condition holds.
+        topic: the topic whose messages decide.
+        condition: the condition that they must meet.
+        margin: how long before and after is excluded, too.
+        stale: for how long a message is valid if its topic is not latched.
+        excludes_unknown: whether times with an unknown value are excluded, too.
     """
 
     name: str

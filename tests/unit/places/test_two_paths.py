@@ -13,7 +13,12 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Rectangle
-from ros2_memory.places.two_paths import PlacedStandstill, farthest_apart, placed_stands, stood_at
+from ros2_memory.places.two_paths import (
+    PlacedStandstill,
+    farthest_apart,
+    placed_standstills,
+    stood_at,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -99,17 +104,17 @@ def test_only_the_window_and_the_region_count_and_no_way_is_drawn_across_a_gap()
 def test_without_a_way_there_is_nothing_to_be_far_from() -> None:
     way = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)])
     assert farthest_apart((way, EVER), (empty_track(), EVER)) == (None, None)
-    assert [*placed_stands(empty_track(), [(0, S)])] == []
+    assert [*placed_standstills(empty_track(), [(0, S)])] == []
 
 
 def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> None:
     way = track([(0.0, 1.0, 2.0), (20.0, 1.0, 2.0)], [(100.0, 7.0, 2.0), (120.0, 7.0, 2.0)])
     spans = [(2 * S, 18 * S), (50 * S, 70 * S), (105 * S, 115 * S)]
-    assert [*placed_stands(way, spans)] == [
+    assert [*placed_standstills(way, spans)] == [
         PlacedStandstill(1.0, 2.0, 2 * S, 16 * S),
         PlacedStandstill(7.0, 2.0, 105 * S, 10 * S),
     ]
-    assert len([*placed_stands(way, spans, Rectangle(5.0, 8.0, 0.0, 3.0))]) == 1
+    assert len([*placed_standstills(way, spans, Rectangle(5.0, 8.0, 0.0, 3.0))]) == 1
 
 
 stands = st.lists(

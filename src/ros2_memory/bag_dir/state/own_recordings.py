@@ -281,7 +281,7 @@ class OwnRecordings:
         self._add({name: _Entry()})
 
     def complete(self, name: str) -> bool:
-        """Lists which directory the child made for a recording; False while there is none.
+        """Lists the directory that the child made for a recording; False while there is none.
 
         Raises:
             RecorderError: it cannot be written.
@@ -333,7 +333,7 @@ class OwnRecordings:
         return found
 
     def _gone(self, names: Iterable[str]) -> list[str]:
-        """Returns the recordings of which nothing lies in the bag directory any more."""
+        """Returns the recordings that are no longer in the bag directory."""
         gone = []
         for name in names:
             try:

@@ -141,7 +141,7 @@ def opened(memory: Memory, window: TimeWindow) -> Scene:
     """Returns what is asked for, as far as the memory spans it.
 
     Raises:
-        NoDataError: the memory holds nothing, or nothing of that time.
+        NoDataError: nothing is recorded, or nothing of that time.
     """
     view = View(memory, Call())
     require_bags(view)

@@ -46,7 +46,7 @@ def moment_shown(memory: Memory, call: Call, request: MomentRequest) -> JsonObje
 
     Raises:
         InvalidArgumentsError: neither a moment nor a stretch was given.
-        NoDataError: the memory holds nothing.
+        NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
     start_s, end_s = request.start_s, request.end_s

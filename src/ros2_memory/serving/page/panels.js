@@ -79,7 +79,7 @@ function showThings(host, view, choose) {
   const now = view.range.now;
   const rows = view.things.map((each) => pair(
     el("span", {}, link(each.label, () => choose(each)), each.in ? ` in ${plain(each.in)}` : "",
-      each.state === MISSED ? el("span", { class: "warn" }, " no longer there") : ""),
+      each.state === MISSED ? el("span", { class: "warn" }, " not seen where expected") : ""),
     `${metres(each)} \u00b7 ${ago(now - each.last)}`));
   host.replaceChildren(...(rows.length ? listing(rows, 8)
     : [soft(view.events.some((each) => each.kind === "thing")
@@ -97,7 +97,7 @@ function showEvents(host, view, point) {
     .map(([kind, n]) => `${n} ${n === 1 ? ONE[kind] || kind : kind}`).join(", ");
   host.replaceChildren(...(counts ? [soft(counts)] : []),
     ...(shown.length ? listing(eventRows(shown, point), 8)
-      : [soft(view.isWhole ? "Nothing happened." : "Not known yet.")]),
+      : [soft(view.isWhole ? "No events." : "Not known yet.")]),
     ...notesOf(view.notes));
 }
 
@@ -117,15 +117,15 @@ function faults(title, kind, range) {
     ...listing(rows)];
 }
 const recorderOf = (status) => (status.recorder === null ? "" : status.recorder
-  + (status.recorder_alive ? "" : ", not alive")
+  + (status.recorder_alive ? "" : ", no heartbeat")
   + (status.restarts ? `, ${counted(status.restarts, "restart")}` : ""));
 
 function showState(host, status, range) {
   const sound = status.trust === "nothing is known to be missing";
   const own = status.budget.max_gb !== null;
   const recorder = recorderOf(status)
-    || (own ? "not heard of" : state.recording ? "not shown for one recording"
-      : "none belongs to this memory");
+    || (own ? "no heartbeat yet" : state.recording ? "not shown for one recording"
+      : "none in this deployment");
   const halted = status.latest !== null && status.now === status.latest;
   const failing = status.recorder !== null && status.recorder !== "stopped"
     && !status.recorder_alive;

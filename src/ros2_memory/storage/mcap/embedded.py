@@ -60,12 +60,12 @@ def custom_data(path: Path) -> dict[str, str] | None:
     return {}
 
 
-def retold(record: Metadata, retell: Callable[[str], str]) -> Metadata:
+def retold(record: Metadata, edit_metadata: Callable[[str], str]) -> Metadata:
     """Returns a metadata record; that of rosbag2 with its text changed."""
     text = record.metadata.get(_KEY)
     if record.name != _NAME or text is None:
         return record
-    return Metadata(name=record.name, metadata={**record.metadata, _KEY: retell(text)})
+    return Metadata(name=record.name, metadata={**record.metadata, _KEY: edit_metadata(text)})
 
 
 def _before_messages(file: OpenFile) -> Iterator[McapRecord]:

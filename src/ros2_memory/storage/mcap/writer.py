@@ -93,12 +93,12 @@ class McapWriter(BagWriter):
         source: Path,
         target: Path,
         takes: Callable[[str, Ns, Ns], bool],
-        retell: Callable[[str], str],
+        edit_metadata: Callable[[str], str],
     ) -> Counter[str]:
         """Writes a whole file again without some messages."""
         if source.suffix.lower() != ".mcap":
             with _written(target) as stream, reading(source):
-                return cut_sqlite(source, target, stream, takes, retell)
+                return cut_sqlite(source, target, stream, takes, edit_metadata)
         taken = Counter[str]()
         with _written(target) as stream:
             with reading(source), OpenFile(source) as file:
@@ -108,7 +108,7 @@ class McapWriter(BagWriter):
                 copy, digest = _Copy(_writer(stream)), ContentDigest()
                 for record in _without(salvage, takes, taken):
                     if isinstance(record, mcap_records.Metadata):
-                        record = retold(record, retell)  # noqa: PLW2901 - in its place
+                        record = retold(record, edit_metadata)  # noqa: PLW2901 - in its place
                     if digest.add(record):
                         copy.put(record)
                     elif isinstance(record, mcap_records.Message):
