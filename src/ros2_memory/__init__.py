@@ -7,7 +7,7 @@ Two programs share a directory of bags and nothing else. The **recorder**
 Modules at the top::
 
     server          entry point of the query server
-    bootstrap       composition root
+    bootstrap       composition root; bootstrap_fleet: of many robots
     config          the configuration: models, loading, errors, sources
     queries         one function for each tool of the specification
     results         what queries and insights return
@@ -33,6 +33,7 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     counts          how often, how long and how far in each day, hour or weekday
     insights        the tools beyond the specification
     tools           declarations, arguments, replies as JSON
+    fleet           the tools of one robot, asked of many, and their replies as one
     serving         dispatch, MCP, HTTP, access, limits, health
     observability   Prometheus, OpenTelemetry
     demo            the simulated robot of `ros2-memory demo`

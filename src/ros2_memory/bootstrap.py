@@ -15,7 +15,7 @@ import os
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from hydra.errors import HydraException
 from hydra.utils import instantiate
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.telemetry import Observer
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.retention.repair import Repairer
@@ -330,8 +332,31 @@ def supposed_own(bag_dir: Path) -> OwnRecordings:
     return own
 
 
-def build_memory(settings: Settings) -> Memory:
+class SharedParts(NamedTuple):
+    """What memories of the same settings can share, with its caches: the reader and the decoder."""
+
+    reader: BagReader
+    schemas: Mapping[str, Mapping[str, str]]
+    extractor: SchemaExtractor
+
+
+def shared_parts(settings: Settings) -> SharedParts:
+    """Returns what reads and decodes the bags of one memory, or of several.
+
+    Raises:
+        ConfigError: the reader cannot be built, or the schema map is refused.
+    """
+    from ros2_memory.extract import SchemaExtractor
+
+    schemas = load_message_schemas(settings)
+    extractor = SchemaExtractor(schemas, settings.data.max_array_length)
+    return SharedParts(build_reader(settings), schemas, extractor)
+
+
+def build_memory(settings: Settings, shared: SharedParts | None = None) -> Memory:
     """Returns the memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
+
+    `shared` is what it has in common with other memories; its own where None.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
@@ -339,15 +364,13 @@ def build_memory(settings: Settings) -> Memory:
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.catalogue.store import Catalogue
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.context import Memory
     from ros2_memory.recorder.index_manager import IndexManager
 
     clock = WallClock()
-    schemas = load_message_schemas(settings)
-    extractor = SchemaExtractor(schemas, settings.data.max_array_length)
-    bag_dir = settings.recording.bag_dir
-    reader = BagDirReader(build_reader(settings), bag_dir)
+    shared = shared or shared_parts(settings)
+    schemas, bag_dir = shared.schemas, settings.recording.bag_dir
+    reader = BagDirReader(shared.reader, bag_dir)
     catalogue = Catalogue(
         partial(catalogue_paths, settings),
         catalogue_fingerprint(settings, schemas),
@@ -365,7 +388,7 @@ def build_memory(settings: Settings) -> Memory:
         only=settings.data.recording,
     )
     recall = DigestCache(catalogue, bag_dir)
-    return Memory(index, reader, extractor, clock, query_settings_of(settings), recall)
+    return Memory(index, reader, shared.extractor, clock, query_settings_of(settings), recall)
 
 
 def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
@@ -505,9 +528,13 @@ def places_of(settings: Settings) -> tuple[Place, ...]:
 
 
 def build_dispatcher(
-    settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
+    settings: Settings,
+    memory: Memory,
+    telemetry: Telemetry = SILENT,
+    fleet: Fleet | None = None,
 ) -> Dispatcher:
-    """Returns what answers tool calls from a memory."""
+    """Returns what answers tool calls from a memory, or from those of a fleet's robots."""
+    from ros2_memory.fleet.tools import fleet_tools
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.replies import Replies
     from ros2_memory.tools.spec_tools import build_tools, readable_tools
@@ -518,12 +545,14 @@ def build_dispatcher(
         additions=server.tools == "all",
         writing=server.write_tools,
     )
+    if fleet is not None:
+        tools = fleet_tools(tools, fleet, server.max_reply_chars)
     return Dispatcher(
         memory,
         tools,
         Replies(settings.recording.bag_dir, server.max_reply_chars),
         call_timeout_s=server.call_timeout_s,
-        readable=readable_tools(memory.limits),
+        readable=readable_tools(memory.limits) if fleet is None else (),
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
         most_questions=server.keep_questions,
@@ -535,8 +564,12 @@ def build_server(
     memory: Memory,
     telemetry: Telemetry = SILENT,
     catalogue: Callable[[], Progress] | None = None,
+    fleet: Fleet | None = None,
 ) -> EpisodicServer:
-    """Returns the MCP server that answers from a memory; `catalogue`: how far that is filled."""
+    """Returns the MCP server that answers from a memory, or from those of a fleet's robots.
+
+    `catalogue`: how far that is filled.
+    """
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.tools.instructions import instructions
 
@@ -545,10 +578,12 @@ def build_server(
     # each 700 new ones takes up to a sixth of the first answers.
     gc.set_threshold(_NEW_OBJECTS)
     return EpisodicServer(
-        build_dispatcher(settings, memory, telemetry),
+        build_dispatcher(settings, memory, telemetry, fleet),
         name=server.name,
         version=package_version(),
-        instructions=instructions(memory.limits, additions=server.tools == "all"),
+        instructions=instructions(
+            memory.limits, additions=server.tools == "all", several=fleet is not None
+        ),
         catalogue=catalogue,
     )
 

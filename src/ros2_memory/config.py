@@ -13,6 +13,7 @@ alone.
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 import sys
@@ -32,7 +33,7 @@ from typing import (
 
 from hydra import compose, initialize_config_dir
 from omegaconf import ListConfig, OmegaConf
-from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 from pydantic.types import PathType
 from pydantic_core import to_jsonable_python
@@ -101,6 +102,36 @@ def _dot_path(path: str) -> str:
     return path
 
 
+def _robot_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name) or ".." in name:
+        raise ValueError(
+            f"must name each robot by up to 64 letters, digits, '-', '_' and '.', not {name[:80]!r}"
+        )
+    return name
+
+
+def _robots_found(value: object) -> object:
+    """Returns the robots of a pattern such as `/data/*/bags`, by what its `*` stands for."""
+    if value is None:
+        raise ValueError("must name robots: {r1: /data/r1/bags, ...}, or a pattern: /data/*/bags")
+    if not isinstance(value, str):
+        return value
+    pattern = str(expand_home(value))
+    before, star, after = pattern.partition("*")
+    if not star or any(mark in after for mark in "*?[") or any(mark in before for mark in "?["):
+        raise ValueError("must have one *, which stands for the robot's name, as /data/*/bags has")
+    folders = [each for each in sorted(glob.glob(pattern)) if Path(each).is_dir()]  # noqa: PTH207
+    if not folders:
+        raise ValueError("must match the folders of robots, and matches none")
+    return {each[len(before) : len(each) - len(after)]: each for each in folders}
+
+
+def _one_star(pattern: str) -> str:
+    if pattern.count("*") != 1:
+        raise ValueError("must have one *, which stands for the robot's name")
+    return str(expand_home(pattern))
+
+
 def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
     """Checks that no spelling leads to two names; case, spacing and plurals do not count."""
     known: dict[str, tuple[str, str]] = {}
@@ -134,6 +165,7 @@ ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
 MessageType: TypeAlias = Annotated[Text, AfterValidator(_message_type)]
 BelowBagDir: TypeAlias = Annotated[Text, AfterValidator(_below)]
 DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
+RobotName: TypeAlias = Annotated[Text, AfterValidator(_robot_name)]
 
 _REFUSE_UNKNOWN: Final = ConfigDict(extra="forbid")
 
@@ -243,6 +275,29 @@ class ServerSettings:
     keep_questions: Annotated[int, Field(strict=True, ge=0, le=1000)]
     metrics: Flag
     traces: Flag
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class FleetSettings:
+    """The robots that one server answers for; none where it answers for `recording.bag_dir`.
+
+    `robots` has the bag directory of each by its name; it may be given as a pattern. `places` is
+    the pattern of the robots' own files of named places. `shared_map`: whether coordinates mean the
+    same place for all. `tokens` has, by the file of a token, the robots that it may ask about.
+    """
+
+    robots: Annotated[dict[RobotName, AnyPath], BeforeValidator(_robots_found)]
+    places: Annotated[Text, AfterValidator(_one_star)] | None
+    shared_map: Flag
+    tokens: dict[AnyPath, tuple[RobotName, ...]]
+
+    def __post_init__(self) -> None:
+        """Refuses tokens for robots that there are not."""
+        for file, names in self.tokens.items():
+            if unknown := sorted({*names} - self.robots.keys()):
+                raise ValueError(
+                    f"must have in tokens, under {file}, robots of the fleet, not {unknown[0]}"
+                )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -448,6 +503,7 @@ class Settings:
     reader: ReaderSettings
     retention: RetentionSettings
     server: ServerSettings
+    fleet: FleetSettings
     logging: LoggingSettings
     storage: Annotated[McapNode | Rosbag2Node, Field(discriminator="target")]
     recorder: Annotated[Ros2BagNode | NullRecorderNode, Field(discriminator="target")]

@@ -202,7 +202,8 @@ def _split_variable(given: Mapping[str, str]) -> list[str]:
 
 def _names_token(text: str) -> bool:
     """Returns whether a text sets a token as if it were a setting; it must not be shown then."""
-    return re.search(r"token\w*\s*=", text, re.IGNORECASE) is not None
+    # `fleet.tokens` has the names of files.
+    return re.search(r"(?<!\bfleet\.)token\w*\s*=", text, re.IGNORECASE) is not None
 
 
 def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:

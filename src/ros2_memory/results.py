@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
@@ -843,6 +844,25 @@ class Bins(AnswerWithNotes):
     usual_exit: Usual | None = None
 
 
-Answer: TypeAlias = (
+OneAnswer: TypeAlias = (
     AnswerWithNotes | tuple[TopicRow, ...] | RememberedMoment | MomentList | ShownMoment
 )
+
+
+@dataclass(frozen=True, slots=True)
+class OfRobot:
+    """What one robot of a fleet answers; its files are named relative to `bag_dir`."""
+
+    name: str
+    bag_dir: Path
+    answer: OneAnswer
+
+
+@dataclass(frozen=True, slots=True)
+class OfFleet:
+    """What several robots answer, as one JSON value."""
+
+    value: dict[str, JsonValue]
+
+
+Answer: TypeAlias = OneAnswer | OfRobot | OfFleet

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import anyio
 import uvicorn
@@ -26,24 +26,31 @@ from ros2_memory.bootstrap import (
     build_server,
     build_telemetry,
 )
+from ros2_memory.bootstrap_fleet import build_fleet, robot_settings
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.sd_notify import READY, STOPPING, notify
-from ros2_memory.serving.auth import take_token
-from ros2_memory.serving.backfill import keep_backfilled
+from ros2_memory.core.text import counted
+from ros2_memory.serving.auth import limited_tokens, take_token
+from ros2_memory.serving.backfill import Filler, keep_all_backfilled, keep_backfilled
 from ros2_memory.serving.connection_limits import (
     ACCEPTED_AT_ONCE,
     BoundedConnection,
 )
-from ros2_memory.serving.health import Health, keep_fresh
+from ros2_memory.serving.health import FleetHealth, Health, keep_fresh
 from ros2_memory.serving.listen import BACKLOG, CannotListenError, bound, resolved
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.serving.web_app import STREAM_PATH, web_app
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from starlette.routing import Route
+
+    from ros2_memory.config import Settings
+    from ros2_memory.core.telemetry import Telemetry
+    from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.listen import Address
@@ -89,24 +96,25 @@ def _run(overrides: Sequence[str]) -> None:
         )
         at = settings.server
         address, token = None, None
+        limited: dict[str, frozenset[str]] = {}
         if at.transport != "stdio":
             # Before anything is built, so that a refusal comes at once.
             address = resolved(at.host, at.port)
-            token = take_token(os.environ, host=at.host, loopback=address.is_loopback)
+            limited = limited_tokens(settings.fleet.tokens)
+            token = take_token(
+                os.environ, host=at.host, loopback=address.is_loopback, limited=bool(limited)
+            )
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
-    backfill = build_backfill(settings, memory)
-    server = build_server(settings, memory, telemetry, backfill.progress)
-    health = Health(memory, package_version(), backfill)
-    background = partial(
-        _in_background, memory, backfill, settings.reader.index_refresh_s, overrides
-    )
-    log.info(
-        "starting",
-        version=package_version(),
-        bag_dir=str(settings.recording.bag_dir.absolute()),
-        transport=at.transport,
-    )
+        fleet = build_fleet(settings)
+    if fleet is None:
+        parts = _parts_of_one(settings, memory, telemetry, overrides)
+        bag_dir = str(settings.recording.bag_dir.absolute())
+    else:
+        parts = _parts_of_fleet(settings, memory, fleet, telemetry, overrides)
+        bag_dir = f"those of {counted(len(fleet.robots), 'robot')}"
+    server, health, background = parts.server, parts.health, parts.background
+    log.info("starting", version=package_version(), bag_dir=bag_dir, transport=at.transport)
     try:
         if address is None:
             anyio.run(_serve_stdio, server, background)
@@ -118,7 +126,8 @@ def _run(overrides: Sequence[str]) -> None:
                 background=background,
                 api_token=token.get_secret_value() if token else None,
                 metrics=telemetry.metrics,
-                page=page_routes(server.dispatcher, backfill.progress),
+                page=parts.page,
+                limited=limited,
             )
             _serve_http(server, app, address)
     except SystemExit:
@@ -127,6 +136,52 @@ def _run(overrides: Sequence[str]) -> None:
         server.dispatcher.stop()
         health.stop()
         telemetry.stop()
+
+
+class _Parts(NamedTuple):
+    """What differs between a server of one robot and that of a fleet."""
+
+    server: EpisodicServer
+    health: Health | FleetHealth
+    background: Background
+    page: Sequence[Route] | None
+
+
+def _parts_of_one(
+    settings: Settings, memory: Memory, telemetry: Telemetry, overrides: Sequence[str]
+) -> _Parts:
+    backfill = build_backfill(settings, memory)
+    server = build_server(settings, memory, telemetry, backfill.progress)
+    return _Parts(
+        server,
+        Health(memory, package_version(), backfill),
+        partial(_in_background, memory, backfill, settings.reader.index_refresh_s, overrides),
+        page_routes(server.dispatcher, backfill.progress),
+    )
+
+
+def _parts_of_fleet(
+    settings: Settings,
+    memory: Memory,
+    fleet: Fleet,
+    telemetry: Telemetry,
+    overrides: Sequence[str],
+) -> _Parts:
+    """Returns the parts of a fleet's server, which has no page: that shows one robot."""
+    robots = {
+        each: build_backfill(robot_settings(settings, name), each.memory())
+        for name, each in fleet.robots.items()
+    }
+    reports = {
+        each.name: Health(each.memory(), package_version(), backfill)
+        for each, backfill in robots.items()
+    }
+    return _Parts(
+        build_server(settings, memory, telemetry, fleet=fleet),
+        FleetHealth(reports, package_version()),
+        partial(_fleet_in_background, robots, settings.reader.index_refresh_s, overrides),
+        None,
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -167,15 +222,40 @@ def _end_threads(code: int) -> int:
     return code
 
 
+def _helper(overrides: Sequence[str], *options: str) -> list[str]:
+    """Returns the command line of the program that digests a backlog."""
+    program = [sys.executable, "-m", "ros2_memory.cli", "index"]
+    return [*program, "--for-server", str(os.getpid()), *options, "--", *overrides]
+
+
 async def _in_background(
     memory: Memory, backfill: Backfill, every_s: float, overrides: Sequence[str]
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
-    program = [sys.executable, "-m", "ros2_memory.cli", "index"]
-    helper = [*program, "--for-server", str(os.getpid()), "--", *overrides]
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_fresh, memory, every_s)
-        tasks.start_soon(keep_backfilled, backfill, helper, every_s)
+        tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s)
+
+
+async def _fleet_in_background(
+    robots: Mapping[Robot, Backfill], every_s: float, overrides: Sequence[str]
+) -> None:
+    """Keeps the indexes fresh and the catalogues full, until it is cancelled.
+
+    A disk that hangs keeps the scans of its own robot waiting alone.
+    """
+    limiter = anyio.CapacityLimiter(len(robots))
+    fillers = [
+        (
+            each.memory(),
+            Filler(backfill, _helper(overrides, "--bag-dir", str(each.bag_dir.absolute()))),
+        )
+        for each, backfill in robots.items()
+    ]
+    async with anyio.create_task_group() as tasks:
+        for memory, _ in fillers:
+            tasks.start_soon(keep_fresh, memory, every_s, limiter)
+        tasks.start_soon(keep_all_backfilled, fillers, every_s)
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,8 @@ from hydra.utils import instantiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.config import NullRecorderNode, load_settings
+from ros2_memory.config import NullRecorderNode, Settings, load_settings
+from ros2_memory.core.errors import ConfigError
 from ros2_memory.recorder.base import NullRecorder
 from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, refusal
 
@@ -81,6 +83,7 @@ class TestDefaults:
                 "metrics": False,
                 "traces": False,
             },
+            "fleet": {"robots": {}, "places": None, "shared_map": False, "tokens": {}},
             "logging": {"level": "info", "format": "json", "arguments": True},
             "storage": {
                 "target": MCAP,
@@ -252,6 +255,44 @@ class TestPrecedence:
         assert (settings.server.transport, settings.data.now) == ("stdio", "latest")
 
 
+class TestFleet:
+    def test_a_pattern_names_robots_by_what_its_star_stands_for(self, tmp_path: Path) -> None:
+        for name in ("r1", "r2", "no bags"):
+            (tmp_path / name).mkdir()
+        for name in ("r1", "r2"):
+            (tmp_path / name / "bags").mkdir()
+        settings = fleet_of(f"{tmp_path}/*/bags")
+        assert settings.fleet.robots == {name: tmp_path / name / "bags" for name in ("r1", "r2")}
+
+    @pytest.mark.parametrize(
+        ("robots", "fragment"),
+        [
+            ("null", "must name robots"),
+            ("/data/r1", "must have one *"),
+            ("/nowhere/*/bags", "matches none"),
+            ("{../r1: /data}", "not '../r1'"),
+            ("{a..b: /data}", "not 'a..b'"),
+            ("{r/1: /data}", "not 'r/1'"),
+            (f"{{{'r' * 65}: /data}}", "up to 64"),
+        ],
+    )
+    def test_refuses_names_that_could_be_paths_and_patterns_without_robots(
+        self, robots: str, fragment: str
+    ) -> None:
+        with pytest.raises(ConfigError, match=re.escape(fragment)):
+            fleet_of(robots)
+
+    def test_tokens_are_files_for_robots_that_there_are(self) -> None:
+        settings = fleet_of("{r1: /a, r2: /b}", "fleet.tokens={/run/site: [r1]}")
+        assert settings.fleet.tokens == {Path("/run/site"): ("r1",)}
+        with pytest.raises(ConfigError, match="robots of the fleet, not r3"):
+            fleet_of("{r1: /a}", "fleet.tokens={/run/site: [r3]}")
+
+
+def fleet_of(robots: str, *more: str) -> Settings:
+    return load_settings([f"fleet.robots={robots}", *more], {"MEMORY_DEPLOYMENT": "fleet"})
+
+
 class TestPresets:
     @pytest.mark.parametrize(
         ("preset", "storage", "recorder", "transport", "now"),
@@ -260,19 +301,28 @@ class TestPresets:
             ("robot_live", MCAP, ROS2BAG, "sse", "wall"),
             ("query_only", ROSBAG2, NONE, "stdio", "wall"),
             ("replay", ROSBAG2, NONE, "stdio", "latest"),
+            ("fleet", ROSBAG2, NONE, "stdio", "wall"),
             ("local", MCAP, NONE, "stdio", "wall"),
         ],
     )
     def test_set_adapters_and_keys(
         self, preset: str, storage: str, recorder: str, transport: str, now: str
     ) -> None:
-        settings = load_settings((), {"MEMORY_DEPLOYMENT": preset})
+        robots = ["fleet.robots={r1: /data/r1/bags}"] if preset == "fleet" else []
+        settings = load_settings(robots, {"MEMORY_DEPLOYMENT": preset})
         assert (settings.storage.target, settings.recorder.target) == (storage, recorder)
         assert (settings.server.transport, settings.data.now) == (transport, now)
 
     def test_each_shipped_one_is_tested_here(self) -> None:
         shipped = {path.stem for path in (ROOT / "config/deployment").iterdir()}
-        assert shipped == {"robot", "robot_live", "query_only", "replay", "local"}
+        assert shipped == {
+            "robot",
+            "robot_live",
+            "query_only",
+            "replay",
+            "fleet",
+            "local",
+        }
 
     def test_robot_live_is_robot_that_answers_from_the_split_being_written(self) -> None:
         robot, live = (

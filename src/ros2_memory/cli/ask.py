@@ -10,6 +10,7 @@ import anyio
 import typer
 
 from ros2_memory.bootstrap import build_dispatcher
+from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
@@ -37,7 +38,7 @@ from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.spec_tools import build_tools
 
 _SETTING: Final = re.compile(
-    r"((recording|data|reader|retention|server|logging)\.\w|(deployment|storage|recorder)=).*",
+    r"((recording|data|reader|retention|server|fleet|logging)\.\w|(deployment|storage|recorder)=).*",
     re.DOTALL,
 )
 """A word that sets a setting; no argument of a tool is named so."""
@@ -85,8 +86,9 @@ def ask(
         tool, words = None, [tool, *words]
     of_settings = [each for each in words if _SETTING.fullmatch(each)]
     loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
-    memory = open_memory(loaded, verbose=verbose)
-    dispatcher = build_dispatcher(loaded, memory)
+    fleet = None if bag_dir is not None else build_fleet(loaded)
+    memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
+    dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     tools = {each.name: each for each in dispatcher.tools}
     if tool is None:
         rows: list[JsonValue] = [_tool_row(each.name, each.schema) for each in dispatcher.tools]

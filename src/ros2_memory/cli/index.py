@@ -17,6 +17,7 @@ from typing import Annotated, Final
 import typer
 
 from ros2_memory.bootstrap import build_backfill, build_memory
+from ros2_memory.bootstrap_fleet import robot_settings
 from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
     AsJson,
@@ -57,14 +58,35 @@ def index(
     the background; the catalogue changes only the speed of answers.
     """
     settings = load_for(bag_dir, overrides)
-    if for_server is None:
+    if for_server is not None:
+        _fill_for_server(settings, for_server)
+    elif settings.fleet.robots and bag_dir is None:
+        _fill_fleet(settings, as_json=as_json, verbose=verbose)
+    else:
         progress = _fill_for_people(settings, verbose=verbose)
         if as_json:
             print_line(json.dumps(as_object(progress)))
         else:
             print(describe_progress(progress), file=sys.stderr)
-    else:
-        _fill_for_server(settings, for_server)
+
+
+def _fill_fleet(settings: Settings, *, as_json: bool, verbose: bool) -> None:
+    """Fills the catalogues of a fleet's robots; names those whose bags cannot be listed."""
+    done: dict[str, JsonValue] = {}
+    problems: list[str] = []
+    for name in settings.fleet.robots:
+        try:
+            progress = _fill_for_people(robot_settings(settings, name), verbose=verbose)
+        except RecorderError as error:
+            problems.append(f"{name}: {error}")
+            continue
+        done[name] = as_object(progress)
+        if not as_json:
+            print(f"{describe_progress(progress)} of {name}", file=sys.stderr)
+    if as_json:
+        print_line(json.dumps(done))
+    if problems:
+        raise RecorderError("; ".join(problems))
 
 
 def _fill_for_people(settings: Settings, *, verbose: bool) -> Progress:

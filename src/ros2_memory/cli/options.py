@@ -233,9 +233,10 @@ def require_recorder(settings: Settings) -> None:
         )
 
 
-def open_memory(settings: Settings, *, verbose: bool = False) -> "Memory":
+def open_memory(settings: Settings, *, verbose: bool = False, scans: bool = True) -> "Memory":
     """Returns the memory of the configured bags, with an index of the directory as it is now.
 
+    Without an index where it `scans` not, because others are asked.
     `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
     prints the count when the command ends.
 
@@ -249,6 +250,8 @@ def open_memory(settings: Settings, *, verbose: bool = False) -> "Memory":
     if not verbose:
         withhold_warnings()
     memory = build_memory(settings)
+    if not scans:
+        return memory
     with spinner(f"looking through {settings.recording.bag_dir}"):
         snapshot = memory.index.refresh()
     if settings.data.recording is not None and snapshot.problem:

@@ -162,6 +162,10 @@ class Deadline:
         at_s = min(self.at_s, self._monotonic() + budget_s)
         return Deadline(at_s, min(self.budget_s, budget_s), self._monotonic)
 
+    def left_s(self) -> float:
+        """Returns the seconds that are left; none or fewer where the time is up."""
+        return self.at_s - self._monotonic()
+
     def expired(self) -> bool:
         """Returns whether the time is up."""
         return self._monotonic() >= self.at_s

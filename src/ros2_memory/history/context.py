@@ -138,16 +138,16 @@ class _StageTimer:
 
 
 class Stages:
-    """How long one call spent where: `index`, `read`, `extract`."""
+    """How long one call spent where: `index`, `read`, `extract`; `spent` has nanoseconds."""
 
-    __slots__ = ("_spent",)
+    __slots__ = ("spent",)
 
     def __init__(self) -> None:
-        self._spent: dict[str, Ns] = {}
+        self.spent: dict[str, Ns] = {}
 
     def add(self, stage: str, spent: Ns) -> None:
         """Adds nanoseconds to a stage."""
-        self._spent[stage] = self._spent.get(stage, 0) + spent
+        self.spent[stage] = self.spent.get(stage, 0) + spent
 
     def timed(self, stage: str) -> _StageTimer:
         """Returns a context manager that adds the time that its block takes."""
@@ -155,7 +155,7 @@ class Stages:
 
     def as_ms(self) -> dict[str, float]:
         """Returns milliseconds by stage, for the log event of the call."""
-        return {stage: round(ms_from_ns(spent), 3) for stage, spent in self._spent.items()}
+        return {stage: round(ms_from_ns(spent), 3) for stage, spent in self.spent.items()}
 
 
 @dataclass(slots=True)
@@ -165,12 +165,14 @@ class Call:
     Attributes:
         used_active: whether the answer is partly from a bag that is still being written.
         stores_joined: whether what is joined of many bags is stored for other processes.
+        robots: those of a fleet that it may ask about; None for all.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
     used_active: bool = False
     stores_joined: bool = False
+    robots: frozenset[str] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,7 @@ from ros2_memory.core.logging_setup import LogThrottle, get_logger
 from ros2_memory.serving.page import PAGE_PATH
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, MutableMapping
+    from collections.abc import Callable, Mapping, MutableMapping, Sequence
 
     from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -53,6 +53,8 @@ LONGEST_TOKEN: Final = 1024
 LOG_INTERVAL_S: Final = 60.0
 """Wrong tokens are logged at most this often: guessing must not fill the disk with log events."""
 
+_ROBOTS: Final = "ros2_memory.robots"
+"""The key in the scope of a request: the robots that its token is for; absent where for all."""
 _ADMITTED: Final = "ros2_memory.admitted"
 """The key in the state of a request, which its connection can read."""
 _SAME_SITE: Final = frozenset({"same-origin", "none"})
@@ -60,6 +62,11 @@ _SAME_SITE: Final = frozenset({"same-origin", "none"})
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
 _SCHEME: Final = b"bearer "
 _MISSING: Final = "A token is needed: send it as Authorization: Bearer TOKEN.\n"
+_QUESTIONS: Final = ("/sse", "/messages/", "/mcp")
+"""How the paths begin that a limited token may use."""
+_FORBIDDEN: Final = PlainTextResponse(
+    "The token is for questions about some robots alone.\n", status_code=403
+)
 _WRONG: Final = "The token is not the one of this server.\n"
 _HOW: Final = "make one with `openssl rand -hex 32`"
 # The characters of a bearer token: RFC 6750, section 2.1 (b64token).
@@ -79,19 +86,36 @@ def is_admitted(scope: Mapping[str, object]) -> bool:
     return isinstance(state, dict) and state.get(_ADMITTED) is True
 
 
+def robots_of(scope: Mapping[str, object]) -> frozenset[str] | None:
+    """Returns the robots that the token of a request is for; None where it is for all."""
+    robots = scope.get(_ROBOTS)
+    return robots if isinstance(robots, frozenset) else None
+
+
 class TokenGate:
     """Passes on requests with the right `Authorization: Bearer ...` (RFC 6750, section 2.1).
 
     Every other request is answered with 401 before its body is read. `/health` is passed on without
     a token too, marked as such. A token in a query string is not accepted, since query strings are
-    logged. Only the token's digest is kept, and digests are compared in constant time.
+    logged. Only tokens' digests are kept, and digests are compared in constant time.
+
+    `token` is for everything. Each of `limited` is for the questions of MCP alone, about the
+    robots that it has here; for `/health` it counts as none.
     """
 
     def __init__(
-        self, app: ASGIApp, token: str, monotonic: Callable[[], float] = time.monotonic
+        self,
+        app: ASGIApp,
+        token: str | None,
+        monotonic: Callable[[], float] = time.monotonic,
+        limited: Mapping[str, frozenset[str]] | None = None,
     ) -> None:
         self._app = app
-        self._digest = _digest(token.encode("ascii"))
+        self._digests: list[tuple[bytes, frozenset[str] | None]] = [
+            (_digest(each.encode("ascii")), robots) for each, robots in (limited or {}).items()
+        ]
+        if token is not None:
+            self._digests.append((_digest(token.encode("ascii")), None))
         self._refusals = LogThrottle(monotonic, LOG_INTERVAL_S)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -100,18 +124,34 @@ class TokenGate:
             await self._app(scope, receive, send)
             return
         shown = [value for name, value in scope["headers"] if name == b"authorization"]
-        if len(shown) == 1 and self._is_right(shown[0]):
+        is_right, robots = self._checked(shown[0]) if len(shown) == 1 else (False, None)
+        is_health = scope["path"] in {HEALTH_PATH, RECORDING_PATH}
+        if is_right and robots is None:
             admit(scope)
             await self._app({**scope, AUTHENTICATED: True}, receive, send)
-        elif not shown and scope["path"] in {HEALTH_PATH, RECORDING_PATH}:
+        elif is_right and is_health:
+            await self._app({**scope, AUTHENTICATED: False}, receive, send)
+        elif is_right and not scope["path"].startswith(_QUESTIONS):
+            await _FORBIDDEN(scope, receive, send)
+        elif is_right:
+            admit(scope)
+            await self._app({**scope, AUTHENTICATED: False, _ROBOTS: robots}, receive, send)
+        elif not shown and is_health:
             await self._app({**scope, AUTHENTICATED: False}, receive, send)
         else:
             self._log_refused(scope, is_wrong=bool(shown))
             await _unauthorized(is_wrong=bool(shown))(scope, receive, send)
 
-    def _is_right(self, header: bytes) -> bool:
+    def _checked(self, header: bytes) -> tuple[bool, frozenset[str] | None]:
+        """Returns whether a header has a token of this server, and the robots that it is for."""
         scheme, token = header[: len(_SCHEME)].lower(), header[len(_SCHEME) :].strip(b" ")
-        return hmac.compare_digest(_digest(token), self._digest) and scheme == _SCHEME
+        shown = _digest(token)
+        right: tuple[bool, frozenset[str] | None] = (False, None)
+        for digest, robots in self._digests:
+            # All are compared, so that the time says nothing of which it was.
+            if hmac.compare_digest(shown, digest):
+                right = True, robots
+        return right if scheme == _SCHEME else (False, None)
 
     def _log_refused(self, scope: Scope, *, is_wrong: bool) -> None:
         """Logs the client and the number of refusals; nothing that was sent, not even the path."""
@@ -251,17 +291,37 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     return SecretStr(text)
 
 
-def take_token(env: MutableMapping[str, str], *, host: str, loopback: bool) -> SecretStr | None:
+def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[str]]:
+    """Returns the tokens in files, each with the robots that it is for.
+
+    Raises:
+        ConfigError: a file cannot be read, its token cannot be used, or two have the same one.
+    """
+    tokens: dict[str, frozenset[str]] = {}
+    for path, names in robots.items():
+        source = f"fleet.tokens: {path}"
+        text = _read_token(path, source)
+        _require_usable(text, source)
+        if text in tokens:
+            raise ConfigError(f"{source}: another file has the same token; {_HOW}")
+        tokens[text] = frozenset(names)
+    return tokens
+
+
+def take_token(
+    env: MutableMapping[str, str], *, host: str, loopback: bool, limited: bool = False
+) -> SecretStr | None:
     """Returns the token of a server on `host`; None only where no other machine can reach it.
 
-    Removes it from the environment, which child processes inherit.
+    Where there are `limited` ones, none that is for everything is needed. Removes it from the
+    environment, which child processes inherit.
 
     Raises:
         ConfigError: there must be a token, or the one that there is cannot be used.
     """
     token = api_token(env)
     env.pop(VARIABLE, None)
-    if token is None and not loopback:
+    if token is None and not loopback and not limited:
         raise ConfigError(
             f"{VARIABLE}: missing; server.host is {host!r}, which other machines can reach, so "
             f"clients must send a token: {_HOW} and give it as {VARIABLE}, in a file that "

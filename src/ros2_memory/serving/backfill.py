@@ -27,7 +27,7 @@ from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.history.bag_fold import JOINED_VERSION
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import store_shared_paths
@@ -62,6 +62,10 @@ BACKLOG: Final = 8
 PRUNE_INTERVAL_S: Final = 600.0
 """How often the entries of deleted files are removed."""
 
+LONGEST_TURN_S: Final = 600.0
+"""How long one of several catalogues is filled before it is the next one's turn."""
+_LATELY: Final = 4
+"""Intervals between scans after which bags count as out of reach."""
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be digested is tried again: the disk may have failed."""
 
@@ -313,29 +317,64 @@ async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: fl
 
     `helper` is the command line of the program that digests a backlog (`ros2-memory index`).
     """
-    pruned_s, is_precomputed = -math.inf, False
+    filler = Filler(backfill, helper)
     while True:
+        await filler.fill()
+        await anyio.sleep(every_s)
+
+
+async def keep_all_backfilled(fillers: Sequence[tuple[Memory, Filler]], every_s: float) -> None:
+    """Fills several catalogues, one after the other, until it is cancelled.
+
+    A memory whose bags were not scanned lately is passed over: its disk may hang.
+    """
+    while True:
+        for memory, filler in fillers:
+            published = memory.index.published
+            if published is None or published.problem is not None:
+                continue
+            if memory.clock.now() - published.scanned_at > ns_from_unix(_LATELY * every_s):
+                continue
+            with anyio.move_on_after(LONGEST_TURN_S):
+                await filler.fill()
+        await anyio.sleep(every_s)
+
+
+class Filler:
+    """Fills one catalogue, a round at a time; see `keep_backfilled`."""
+
+    def __init__(self, backfill: Backfill, helper: Sequence[str]) -> None:
+        self._backfill = backfill
+        self._helper = helper
+        self._pruned_s = -math.inf
+        self._is_precomputed = False
+
+    async def fill(self) -> None:
+        """Digests the closed bags that there are. Raises nothing but cancellation."""
         try:
-            due = time.monotonic() - pruned_s > PRUNE_INTERVAL_S
-            await _in_thread(partial(backfill.look_after, thorough=due))
-            waiting = await _in_thread(backfill.waiting)
-            waiting = await _in_thread(partial(backfill.renew, waiting))
-            # A catalogue that is in memory cannot be filled by another process.
-            has_file = backfill.catalogue.path is not None
-            if len(waiting) > BACKLOG and has_file and await _run_helper(helper):
-                # Bags that the helper could not digest are tried here, and refused if they fail.
-                waiting = await _in_thread(backfill.waiting)
-            done = await _digest(backfill, waiting[:BACKLOG])
-            # Earlier, bags without a digest would be read for it.
-            if (done or not is_precomputed) and len(waiting) <= BACKLOG:
-                await _in_thread(backfill.precompute)
-                is_precomputed = True
-            if due:
-                await _in_thread(backfill.prune)
-                pruned_s = time.monotonic()
+            await self._fill()
         except Exception:
             log.exception("filling_failed")
-        await anyio.sleep(every_s)
+
+    async def _fill(self) -> None:
+        backfill = self._backfill
+        due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
+        await _in_thread(partial(backfill.look_after, thorough=due))
+        waiting = await _in_thread(backfill.waiting)
+        waiting = await _in_thread(partial(backfill.renew, waiting))
+        # A catalogue that is in memory cannot be filled by another process.
+        has_file = backfill.catalogue.path is not None
+        if len(waiting) > BACKLOG and has_file and await _run_helper(self._helper):
+            # Bags that the helper could not digest are tried here, and refused if they fail.
+            waiting = await _in_thread(backfill.waiting)
+        done = await _digest(backfill, waiting[:BACKLOG])
+        # Earlier, bags without a digest would be read for it.
+        if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
+            await _in_thread(backfill.precompute)
+            self._is_precomputed = True
+        if due:
+            await _in_thread(backfill.prune)
+            self._pruned_s = time.monotonic()
 
 
 async def _in_thread(work: Callable[[], T]) -> T:

@@ -70,6 +70,7 @@ class Dispatcher:
     Attributes:
         questions: the latest calls with their replies.
         tools: the tools that a call can name, in the order of their declaration.
+        readable: the names of those that a resource can name.
         quick: the queue of the other tools.
         blocking: the queue of the tools that are declared as blocking.
     """
@@ -91,6 +92,7 @@ class Dispatcher:
         self._memory = memory
         self._tools = {tool.name: tool for tool in tools}
         self._readable = self._tools | {each.name: each for each in readable}
+        self.readable = frozenset(self._readable)
         self._replies = replies
         self._call_timeout_s = call_timeout_s
         self._telemetry = telemetry
@@ -113,17 +115,20 @@ class Dispatcher:
         *,
         for_resource: bool = False,
         for_page: bool = False,
+        robots: frozenset[str] | None = None,
     ) -> Reply:
         """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
         Where more calls wait than there are threads, `client`s take turns. `for_resource`: whether
         the tools that only the resources use can be named, too. `for_page`: whether the page asks,
-        which does not keep its own questions.
+        which does not keep its own questions. `robots`: those of a fleet that the client may ask
+        about; None for all.
         """
         tools = self._readable if for_resource else self._tools
         begun = time.perf_counter_ns()
         over = threading.Event()
         call = self._call(over)
+        call.robots = robots
         outcome, text = "cancelled", ""
         correlation_id = uuid.uuid4().hex[:12]
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):

@@ -20,7 +20,10 @@ from ros2_memory.serving.fair_queue import FairQueue
 from ros2_memory.tools.reply_json import moment, seconds
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
@@ -38,11 +41,18 @@ _MAX_CHARS: Final = 300
 log = get_logger(__name__)
 
 
-async def keep_fresh(memory: Memory, every_s: float) -> None:
-    """Scans the bag directory every `every_s` seconds, until it is cancelled."""
+async def keep_fresh(
+    memory: Memory, every_s: float, limiter: anyio.CapacityLimiter | None = None
+) -> None:
+    """Scans the bag directory every `every_s` seconds, until it is cancelled.
+
+    `limiter`: of the threads for it; those for all background work where None.
+    """
     while True:
         try:
-            await anyio.to_thread.run_sync(memory.index.refresh, abandon_on_cancel=True)
+            await anyio.to_thread.run_sync(
+                memory.index.refresh, abandon_on_cancel=True, limiter=limiter
+            )
         except Exception:
             log.exception("index_refresh_failed")
         await anyio.sleep(every_s)
@@ -81,6 +91,46 @@ class Health:
         with anyio.move_on_after(self._timeout_s), suppress(BusyError):
             return await self._queue.run(None, self._report)
         return _status(self._version, ["the bag directory is being scanned"], {})
+
+
+class FleetHealth:
+    """Reports the state of a fleet's server: the robots' states, each by its own `Health`."""
+
+    def __init__(self, robots: Mapping[str, Health], version: str) -> None:
+        self._robots = robots
+        self._version = version
+
+    def stop(self) -> None:
+        """Ends the threads when they are done."""
+        for each in self._robots.values():
+            each.stop()
+
+    async def __call__(self) -> JsonObject:
+        """Returns the report of each robot; `degraded` where one of them is.
+
+        A robot that does not answer in time delays the report by `TIMEOUT_S`, whatever their
+        number.
+        """
+        reports: dict[str, JsonObject] = {}
+
+        async def ask(name: str, health: Health) -> None:
+            reports[name] = await health()
+
+        async with anyio.create_task_group() as tasks:
+            for name, health in self._robots.items():
+                tasks.start_soon(ask, name, health)
+        problems = [
+            f"{name}: {problem}" for name in self._robots for problem in _problems(reports[name])
+        ]
+        robots: JsonObject = {}
+        for name in self._robots:
+            robots[name] = {key: value for key, value in reports[name].items() if key != "version"}
+        return _status(self._version, problems, {"robots": robots})
+
+
+def _problems(report: JsonObject) -> list[JsonValue]:
+    problems = report.get("problems")
+    return problems if isinstance(problems, list) else []
 
 
 def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:

@@ -35,6 +35,7 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
+from ros2_memory.serving.auth import robots_of
 from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
@@ -153,8 +154,12 @@ class EpisodicServer(MCPServer[object]):
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
-        self._resources = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
-        self._templates = [each[0] for each in _TEMPLATES.values()] if has_status else []
+        offered = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
+        readable = dispatcher.readable
+        self._resources = [each for each in offered if TOOLS_OF_RESOURCES[each.uri] in readable]
+        self._templates = [
+            template for template, tool, _ in _TEMPLATES.values() if has_status and tool in readable
+        ]
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
 
     async def list_tools(self) -> list[ListedTool]:
@@ -174,7 +179,11 @@ class EpisodicServer(MCPServer[object]):
             ):
                 tasks.start_soon(self._report_progress, context.report_progress)
             reply = await self.dispatcher.answer(
-                name, arguments, _client(context), for_page=_is_page(context)
+                name,
+                arguments,
+                _client(context),
+                for_page=_is_page(context),
+                robots=_robots(context),
             )
             tasks.cancel_scope.cancel()
         return CallToolResult(
@@ -209,7 +218,9 @@ class EpisodicServer(MCPServer[object]):
         """
         name, arguments = self._resource_call(str(uri))
         client = _client(context)
-        reply = await self.dispatcher.answer(name, arguments, client, for_resource=True)
+        reply = await self.dispatcher.answer(
+            name, arguments, client, for_resource=True, robots=_robots(context)
+        )
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
     def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
@@ -232,7 +243,7 @@ class EpisodicServer(MCPServer[object]):
     ) -> Completion | None:
         """Returns what a template's parameter can be, as far as it has been typed."""
         of = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        if of not in _VALUES:
+        if of not in {each.uri_template for each in self._templates}:
             return None
         tool, key = _VALUES[of]
         reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
@@ -311,6 +322,12 @@ def _client(context: object) -> Hashable:
     address = request.client.host if request.client else ""
     name = request.headers.get("mcp-session-id") or request.headers.get("user-agent", "")
     return address, name[:_LONGEST_NAME]
+
+
+def _robots(context: object) -> frozenset[str] | None:
+    """Returns the robots that the token of a request is for; None where it is for all."""
+    request = context.request_context.request if isinstance(context, Context) else None
+    return robots_of(request.scope) if isinstance(request, Request) else None
 
 
 def _is_page(context: object) -> bool:

@@ -28,7 +28,7 @@ from ros2_memory.serving.page import Page
 from ros2_memory.serving.request_limits import RequestLimits
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 
     from mcp.server.mcpserver import MCPServer
     from mcp.server.streamable_http_manager import StreamableHTTPSessionManager
@@ -78,7 +78,8 @@ def web_app(
     background: Background,
     api_token: str | None = None,
     metrics: Callable[[], Awaitable[Exposition]] | None = None,
-    page: Sequence[Route] = (),
+    page: Sequence[Route] | None = (),
+    limited: Mapping[str, frozenset[str]] | None = None,
 ) -> WebApp:
     """Returns the application that listens on `host`.
 
@@ -90,8 +91,10 @@ def web_app(
         api_token: demanded of every request, if there is one. Requests without it see only the
             status of `/health`, and the page, which holds no data and asks for it.
         metrics: returns what `/metrics` shows; without it there is no such path.
-        page: where the page reads what it shows.
+        page: where the page reads what it shows; None for a server without a page.
+        limited: other tokens, each with the robots of a fleet that it is for.
     """
+    needs_token = api_token is not None or bool(limited)
     # `ForgeryGuard` checks all routes instead, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     streams = server.sse_app(sse_path=STREAM_PATH, transport_security=guarded)
@@ -102,13 +105,13 @@ def web_app(
 
     async def show_health(request: Request) -> JSONResponse:
         report = await health()
-        if api_token is not None and not request.scope.get(AUTHENTICATED, False):
+        if needs_token and not request.scope.get(AUTHENTICATED, False):
             # Enough for a monitor that only watches that the server is up.
             report = {"status": report["status"]}
         return JSONResponse(report)
 
     async def show_recording(request: Request) -> JSONResponse:
-        known = api_token is None or request.scope.get(AUTHENTICATED, False)
+        known = not needs_token or request.scope.get(AUTHENTICATED, False)
         return _recording(await health(), all_of_it=known)
 
     @asynccontextmanager
@@ -124,7 +127,7 @@ def web_app(
         Route(_MCP_PATH, McpEndpoint(plain.handle_request, streaming.handle_request)),
         Route(HEALTH_PATH, show_health, methods=["GET"]),
         Route(RECORDING_PATH, show_recording, methods=["GET"]),
-        *page,
+        *(page or ()),
     ]
     if metrics is not None:
 
@@ -134,10 +137,12 @@ def web_app(
 
         routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
     app: ASGIApp = RequestLimits(SessionIds(Starlette(routes=routes, lifespan=lifespan)))
-    if api_token is not None:
-        app = TokenGate(app, api_token)
-    # The page comes before the token: it holds no data, and asks for the token.
-    return WebApp(ForgeryGuard(Page(app), host, admits=api_token is None))
+    if needs_token:
+        app = TokenGate(app, api_token, limited=limited)
+    if page is not None:
+        # The page comes before the token: it holds no data, and asks for the token.
+        app = Page(app)
+    return WebApp(ForgeryGuard(app, host, admits=not needs_token))
 
 
 def _session_manager(

@@ -34,6 +34,11 @@ you been here?": visits. "How low was it?": get_topic_in_last with fields and ma
 "Usually? Each day or room?": by. "Can I trust this?": memory_status.
 - where: a place's name, {{x, y, radius_m}} or {{"x": [from, to], "y": [from, to]}}.
 """
+_SEVERAL: Final = """\
+- robot names one of several robots. Without it find_*, visits, compare, recap, memory_status, \
+list_recorded_topics and data_time_range answer for all, newest first, rows with robot_name. \
+Clocks, maps and frames of robots may differ: pass where by name.
+"""
 _REST: Final = """\
 - Positions are in metres, yaw_deg counter-clockwise from x, in frame_id ({pose_topic}: origin \
 usually where the robot was switched on; not a map). get_transform_* relates frames.
@@ -42,13 +47,15 @@ fields. Call tools marked Blocking one at a time.
 """
 
 
-def instructions(settings: QuerySettings, *, additions: bool = True) -> str:
+def instructions(settings: QuerySettings, *, additions: bool = True, several: bool = False) -> str:
     """Returns the rules that prevent most wrong calls, with this deployment's defaults.
 
     Clients cut instructions at about 2,000 characters; these are shorter. `additions`: whether the
-    tools beyond the specification are offered.
+    tools beyond the specification are offered. `several`: whether it is the memory of several
+    robots.
     """
-    return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
+    found = (_HAPPENED if additions else _SEEN) + (_SEVERAL if several else "")
+    return (_RULES + found + _REST).format(
         or_text=" or ISO 8601 (2026-11-20T14:05; local without offset)" if additions else "",
         newest="the newest 3 s or so are not on disk yet and"
         if settings.include_active

@@ -20,9 +20,9 @@ from ros2_memory.tools import (  # noqa: F401 - register replies
     reply_json_motion,
     reply_json_things,
 )
-from ros2_memory.tools.reply_json import render, with_notes
+from ros2_memory.tools.reply_json import ROBOT_NAME, render, with_notes
 from ros2_memory.tools.reply_json_memory import file_name, time_range
-from ros2_memory.tools.reply_json_topics import fit_topics
+from ros2_memory.tools.reply_json_topics import fit_topics, topic_row
 from ros2_memory.tools.reply_size import fit_reply, to_json_text
 
 if TYPE_CHECKING:
@@ -40,6 +40,24 @@ class Reply:
     is_error: bool = False
 
 
+def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
+    """Returns an answer as a JSON value of any size; files are named relative to `bag_dir`."""
+    if isinstance(answer, tuple):
+        return [topic_row(row) for row in answer]
+    if isinstance(answer, results.DataTimeRange):
+        return time_range(answer, bag_dir)
+    return render(answer)
+
+
+def named(robot_name: str, value: JsonValue) -> JsonObject:
+    """Returns the JSON value of an answer with the name of its robot.
+
+    That is first in an object; "never", which is null, becomes an object whose values are null.
+    """
+    whole = value if isinstance(value, dict) else {"timestamp": None, "value": None}
+    return {ROBOT_NAME: robot_name, **whole}
+
+
 @dataclass(frozen=True, slots=True)
 class Replies:
     """Renders answers and errors. File names are shown relative to `bag_dir`, never absolute."""
@@ -53,13 +71,16 @@ class Replies:
         `from_active`: whether messages of a split that is still being written were read, which a
         reply that is an object shows.
         """
+        name = None
+        if isinstance(answer, results.OfRobot):
+            name, bag_dir, answer = answer.name, answer.bag_dir, answer.answer
+        else:
+            bag_dir = self.bag_dir
         if isinstance(answer, tuple):
-            return Reply(fit_topics(answer, self.max_chars))
-        value = (
-            time_range(answer, self.bag_dir)
-            if isinstance(answer, results.DataTimeRange)
-            else render(answer)
-        )
+            return Reply(fit_topics(answer, self.max_chars, name))
+        value = answer.value if isinstance(answer, results.OfFleet) else as_json(answer, bag_dir)
+        if name is not None:
+            value = named(name, value)
         if not isinstance(value, dict):
             return Reply(to_json_text(value))
         if from_active:

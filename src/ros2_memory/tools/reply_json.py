@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
 """Shorter spans have no local times."""
+ROBOT_NAME: Final = "robot_name"
+"""The key of the robot that an answer or a row is of, in a fleet; `robot` is where one was."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
 

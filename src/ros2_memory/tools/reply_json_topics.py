@@ -9,6 +9,7 @@ from ros2_memory import results
 from ros2_memory.core.text import listed, shortened
 from ros2_memory.core.timebase import Ns, unix_rounded_up
 from ros2_memory.tools.reply_json import (
+    ROBOT_NAME,
     LocalTimes,
     metres,
     moment,
@@ -37,20 +38,26 @@ LONGEST_MATCHED: Final = 200
 _MAX_ZEROS_NAMED: Final = 20
 
 
-def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
+def fit_topics(
+    rows: Sequence[results.TopicRow], max_chars: int, robot_name: str | None = None
+) -> str:
     """Returns the list of topics as JSON text of at most `max_chars` characters.
+
+    Each row has the name of the robot, if there is one.
 
     It is always a list of rows. Where it would be longer, the busiest topics come first, and the
     last row sums up those left out: their first and last time and all their messages. `max_chars`
     must be at least 500.
     """
-    text = to_json_text([_topic_row(row) for row in rows])
+    name: JsonObject = {} if robot_name is None else {ROBOT_NAME: robot_name}
+    text = to_json_text([name | topic_row(row) for row in rows])
     if len(text) <= max_chars:
         return text
     busiest = sorted(rows, key=lambda row: -row.count)
-    shown: list[JsonValue] = [_topic_row(row) for row in busiest]
+    shown: list[JsonValue] = [name | topic_row(row) for row in busiest]
     sizes = accumulate(len(to_json_text(row)) + 1 for row in shown)
-    fitting = sum(size <= max_chars - _LONGEST_LAST_ROW_CHARS for size in sizes)
+    longest = _LONGEST_LAST_ROW_CHARS + len(to_json_text(name))
+    fitting = sum(size <= max_chars - longest for size in sizes)
     rest = busiest[fitting:]
     others = results.TopicRow(
         f"({len(rest)} more: use pattern)",
@@ -59,10 +66,11 @@ def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
         max(row.last for row in rest),
         sum(row.count for row in rest),
     )
-    return to_json_text([*shown[:fitting], _topic_row(others)])
+    return to_json_text([*shown[:fitting], name | topic_row(others)])
 
 
-def _topic_row(row: results.TopicRow) -> JsonObject:
+def topic_row(row: results.TopicRow) -> JsonObject:
+    """Returns the row of a topic in the list of all."""
     return {
         "topic": row.topic,
         "type": row.type,

@@ -1,0 +1,218 @@
+"""The tools of one robot as those of a fleet: with the argument `robot`, and for all without it.
+
+The tools themselves are unchanged: each is asked of the memory of a robot. Where it is asked of
+several, their replies become one (`merging`), and what keeps a robot from answering is a note.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import (
+    BagError,
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+    RefusedError,
+)
+from ros2_memory.core.text import listed
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_rounded_up
+from ros2_memory.fleet.fan_out import FanOut
+from ros2_memory.fleet.merging import (
+    ANSWER_FOR_ALL,
+    MATCHES,
+    MERGED_ROWS,
+    TOPICS,
+    RobotReply,
+    merged,
+)
+from ros2_memory.fleet.robots import Robot, StoppedClock
+from ros2_memory.results import OfFleet, OfRobot
+from ros2_memory.tools.replies import as_json
+from ros2_memory.tools.reply_json import ROBOT_NAME
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ros2_memory.fleet.robots import Fleet
+    from ros2_memory.history.context import Call
+    from ros2_memory.results import Answer, OneAnswer
+    from ros2_memory.tools.declaration import Question, Tool
+    from ros2_memory.tools.reply_size import JsonObject
+
+ROBOT: Final = "robot"
+"""The argument that names a robot."""
+_AHEAD_NS: Final[Ns] = 60 * NS_PER_S
+"""Data that is newer than now by more was dated by a clock that runs ahead."""
+_REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
+"""Tools whose reply says itself that a bag directory is missing."""
+
+
+def fleet_tools(tools: Sequence[Tool], fleet: Fleet, max_chars: int) -> tuple[Tool, ...]:
+    """Returns the tools of a fleet, without those that write.
+
+    `max_chars` is how long a reply may be: rows for many robots are given shortly before that.
+    """
+    fan_out = FanOut()
+    return tuple(
+        replace(
+            tool,
+            describe=partial(_described, tool),
+            # One robot that is slow must not keep a quick tool's thread.
+            blocking=tool.blocking or tool.name in ANSWER_FOR_ALL,
+            question=_FleetQuestions(tool, fleet, fan_out, max_chars),
+        )
+        for tool in tools
+        if not tool.writes
+    )
+
+
+def _described(tool: Tool) -> tuple[str, JsonObject]:
+    text, schema = tool.description, tool.schema
+    needs = "Its name; without it, all." if tool.name in ANSWER_FOR_ALL else "Its name."
+    properties = schema.get("properties")
+    known = properties if isinstance(properties, dict) else {}
+    argument: JsonObject = {"type": "string", "description": needs}
+    return _for_all(tool.name, text), {**schema, "properties": {ROBOT: argument, **known}}
+
+
+def _for_all(tool: str, text: str) -> str:
+    """Returns a description with the shape of the reply for all robots."""
+    if tool not in ANSWER_FOR_ALL:
+        return text
+    shape = f"{{robots: [{{{ROBOT_NAME}, ...}}]}}"
+    if tool in MERGED_ROWS:
+        key = next(iter(MERGED_ROWS[tool].rows))
+        name = f"{ROBOT_NAME}s" if key == TOPICS else ROBOT_NAME
+        also = ", never: robots that never did" if key == MATCHES else ""
+        shape = f"{{{key}: [{{{name}, ...}}]{also}}}"
+    return f"{text} Of all robots: {shape}."
+
+
+@dataclass(frozen=True, slots=True)
+class _FleetQuestions:
+    """Checks the arguments of a call, and returns what asks one robot or all."""
+
+    tool: Tool
+    fleet: Fleet
+    fan_out: FanOut
+    max_chars: int
+
+    def __call__(self, given: Mapping[str, object]) -> Question:
+        own = {name: value for name, value in given.items() if name != ROBOT}
+        question = self.tool.question(own)
+        name = given.get(ROBOT)
+        if name is not None:
+            return lambda _, call: _of_one(self.fleet.named(name, call), question, call)
+        if self.tool.name not in ANSWER_FOR_ALL:
+            return lambda _, call: _of_one(self.fleet.the_one(self.tool.name, call), question, call)
+        return lambda _, call: self._of_all(question, own, call)
+
+    def _of_all(self, question: Question, given: Mapping[str, object], call: Call) -> OfFleet:
+        robots = self.fleet.allowed(call)
+        if not robots:
+            raise RefusedError("there is no robot that this token may ask about")
+        if len(robots) > 1 and not self.fleet.shared_map and (name := _coordinates_in(given)):
+            raise InvalidArgumentsError(
+                f"{name} has coordinates, which each robot has in a map of its own: pass robot, or "
+                "where with the name of a place (fleet.shared_map is set where all share one map)"
+            )
+        robots.sort(key=Robot.latest_known, reverse=True)
+        now = StoppedClock(self.fleet.clock.now())
+        found = self.fan_out.ask(robots, partial(self._reply, question, now), call)
+        replies = [each for each in found.values() if isinstance(each, RobotReply)]
+        errors = {name: each for name, each in found.items() if isinstance(each, EpisodicError)}
+        if not replies:
+            raise _shared_error(errors)
+        limit, oldest_first = given.get("limit"), given.get("oldest_first")
+        return OfFleet(
+            merged(
+                self.tool.name,
+                replies,
+                {name: _reason(each) for name, each in errors.items()},
+                limit=self._limit(limit),
+                oldest_first=oldest_first is True,
+                max_chars=self.max_chars,
+            )
+        )
+
+    def _reply(self, question: Question, now: StoppedClock, robot: Robot, call: Call) -> RobotReply:
+        """Returns a robot's reply; runs in a thread of its own.
+
+        Raises:
+            EpisodicError: it has none.
+        """
+        memory = robot.memory()
+        snapshot = memory.index.snapshot()
+        if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
+            # It would say "never" of what nobody can know.
+            raise RefusedError(
+                snapshot.problem.replace("recording.bag_dir (MEMORY_BAG_DIR)", "fleet.robots")
+            )
+        answer = question(replace(memory, clock=now), call)
+        value = as_json(_single(answer), robot.bag_dir)
+        latest = snapshot.latest
+        is_ahead = latest is not None and latest > now.at + _AHEAD_NS
+        return RobotReply(robot.name, value, latest, is_ahead)
+
+    def _limit(self, given: object) -> int | None:
+        """Returns how many rows a call wants, all robots together."""
+        if isinstance(given, int | float):
+            return int(given)
+        properties = self.tool.schema.get("properties")
+        schema = properties.get("limit") if isinstance(properties, dict) else None
+        default = schema.get("default") if isinstance(schema, dict) else None
+        return default if isinstance(default, int) else None
+
+
+def _of_one(robot: Robot, question: Question, call: Call) -> OfRobot:
+    return OfRobot(robot.name, robot.bag_dir, _single(question(robot.memory(), call)))
+
+
+def _single(answer: Answer) -> OneAnswer:
+    if isinstance(answer, OfRobot | OfFleet):
+        raise TypeError("a tool of one robot answered for several")
+    return answer
+
+
+def _coordinates_in(given: Mapping[str, object]) -> str | None:
+    """Returns the argument that has coordinates, if there is one."""
+    where = given.get("where")
+    if isinstance(where, dict) or (isinstance(where, str) and where.lstrip().startswith("{")):
+        return "where"
+    if given.get("condition_type") == "near_position":
+        return "value"
+    return next((name for name in ("x", "y") if given.get(name) is not None), None)
+
+
+def _reason(error: EpisodicError) -> str:
+    """Returns why a robot has no answer, as a phrase; names no path of this machine."""
+    match error:
+        case BagError():
+            return f"a bag cannot be read: {error.reason}"
+        case QueryTimeoutError(searched_back_to=int(back_to)):
+            return f"{error} (searched back to {unix_rounded_up(back_to):.3f})"
+        case _:
+            return str(error)
+
+
+def _shared_error(errors: Mapping[str, EpisodicError]) -> EpisodicError:
+    """Returns the error where no robot has an answer."""
+    by_reason: dict[str, list[str]] = {}
+    for name, error in errors.items():
+        by_reason.setdefault(_reason(error), []).append(name)
+    text = "; ".join(f"{listed(names)}: {reason}" for reason, names in by_reason.items())
+    kinds = {type(error) for error in errors.values()}
+    first = next(iter(errors.values()))
+    if isinstance(first, NoDataError) and len(kinds) == 1:
+        reasons = {error.reason for error in errors.values() if isinstance(error, NoDataError)}
+        if len(reasons) == 1:
+            return NoDataError(first.reason, text)
+    if kinds == {InvalidArgumentsError}:
+        return InvalidArgumentsError(str(first) if len(by_reason) == 1 else text)
+    if any(issubclass(kind, QueryTimeoutError) for kind in kinds):
+        return QueryTimeoutError(text)
+    return RefusedError(text)

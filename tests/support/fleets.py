@@ -1,0 +1,94 @@
+"""A small fleet: for each robot a minute in two splits, seeded by its name, and what it saw."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Final
+
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.history.context import Memory, QuerySettings
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    odom,
+    tf,
+    transform,
+    write_mcap,
+)
+from tests.support.clocks import FixedClock
+from tests.support.memories import memory_of
+
+START_S: Final = 1_795_161_600
+NOW: Final = (START_S + 600) * NS_PER_S
+LENGTH_S: Final = 60
+LABELS: Final = ("mug", "scissors", "table")
+SEEN: Final = "/vision/scene/scene_objects"
+
+
+@dataclass(frozen=True)
+class SeededRobot:
+    """What a robot's bags hold: when its data begins, and when it saw what (Unix s)."""
+
+    name: str
+    start_s: int
+    seen: tuple[tuple[int, str], ...]
+
+    @property
+    def end_s(self) -> int:
+        """The last second that has data."""
+        return self.start_s + LENGTH_S - 1
+
+
+def seeded(name: str, *, shift_s: int = 0) -> SeededRobot:
+    """The robot of a name: it sees something every seventh second, and what depends on the name."""
+    chance = Random(name)
+    start = START_S + 10 * chance.randrange(20) + shift_s
+    seen = [(start + at, chance.choice(LABELS)) for at in range(1, LENGTH_S, 7)]
+    return SeededRobot(name, start, tuple(seen))
+
+
+def write_robot(robot: SeededRobot, bag_dir: Path) -> Path:
+    """Writes its bags, dated as their recorder would have left them."""
+    first = robot.start_s * NS_PER_S
+    messages: list[Msg] = [
+        tf(first, transform(first, "map", "odom", (1.0, 2.0, 0.0)), topic="/tf_static")
+    ]
+    seen = dict(robot.seen)
+    for second in range(LENGTH_S):
+        at = first + second * NS_PER_S
+        x = math.sin(second / 10) * 3
+        messages.append(odom(at, x, 0.1 * second, 0.0, vx=0.3))
+        messages.append(tf(at, transform(at, "odom", "base_link", (x, 0.1 * second, 0.0), 0.0)))
+        if second % 20 == 0:
+            messages.append(boolean(at, second == 20, topic="/is_docked"))
+        if robot.start_s + second in seen:
+            label = seen[robot.start_s + second]
+            # What is seen stands still, 2 m apart, in the map.
+            place = (4.0 + 2 * LABELS.index(label) - x, 3.0 - 0.1 * second, 0.0)
+            messages.append(detections(at, [label], topic=SEEN, at=place))
+    half = first + LENGTH_S // 2 * NS_PER_S
+    for number, (begin, end) in enumerate(((first, half), (half, half * 2))):
+        path = bag_dir / "rec" / f"rec_{number}.mcap"
+        part = [each for each in messages if begin <= each.log_time < end]
+        write_mcap(path, part, McapLayout(latched=frozenset({"/tf_static"})))
+        os.utime(path, ns=(min(end, first + LENGTH_S * NS_PER_S),) * 2)
+    return bag_dir
+
+
+def fleet_memory(bag_dir: Path, limits: QuerySettings | None = None) -> Memory:
+    """A robot's memory, asked at `NOW`."""
+    return memory_of(bag_dir, clock=FixedClock(NOW), limits=limits)
+
+
+def fleet_over(folder: Path, names: tuple[str, ...], *, shared_map: bool = False) -> Fleet:
+    """The fleet of `folder/<name>`, asked at `NOW`."""
+    robots = [Robot(name, folder / name, partial(fleet_memory, folder / name)) for name in names]
+    return Fleet(robots, FixedClock(NOW), shared_map=shared_map)

@@ -1,0 +1,125 @@
+"""One question to many robots: none waits for one."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.core.errors import (
+    BusyError,
+    EpisodicError,
+    InvalidArgumentsError,
+    QueryTimeoutError,
+)
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.fleet.fan_out import FanOut
+from ros2_memory.fleet.robots import Robot
+from ros2_memory.history.context import Call
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.history.context import Memory
+
+
+def robots(count: int) -> list[Robot]:
+    def none() -> Memory:
+        raise AssertionError("no memory is needed")
+
+    return [Robot(f"r{number}", Path("bags"), none) for number in range(count)]
+
+
+@pytest.fixture
+def released() -> Iterator[threading.Event]:
+    """Set at the end, so that no thread of a test outlives it."""
+    event = threading.Event()
+    yield event
+    event.set()
+
+
+def test_all_answer_in_their_order_and_what_they_cost_is_the_calls() -> None:
+    def work(robot: Robot, call: Call) -> str:
+        call.stages.add("read", 5)
+        call.used_active = robot.name == "r7"
+        return robot.name.upper()
+
+    call = Call()
+    found = FanOut().ask(robots(9), work, call)
+    assert [*found.items()] == [(f"r{number}", f"R{number}") for number in range(9)]
+    assert call.stages.spent == {"read": 45}
+    assert call.used_active
+
+
+def test_an_error_is_that_of_its_robot_and_a_fault_says_nothing_more() -> None:
+    def work(robot: Robot, _call: Call) -> str:
+        if robot.name == "r0":
+            raise InvalidArgumentsError("no such place")
+        if robot.name == "r1":
+            raise RuntimeError("secret /home/path")
+        return "fine"
+
+    found = FanOut().ask(robots(3), work, Call())
+    assert isinstance(found["r0"], InvalidArgumentsError)
+    assert isinstance(found["r1"], EpisodicError)
+    assert "secret" not in str(found["r1"])
+    assert found["r2"] == "fine"
+
+
+def test_a_robot_that_hangs_costs_its_own_answer_and_is_not_asked_again_until_it_is_done(
+    released: threading.Event,
+) -> None:
+    ended = threading.Event()
+
+    def hangs(robot: Robot, _call: Call) -> str:
+        if robot.name == "r0":
+            released.wait()
+            ended.set()
+        return "fine"
+
+    fan_out = FanOut()
+    found = fan_out.ask(robots(8), hangs, Call(Deadline.after(0.5)))
+    assert isinstance(found["r0"], QueryTimeoutError)
+    assert [found[f"r{number}"] for number in range(1, 8)] == ["fine"] * 7
+
+    again = fan_out.ask(robots(2), lambda *_: "fine", Call())
+    assert isinstance(again["r0"], BusyError)
+    assert again["r1"] == "fine"
+
+    released.set()
+    ended.wait()
+    for thread in threading.enumerate():
+        if thread.name == "robot-r0":
+            thread.join()
+    assert fan_out.ask(robots(1), lambda *_: "fine", Call()) == {"r0": "fine"}
+
+
+def test_as_many_as_are_asked_at_once_may_hang_and_the_rest_still_answers(
+    released: threading.Event,
+) -> None:
+    def hangs(robot: Robot, _call: Call) -> str:
+        if robot.name in {"r0", "r1"}:
+            released.wait()
+        return "fine"
+
+    found = FanOut(at_once=2).ask(robots(4), hangs, Call(Deadline.after(0.5)))
+    assert [each for each in found.values() if isinstance(each, str)] == ["fine", "fine"]
+
+
+def test_a_robot_is_told_when_its_time_is_up() -> None:
+    def heeds(_robot: Robot, call: Call) -> str:
+        while not call.deadline.expired():
+            pass
+        raise QueryTimeoutError("too long", searched_back_to=7)
+
+    found = FanOut().ask(robots(1), heeds, Call(Deadline.after(0.05)))
+    error = found["r0"]
+    assert isinstance(error, QueryTimeoutError)
+    assert error.searched_back_to == 7
+
+
+def test_nobody_is_asked_when_the_call_is_over() -> None:
+    found = FanOut().ask(robots(3), lambda *_: "fine", Call(Deadline.after(-1)))
+    assert all(isinstance(each, QueryTimeoutError) for each in found.values())

@@ -1,0 +1,202 @@
+"""Merging: what several robots answered, as one reply."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.fleet.merging import RobotReply, merged
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+MANY = 10**6
+NAMES = st.lists(
+    st.sampled_from([f"r{number}" for number in range(8)]), unique=True, min_size=1, max_size=6
+)
+
+
+def reply_of(tool: str, replies: Sequence[RobotReply], **how: Any) -> dict[str, Any]:
+    failures: Mapping[str, str] = how.pop("failures", {})
+    found = merged(tool, replies, failures, max_chars=how.pop("max_chars", MANY), **how)
+    assert json.loads(json.dumps(found)) == found
+    return found
+
+
+@st.composite
+def sighting_replies(draw: st.DrawFn) -> list[RobotReply]:
+    """Replies of `find_matches`, each newest first."""
+    replies = []
+    for name in draw(NAMES):
+        times = sorted(draw(st.lists(st.integers(0, 30), max_size=6)), reverse=True)
+        rows = [{"topic": "/seen", "last_seen": float(at), "of": name} for at in times]
+        total = len(rows) + draw(st.integers(0, 2))
+        value: dict[str, Any] = {
+            "sightings": rows,
+            "total": total,
+            "searched_from": float(draw(st.integers(-9, 0))),
+            "searched_to": float(draw(st.integers(31, 40))),
+        }
+        if total > len(rows):
+            value["more"] = True
+        replies.append(RobotReply(name, value, latest=draw(st.none() | st.integers(0, 50))))
+    return replies
+
+
+@given(sighting_replies(), st.integers(1, 12))
+def test_rows_are_the_newest_of_all_robots_each_with_its_name(
+    replies: list[RobotReply], limit: int
+) -> None:
+    found = reply_of("find_matches", replies, limit=limit)
+    values: list[Any] = [each.value for each in replies]
+    every = [row for value in values for row in value["sightings"]]
+    rows = found["sightings"]
+    assert len(rows) == min(limit, len(every))
+    assert [row["last_seen"] for row in rows] == sorted(
+        (row["last_seen"] for row in every), reverse=True
+    )[:limit]
+    assert all(row["robot_name"] == row["of"] for row in rows)
+    assert found["total"] == sum(value["total"] for value in values)
+    assert found["searched_from"] == min(value["searched_from"] for value in values)
+    assert found["searched_to"] == max(value["searched_to"] for value in values)
+    assert {name: row["total"] for name, row in found["by_robot"].items()} == {
+        each.name: value["total"] for each, value in zip(replies, values, strict=True)
+    }
+    hides = len(every) > limit or any(value.get("more") for value in values)
+    assert found.get("more", False) is hides
+
+
+@given(sighting_replies())
+def test_of_one_robot_the_rows_are_its_own_in_its_own_order(replies: list[RobotReply]) -> None:
+    one = replies[0]
+    found = reply_of("find_matches", [one])
+    value: Any = one.value
+    expected = [{"robot_name": one.name, **row} for row in value["sightings"]]
+    assert found["sightings"] == expected
+
+
+def test_oldest_first_stays_so() -> None:
+    replies = [
+        RobotReply("r1", {"sightings": [{"last_seen": 1.0}, {"last_seen": 5.0}], "total": 2}),
+        RobotReply("r2", {"sightings": [{"last_seen": 3.0}], "total": 1}),
+    ]
+    found = reply_of("find_matches", replies, limit=2, oldest_first=True)
+    assert [row["robot_name"] for row in found["sightings"]] == ["r1", "r2"]
+
+
+def test_a_robot_that_never_did_is_named_and_one_that_could_not_read_all_is_not() -> None:
+    replies = [
+        RobotReply("r1", None),
+        RobotReply("r2", {"timestamp": 7.0, "value": 1, "notes": ["a jump"]}),
+        RobotReply("r3", {"timestamp": None, "value": None, "notes": ["rec_0.mcap is damaged"]}),
+    ]
+    assert reply_of("find_last_match", replies) == {
+        "matches": [{"robot_name": "r2", "timestamp": 7.0, "value": 1}],
+        "never": ["r1"],
+        "notes": ["r2: a jump", "r3: rec_0.mcap is damaged"],
+    }
+
+
+def test_a_clock_that_ran_ahead_is_named_and_its_rows_come_last() -> None:
+    replies = [
+        RobotReply("ahead", {"timestamp": 900.0, "value": 1}, latest=900, is_ahead=True),
+        RobotReply("r1", {"timestamp": 7.0, "value": 1}, latest=8),
+    ]
+    found = reply_of("find_last_match", replies)
+    assert [row["robot_name"] for row in found["matches"]] == ["r1", "ahead"]
+    (note,) = found["notes"]
+    assert note.startswith("ahead: ")
+
+
+def test_a_frame_is_that_of_its_row_and_labels_are_added_up() -> None:
+    def of(name: str, frame: str, labels: dict[str, Any]) -> RobotReply:
+        things: list[Any] = [{"label": label, "last_seen": 1.0} for label in labels]
+        value: Any = {"frame_id": frame, "things": things, "total": len(things), "labels": labels}
+        return RobotReply(name, value)
+
+    found = reply_of("find_things", [of("r1", "map", {"mug": 2}), of("r2", "odom", {"mug": 1})])
+    assert [(row["robot_name"], row["frame_id"]) for row in found["things"]] == [
+        ("r1", "map"),
+        ("r2", "odom"),
+    ]
+    assert found["labels"] == {"mug": 3}
+    assert "frame_id" not in found
+
+
+def test_a_stay_that_goes_on_is_the_newest() -> None:
+    def of(name: str, arrived: float, departed: float | None) -> RobotReply:
+        row: dict[str, Any] = {"arrived": arrived, "departed": departed}
+        value: Any = {"there_now": departed is None, "visits": [row], "total": 1, "minutes": 1.5}
+        return RobotReply(name, value)
+
+    found = reply_of("visits", [of("r1", 8.0, 9.0), of("r2", 1.0, None)])
+    assert [row["robot_name"] for row in found["visits"]] == ["r2", "r1"]
+    assert found["there_now"] == ["r2"]
+    assert found["minutes"] == 3
+
+
+def test_a_topic_has_one_row_with_the_robots_that_record_it() -> None:
+    def row(topic: str, first: float, last: float, count: int) -> dict[str, Any]:
+        return {"topic": topic, "type": "x", "first_ts": first, "last_ts": last, "count": count}
+
+    replies = [
+        RobotReply("r1", [row("/odom", 1.0, 5.0, 10), row("/tf", 1.0, 4.0, 1)], latest=5),
+        RobotReply("r2", [row("/odom", 2.0, 9.0, 20)], latest=9),
+    ]
+    assert reply_of("list_recorded_topics", replies)["topics"] == [
+        {**row("/odom", 1.0, 9.0, 30), "robot_names": ["r2", "r1"]},
+        {**row("/tf", 1.0, 4.0, 1), "robot_names": ["r1"]},
+    ]
+
+
+def test_counts_become_one_table_whose_first_column_is_the_robot() -> None:
+    def of(name: str, columns: list[Any], rows: list[Any]) -> RobotReply:
+        return RobotReply(name, {"topic": "/a", "columns": columns, "rows": rows, "all": [3]})
+
+    found = reply_of(
+        "find_matches",
+        [of("r1", ["day", "count"], [["Mon", 3]]), of("r2", ["day", "count"], [["Tue", 3]])],
+    )
+    assert found == {
+        "columns": ["robot_name", "day", "count"],
+        "rows": [["r1", "Mon", 3], ["r2", "Tue", 3]],
+        "all": {"r1": [3], "r2": [3]},
+        "topic": "/a",
+    }
+
+
+@pytest.mark.parametrize("tool", ["compare", "recap", "memory_status", "data_time_range"])
+def test_where_a_reply_is_about_a_robot_it_becomes_a_row_the_newest_first(tool: str) -> None:
+    replies = [
+        RobotReply(name, {"latest": at, "trust": "x", "notes": ["n"]}, latest=at)
+        for name, at in (("r1", 3), ("r2", 8), ("r3", 5))
+    ]
+    found = reply_of(tool, replies)
+    assert found == {
+        "robots": [
+            {"robot_name": name, "latest": at, "trust": "x", "notes": ["n"]}
+            for name, at in (("r2", 8), ("r3", 5), ("r1", 3))
+        ]
+    }
+
+
+def test_rows_that_are_too_long_together_are_given_shortly() -> None:
+    replies = [
+        RobotReply(f"r{number}", {"trust": "all", "silences": ["x" * 100]}) for number in range(9)
+    ]
+    found = reply_of("memory_status", replies, max_chars=900)
+    assert found["robots"] == [{"robot_name": f"r{n}", "trust": "all"} for n in range(9)]
+    assert "pass robot" in found["notes"][0]
+
+
+def test_who_has_no_answer_is_named_with_the_reason_once() -> None:
+    failures = {"r1": "the disk is gone", "r2": "too slow", "r3": "the disk is gone"}
+    found = reply_of("find_things", [RobotReply("r4", {"things": []})], failures=failures)
+    assert found["notes"] == [
+        "no answer of r1, r3: the disk is gone",
+        "no answer of r2: too slow",
+    ]
