@@ -290,6 +290,18 @@ def test_where_there_are_transforms_alone_the_tool_for_them_is_named(
     assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
 
 
+def test_where_no_topic_has_velocities_the_tool_that_computes_them_is_named(tmp_path: Path) -> None:
+    poses = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    detail = ask(tmp_path, False, "get_velocity_at", timestamp=T0_S + 2)["detail"]
+    assert "nor another with velocities; poses are on /pose" in detail
+    assert "trajectory_summary returns speeds from them, by topic" in detail
+    detail = ask(tmp_path, False, "get_velocity_at", topic="/pose", timestamp=T0_S + 2)["detail"]
+    assert "no topic recorded does; trajectory_summary returns speeds from its poses" in detail
+    way = {"topic": "/pose", "start": T0_S, "end": T0_S + 4}
+    assert ask(tmp_path, False, "trajectory_summary", **way)["avg_speed"] == 1.0
+
+
 def test_recap_names_the_topic_with_poses(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [pose_stamped(T0, 1.0, 2.0, "/pose")])
     reply = ask(tmp_path, False, "recap", start=T0_S, end=T0_S + 1)

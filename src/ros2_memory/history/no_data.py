@@ -98,11 +98,21 @@ def resolve_pose_topic(
                 ", nor another with poses in metres; latitude and longitude are on "
                 f"{listed(fixes)}: {advice}"
             )
-        elif what == "position" and (moving := _transform_topics(view)):
+        elif what == "velocity" and (
+            posed := topics_with(view, "position") or _topics_that_show_poses(view)
+        ):
             detail += (
-                f", nor another with poses; transforms are on {listed(moving)}: get_transform_at "
+                f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
+                "returns speeds from them, by topic"
+            )
+        elif moving := _transform_topics(view):
+            those = {"position": "poses", "velocity": "velocities"}[what]
+            detail += (
+                f", nor another with {those}; transforms are on {listed(moving)}: get_transform_at "
                 "returns the pose of one frame in another, and list_frames lists the frames"
             )
+        elif what == "velocity" and topics_with(view, "geodetic"):
+            detail += ", nor another with velocities"
         else:
             raise
         raise NoDataError(error.reason, detail, error.notes) from error
@@ -397,6 +407,15 @@ def describe_lack(view: View, what: str, found: StoredMessage) -> str:
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
+    if (
+        not topics
+        and what == "velocity"
+        and "position" in view.memory.extractor.kinds_of(channel.type)
+    ):
+        return (
+            f"topic: {channel.topic} is a {channel.type}, which {has}, and no topic recorded does; "
+            "trajectory_summary returns speeds from its poses"
+        )
     return (
         f"topic: {channel.topic} is a {channel.type}, which {has}; give a topic that does, {hint}"
     )
