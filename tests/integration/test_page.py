@@ -15,6 +15,7 @@ from tests.integration.test_server_process import serving
 from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.browser import ENTER, RIGHT, TAB, Browser, browsing, needs_chromium
 from tests.support.documented_history import heartbeat
+from tests.support.processes import until
 from tests.support.robot_run import T0, T0_S
 
 if TYPE_CHECKING:
@@ -462,6 +463,41 @@ def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> 
         assert path["x"][0] == 0
         assert path["x"][-1] == 30
         assert path["begins"] == [0]
+
+
+def test_what_is_answerable_is_shown_by_the_next_poll(chromium: Browser, scratch: Path) -> None:
+    """It polls every 2 s, and the first look that begins once the server knows has all that is new.
+
+    So new data appears within 3 s of being answerable, however busy the machine of the test is.
+    """
+    bag_dir = scratch / "polled"
+    begin = time.time_ns() - 60 * NS_PER_S
+    drive(bag_dir, "one", begin, 20)
+    with serving(bag_dir, scratch / "log_polled", "storage=mcap", "recorder=none") as server:
+        show(chromium, server)
+        chromium.awaits("return state.view.catalogue === null && state.view.isWhole")
+        assert chromium.run("return POLL_MS") <= 2000
+        # Every look, when it was begun, and how far what was shown after it reaches.
+        chromium.run(
+            "window.looks = []; const before = look;"
+            "look = async (...given) => { const mine = { more: given[0] }; looks.push(mine);"
+            " await before(...given); mine.latest = state.view.range.latest; }"
+        )
+        drive(bag_dir, "two", begin + 20 * NS_PER_S, 10, x=20.0)
+        span = server.url("/page/span?last=60&status=0&things=0")
+        newest = until(lambda: _newest(span, begin / NS_PER_S + 25))
+        begun = chromium.run("return looks.length")
+        chromium.awaits("return looks.length > arguments[0] && looks[arguments[0]].latest", begun)
+        first = chromium.run("return looks[arguments[0]]", begun)
+        assert first == {"more": True, "latest": newest}
+        assert chromium.run("return state.view.robot.x") == 30
+        assert chromium.run("return Math.max(...state.view.path.x)") == 30
+
+
+def _newest(address: str, after_s: float) -> float | None:
+    """The newest time that the server answers, once it is later than another."""
+    newest = float(httpx2.get(address).json()["latest"])
+    return newest if newest > after_s else None
 
 
 def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch: Path) -> None:
