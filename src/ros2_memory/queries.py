@@ -396,7 +396,7 @@ def _newest_beside(
     if not frame_history.sessions_of(view).are_joined(recording, newest.bag.recording):
         view.notes.add(
             f"the match is of recording {recording.name}, and the value of "
-            f"{newest.bag.recording.name}: no handover says that both are of one robot"
+            f"{newest.bag.recording.name}: no handover proves that both are of one robot"
         )
     return newest
 
@@ -511,7 +511,9 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     """Notes of an answer that does not show its age that it is latched, and how old it is."""
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
-        view.notes.add(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
+        view.notes.add(
+            f"{topic} is latched: its value of {seconds(at - found.time)} before is still valid"
+        )
 
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:

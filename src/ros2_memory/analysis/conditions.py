@@ -553,7 +553,7 @@ def _refusal_for_position(value: JsonValue) -> str:
             "ask with above or below on field latitude or longitude"
         )
     return (
-        "the values carry no position: near_position needs a topic that does, "
+        "the values have no position: near_position needs a topic that does, "
         "or a field that leads to an object with x and y"
     )
 

@@ -362,7 +362,7 @@ def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
         do = f"journalctl -u ros2-memory-recorder says why it ended; {_START_RECORDER}"
         yield _error("recorder", f"its last heartbeat was {age}, and gives no reason to end", do)
     elif heartbeat.state is RecorderState.PAUSED:
-        why = heartbeat.last_error or "it does not say why"
+        why = heartbeat.last_error or "it gives no reason"
         yield _error("recorder", f"it is paused: {why}", "see disk above")
     elif heartbeat.state is RecorderState.WAITING:
         yield _error("recorder", "it waits, and has recorded nothing", str(heartbeat.waiting_for))
@@ -542,7 +542,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
         yield _ok("server", f"ok on {address}, in {duration_ms:.0f} ms")
     else:
         why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
-        seen = f"{reply.get('status', f'HTTP {status}')}: {why or 'it does not say why'}"
+        seen = f"{reply.get('status', f'HTTP {status}')}: {why or 'it gives no reason'}"
         yield _warning("server", seen, "the findings above and its log have the cause")
 
 

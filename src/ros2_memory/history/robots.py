@@ -262,7 +262,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     if apart:
         names = sorted(each.name for each in apart)
         view.notes.add(
-            f"{len(names)} recordings have messages of their own on {topic} at the same time, as "
+            f"{len(names)} recordings have different messages on {topic} at the same time, as "
             f"from several robots, and the answer does not separate them: {listed(names)}"
         )
 

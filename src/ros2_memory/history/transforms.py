@@ -64,10 +64,10 @@ _LONGER_NS: Final[Ns] = 3600 * NS_PER_S
 """How far around the moment frames are looked for that are unknown then."""
 
 _BORROWED: Final = Reason(
-    "is placed by transforms of another recording of the same time; no handover says that both are "
-    "of one robot",
+    "is placed by transforms of another recording of the same time; no handover proves that both "
+    "are of one robot",
     "recording",
-    many="are placed by transforms of others of the same time; no handovers say that they are of "
+    many="are placed by transforms of others of the same time; no handovers prove that they are of "
     "one robot",
 )
 
@@ -126,8 +126,8 @@ def transform_at(
     parts = sessions.parts_of(session)
     if parts and not any(connected(view, frames, among=each) for each in parts):
         view.notes.add(
-            f"transforms of {sessions.names(session, at)} are joined, as of one robot: they were "
-            "recorded at the same time, and no handover says whether they are of one"
+            f"transforms of {sessions.names(session, at)} are combined, as of one robot: they "
+            "were recorded at the same time, but no handover proves that they are of one"
         )
     return found
 

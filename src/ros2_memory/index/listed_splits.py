@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 _MAX_CACHED_FOLDERS: Final = 1024
-_MISSING: Final = "metadata.yaml lists it, and it is not there"
+_MISSING: Final = "metadata.yaml lists it, but it is missing"
 
 
 class Absent(NamedTuple):
@@ -103,9 +103,12 @@ def describe_absent(absent: Sequence[Absent]) -> Iterator[str]:
     if missing:
         parts = []
         if files := sum(len(each.files) for each in missing):
-            parts.append(counted(files, "file that is not there", "files that are not there"))
+            parts.append(counted(files, "missing file", "missing files"))
         if messages := sum(each.messages for each in missing):
-            noun, plural = "message that no file here holds", "messages that no file here holds"
+            noun, plural = (
+                "message that no file here contains",
+                "messages that no file here contains",
+            )
             parts.append(counted(messages, noun, plural))
         yield f"metadata.yaml of {_names(missing)} lists {' and '.join(parts)}"
     unreadable = [each for each in absent if each.unreadable]

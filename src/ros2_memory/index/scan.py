@@ -344,7 +344,7 @@ def _enter_file(folder: _Folder, entry: os.DirEntry[str], stamps: dict[str, Stam
     except FileNotFoundError:
         return
     except OSError as error:
-        reason = f"cannot be looked at: {error.strerror or error}"
+        reason = f"cannot be read: {error.strerror or error}"
         folder.odd.append(SetAside(Path(entry.path), reason))
         folder.trusted = False
         # A known file is not gone because of that.

@@ -65,7 +65,7 @@ def remember_moment(
             "whether it keeps the moment anyway; if not, ask again"
         )
     if outcome.moment is None:
-        raise RefusedError(outcome.refused or "the recorder does not say why")
+        raise RefusedError(outcome.refused or "the recorder gave no reason")
     return RememberedMoment(outcome.moment, label, start, end, outcome.bags, outcome.pending)
 
 
@@ -164,7 +164,7 @@ def _require_recorder(memory: Memory) -> None:
     heartbeat = memory.index.heartbeat()
     if heartbeat is None or not heartbeat.is_live(memory.clock.now()) or heartbeat.state in _ENDED:
         raise RefusedError(
-            "only the recorder keeps moments, and it is not running: start ros2-memory-recorder, "
+            "only the recorder saves moments, and it is not running: start ros2-memory-recorder, "
             "then ask again"
         )
 

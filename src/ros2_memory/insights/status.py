@@ -100,11 +100,11 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
     if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
         return
     if not heartbeat.is_live(wall):
-        yield "the recorder has stopped without saying so"
+        yield "the recorder died"
     elif heartbeat.state is RecorderState.PAUSED:
-        yield f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}"
+        yield f"the recorder is paused: {heartbeat.last_error or 'it gives no reason'}"
     elif heartbeat.state is RecorderState.WAITING:
-        yield f"the recorder waits: {heartbeat.waiting_for or 'it does not say for what'}"
+        yield f"the recorder waits: {heartbeat.waiting_for or 'it gives no reason'}"
     if heartbeat.held_back is not None and heartbeat.is_live(wall):
         yield heartbeat.held_back
 
@@ -125,7 +125,7 @@ def missing_data(view: View) -> Iterator[str]:
         yield f"{files}; data_time_range says why"
     if odd := len(bags_with_remarks(snapshot)):
         bags = counted(odd, "bag is", "bags are")
-        yield f"{bags} not whole or contradictory; data_time_range says how"
+        yield f"{bags} incomplete or contradictory; data_time_range has the details"
     yield from describe_absent(absent_splits(snapshot, view.memory.index.bag_dir))
     if undecodable := {each.topic for each in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
@@ -205,7 +205,7 @@ def bags_with_remarks(snapshot: Snapshot) -> list[BagFile]:
 def nothing_here(snapshot: Snapshot) -> str:
     """Returns the sentence on a bag directory in which no bag answers."""
     if snapshot.active:
-        return "no bag answers yet: the first one is still being written"
+        return "there is no closed bag yet: the first one is still being written"
     if snapshot.empty:
         bags = counted(len(snapshot.empty), "bag holds", "bags hold")
         return f"no message is recorded here: {bags} none"

@@ -19,7 +19,7 @@ _MOST_COMPARED: Final = 5
 _MOST_STAYS: Final = (8, 5, 3, 2)
 _SHORT: Final = ("label", "moves", "at_once", "place", "frame_id", "in", "last_seen", "moved_times")
 _MISSED: Final = "not_seen_where_expected"
-_HOW: Final = "shortly; ask with label or where for their scores, states and moves"
+_HOW: Final = "in short form; ask with label or where for their scores, states and moves"
 _LONGEST: Final = 6_000
 """Characters of a reply; its lists are cut until it is no longer."""
 _LONGEST_NAME: Final = 100

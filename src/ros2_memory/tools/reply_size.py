@@ -162,7 +162,7 @@ def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
     return _with_note(
         outline,
         f"the answer does not fit into {max_chars} characters; name parts of it in fields, or ask "
-        "more narrowly",
+        "a narrower question",
     )
 
 
@@ -201,7 +201,7 @@ def _rows_note(key: str, kept: int, total: int, max_chars: int) -> str:
     if key in EVENLY_THINNED:
         how, more = "evenly spaced", "ask for a shorter window or for fewer fields to see more"
     else:
-        how, more = "from the beginning", "ask more narrowly to see others"
+        how, more = "from the beginning", "ask a narrower question to see others"
     return (
         f"{key}: {kept} of {total} kept, {how}, to keep the reply under {max_chars} "
         f"characters; {more}"

@@ -236,8 +236,7 @@ def test_files_that_metadata_lists_and_are_not_there_are_counted(
     code, wrong = examined(capsys)
     assert code == 1
     assert wrong["bags"][0]["seen"] == (
-        "metadata.yaml of rec lists 12 files that are not there and 250 messages that no file here "
-        "holds"
+        "metadata.yaml of rec lists 12 missing files and 250 messages that no file here contains"
     )
 
 

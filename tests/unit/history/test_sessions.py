@@ -194,7 +194,7 @@ def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls:
     at = AtTime(unix_from_ns(BEGIN + 4 * S))
     joined = transform(memory, Call(), "map", "base_link", at)
     assert joined.transform.translation[0] == pytest.approx(9.0)
-    assert [note for note in joined.notes if "fixed and moving are joined" in note]
+    assert [note for note in joined.notes if "fixed and moving are combined" in note]
     alone = transform(memory, Call(), "odom", "base_link", at)
     assert alone.notes == ()
     assert arrivals(memory, 9.0) == [pytest.approx(3.4, abs=0.21)]
@@ -327,7 +327,7 @@ def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> Non
         find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
     ):
         [note] = [note for note in answer.notes if "as from several robots" in note]
-        assert note.startswith("2 recordings have messages of their own on /odom")
+        assert note.startswith("2 recordings have different messages on /odom")
         assert note.endswith(": r1, r2")
 
 

@@ -196,7 +196,7 @@ def test_an_active_file_answers_and_is_named_as_active_all_the_same(tail: Tail) 
     assert (reply["bags"], reply["from_active"]) == (1, True)
     assert tail.asked("memory_status")["from_active"] is True
     assert reply["active"] == [
-        {"file": "rec_0.mcap", "reason": "still being written: its complete chunks answer"}
+        {"file": "rec_0.mcap", "reason": "still being written: its complete chunks are read"}
     ]
     assert (reply["incomplete"], reply["damaged"]) == ([], [])
     assert not any("ends early" in note for note in reply.get("notes", ()))

@@ -149,7 +149,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     beating(tmp_path, RecorderState.RECORDING, 1)
     reply = shown(memory, tmp_path)
     assert (reply["recorder"], reply["recorder_alive"]) == told
-    assert ("stopped without saying so" in reply["trust"]) == (now == "wall")
+    assert ("the recorder died" in reply["trust"]) == (now == "wall")
 
 
 def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> None:
@@ -165,8 +165,8 @@ def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("state", "at", "trust"),
     [
-        (RecorderState.RECORDING, -100, "the recorder has stopped without saying so"),
-        (RecorderState.PAUSED, 59, "the recorder is paused: it does not say why"),
+        (RecorderState.RECORDING, -100, "the recorder died"),
+        (RecorderState.PAUSED, 59, "the recorder is paused: it gives no reason"),
         (RecorderState.STOPPED, 59, "nothing is known to be missing"),
     ],
 )
@@ -318,20 +318,20 @@ class TestWhatIsMissingIsNamedAndCounted:
         gone = [(f"rec_{n}.mcap", 20) for n in range(2, 14)]
         self.recording(tmp_path / "rec", *there, *gone)
         assert self.trust(tmp_path) == (
-            "metadata.yaml of rec lists 12 files that are not there and 240 messages that no file "
-            "here holds"
+            "metadata.yaml of rec lists 12 missing files and 240 messages that no file "
+            "here contains"
         )
 
     def test_messages_alone(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 255))
-        assert self.trust(tmp_path).endswith("lists 250 messages that no file here holds")
+        assert self.trust(tmp_path).endswith("lists 250 messages that no file here contains")
 
     def test_a_recording_of_which_metadata_alone_is_left(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
         for each in (tmp_path / "rec").glob("*.mcap"):
             each.unlink()
         trust = self.trust(tmp_path)
-        assert "lists 2 files that are not there and 10 messages" in trust
+        assert "lists 2 missing files and 10 messages" in trust
 
     def test_metadata_that_lists_what_is_there(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
@@ -347,9 +347,9 @@ class TestWhatIsMissingIsNamedAndCounted:
     def test_the_oldest_splits_that_retention_deleted_are_not_missing(self, tmp_path: Path) -> None:
         listed = [(f"rec_{n}.mcap", 5) for n in range(-3, 3)]
         self.recording(tmp_path / "rec", *listed)
-        assert "lists 4 files" in self.trust(tmp_path)
+        assert "lists 4 missing files" in self.trust(tmp_path)
         beating(tmp_path, RecorderState.STOPPED, 59)
-        assert "lists 1 file that is not there and 5 messages" in self.trust(tmp_path)
+        assert "lists 1 missing file and 5 messages" in self.trust(tmp_path)
 
     def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
         self, tmp_path: Path
@@ -360,10 +360,10 @@ class TestWhatIsMissingIsNamedAndCounted:
         own.parent.mkdir()
         inode = (tmp_path / "rec").stat().st_ino
         own.write_text('{"bag_dir_id": "5f0c"}\n')
-        assert "lists 4 files" in self.trust(tmp_path)
+        assert "lists 4 missing files" in self.trust(tmp_path)
         with own.open("a") as stream:
             stream.write(json.dumps({"recording": "rec", "inode": inode}) + "\n")
-        assert "lists 1 file that is not there" in self.trust(tmp_path)
+        assert "lists 1 missing file" in self.trust(tmp_path)
 
     def test_nothing_behind_a_link_is_looked_at(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "bags" / "rec", ("rec_0.mcap", 5), ("gone.mcap", 5))
@@ -389,6 +389,6 @@ class TestWhatIsMissingIsNamedAndCounted:
         content = second.read_bytes()
         second.unlink()
         memory = memory_of(tmp_path)
-        assert "lists 1 file" in str(shown(memory, tmp_path)["trust"])
+        assert "lists 1 missing file" in str(shown(memory, tmp_path)["trust"])
         second.write_bytes(content)
         assert shown(memory, tmp_path)["trust"] == SOUND

@@ -141,7 +141,7 @@ async def test_age_that_is_held_is_shown_and_degrades_nothing(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("heartbeat", "seconds", "problem"),
     [
-        (beat(RecorderState.RECORDING), 600, "the recorder has stopped without saying so"),
+        (beat(RecorderState.RECORDING), 600, "the recorder died"),
         (
             beat(RecorderState.PAUSED, last_error="disk full"),
             1,

@@ -272,7 +272,7 @@ def test_never_is_not_the_answer_beside_a_split_that_is_listed_and_not_there(
     reply = never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool)
     lacking = (
         f"1 bag file could not be read and may hold more: rec/rec_{gone}.mcap "
-        "(metadata.yaml lists it, and it is not there)"
+        "(metadata.yaml lists it, but it is missing)"
     )
     assert reply == {"timestamp": None, "value": None, "notes": [lacking]}
 
