@@ -148,7 +148,7 @@ async def test_an_unknown_tool_is_answered_with_the_nearest_names() -> None:
         assert result.is_error
         assert sent(result)["error"] == "invalid_arguments"
         assert sent(result)["detail"].endswith("do you mean get_position_at?")
-        assert "there are: get_position_at" in sent(await client.call_tool("qqq", {}))["detail"]
+        assert "the tools are: get_position_at" in sent(await client.call_tool("qqq", {}))["detail"]
 
 
 @pytest.mark.parametrize("error", [KeyError("secret"), RecursionError(), MemoryError()])
