@@ -491,6 +491,7 @@ def query_settings_of(settings: Settings) -> QuerySettings:
         tf_clock=data.tf_clock,
         max_plausible_speed_mps=data.max_plausible_speed_mps,
         split_duration_s=settings.recording.split_duration_s,
+        screened=records and bool(load_exclusions(settings)),
         include_active=settings.reader.include_active,
         kept=retention_limits(settings) if records else None,
         latching=Latching(

@@ -39,6 +39,7 @@ class QuerySettings:
 
     Units are the last word of each name. `kept` is how much the recorder keeps; None where nothing
     is recorded, and nothing deleted. `labels` has other spellings by the name that is to be shown.
+    `screened`: no split answers before it was searched for what is to be excluded.
     """
 
     position_tolerance_m: float = 0.5
@@ -51,12 +52,21 @@ class QuerySettings:
     tf_clock: ClockOfTransforms = "auto"
     max_plausible_speed_mps: float = 10.0
     split_duration_s: float = 10.0
+    screened: bool = False
     include_active: bool = False
     kept: RetentionLimits | None = None
     latching: Latching = field(default_factory=lambda: Latching(("/tf_static",)))
     min_score: float = 0.0
     labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
     places: tuple[Place, ...] = ()
+
+    @property
+    def closed_after_s(self) -> float:
+        """How old (s) a message is at most when the split that holds it answers.
+
+        A split that is searched first waits for the next one, and for the search.
+        """
+        return 2.5 * self.split_duration_s if self.screened else self.split_duration_s
 
 
 class SnapshotSource(Protocol):

@@ -188,10 +188,8 @@ def unread_spans(
         files = counted(len(lost), "bag file")
         yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
     active = being_written(snapshot, window)
-    held = [short_name(each.path) for each in active if each.reason == HELD_BACK]
-    if held:
-        yield f"{HELD_BACK}: {listed(held)}"
-    if len(held) < len(active):
+    yield from describe_held(active)
+    if any(each.reason != HELD_BACK for each in active):
         yield _describe_active(snapshot, active, window)
     faults = [
         fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
@@ -220,6 +218,13 @@ def lost_in(
         for aside in (*absent, *snapshot.damaged, *snapshot.unread)
         if _touches(spans[aside], window, unknown=nothing)
     ]
+
+
+def describe_held(active: Sequence[SetAside]) -> Iterator[str]:
+    """Yields a sentence on splits that are not served before they were searched, if there are."""
+    held = [short_name(each.path) for each in active if each.reason == HELD_BACK]
+    if held:
+        yield f"{HELD_BACK}: {listed(held)}"
 
 
 def being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:

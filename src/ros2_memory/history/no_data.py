@@ -191,7 +191,7 @@ def require_bags(view: View) -> None:
             f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
             if _active_answers(view)
             else "the first split is still being written; ask again when it closes, in "
-            f"{view.memory.limits.split_duration_s:g} s or less",
+            f"{view.memory.limits.closed_after_s:g} s or less",
         )
     why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
@@ -437,6 +437,6 @@ def _advice(view: View, reason: NoDataReason) -> list[str]:
             f"ask about an earlier moment, or again in {ON_DISK_S} s"
             if _active_answers(view)
             else "the split being written is not read until it closes: ask about an earlier "
-            f"moment, or again in {view.memory.limits.split_duration_s:g} s"
+            f"moment, or again in {view.memory.limits.closed_after_s:g} s"
         )
     return advice

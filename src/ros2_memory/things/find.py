@@ -14,6 +14,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
@@ -66,7 +67,8 @@ def find_things(
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     now = memory.now(wall, view.snapshot.latest)
-    window = clamped(view, search_window(span, now))
+    asked_for = search_window(span, now)
+    window = clamped(view, asked_for)
     lowest = limits.min_score if min_score is None else min_score
     if lowest > 1:
         raise InvalidArgumentsError(
@@ -79,7 +81,8 @@ def find_things(
     totals: dict[str, int] = {}
     for each in found:
         totals[each.label] = totals.get(each.label, 0) + (each.at_once or 1)
-    notes = [*view.notes.sentences(), *_notes(known, label, asked, found=bool(found))]
+    held = describe_held(being_written(view.snapshot, asked_for))
+    notes = [*view.notes.sentences(), *held, *_notes(known, label, asked, found=bool(found))]
     return Things(
         frame_id=_frame_of(known, found),
         things=tuple(found[:limit]),

@@ -58,8 +58,8 @@ def instructions(settings: QuerySettings, *, additions: bool = True, several: bo
     return (_RULES + found + _REST).format(
         or_text=" or ISO 8601 (2026-11-20T14:05; local without offset)" if additions else "",
         newest="the newest 3 s or so are not on disk yet and"
-        if settings.include_active
-        else f"the newest {settings.split_duration_s:g} s or so are still being written and",
+        if settings.include_active and not settings.screened
+        else f"the newest {settings.closed_after_s:g} s or so are still being written and",
         relative="*_seconds_ago, *_last, recent_* and last_s"
         if additions
         else "*_seconds_ago, *_last and recent_*",

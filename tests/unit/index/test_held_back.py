@@ -6,14 +6,21 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory import queries
 from ros2_memory.bag_dir.layout import SCREENED_FILE
+from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.coverage import describe_excluded, unread_spans
+from ros2_memory.history.view import AtTime
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.things.find import find_things
+from ros2_memory.tools.instructions import instructions
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, words
 
 if TYPE_CHECKING:
@@ -112,3 +119,25 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     assert f"{HELD_BACK}: {name}/{name}_1.mcap" in [
         *unread_spans(index_of(bags).snapshot(), window)
     ]
+
+
+def test_a_search_for_things_names_what_is_held_back(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), *words(0, 10)])
+    bags.split(name, words(10, 20))
+    bags.step()
+    memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 30 * S))
+    held = f"{HELD_BACK}: {name}/{name}_1.mcap"
+    assert held in find_things(memory, Call(), "cup").notes
+    assert held not in find_things(memory, Call(), "cup", end_s=T0 // S + 5).notes
+
+
+def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags")
+    bags.split(bags.begin(0), [mode(-2, value=False), *words(0, 10)])
+    limits = QuerySettings(screened=True, include_active=True)
+    memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 12 * S), limits=limits)
+    with pytest.raises(NoDataError, match="in 25 s or less"):
+        queries.topic_value(memory, Call(), "/chatter", AtTime(T0 // S + 5))
+    assert "the newest 25 s or so" in instructions(limits)
