@@ -115,7 +115,7 @@ def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> 
     write(tmp_path, [each for each in looked(0, 3, HERE) if "vision" not in each.topic])
     reply = ask(tmp_path)
     assert (reply["things"], len(reply["notes"])) == ([], 1)
-    assert "no message of a detector was found" in reply["notes"][0]
+    assert "there is no message of a detector" in reply["notes"][0]
     assert ask(tmp_path, label="cup")["notes"] == reply["notes"]
 
 
