@@ -115,11 +115,14 @@ class ZoneMap:
 
 
 class Boxes:
-    """The boxes of many zone maps as one array, to compare a position with all of them at once."""
+    """The boxes of many zone maps as one array, to compare a position with all of them at once.
 
-    def __init__(self, zone_maps: Mapping[int, ZoneMap]) -> None:
-        self._numbers = list(zone_maps)
-        boxes = [_EVERYWHERE if each.open else each.box or _NOWHERE for each in zone_maps.values()]
+    A zone map without a position has none; that of one which is open is `EVERYWHERE`.
+    """
+
+    def __init__(self, by_number: Mapping[int, Box | None]) -> None:
+        self._numbers = list(by_number)
+        boxes = [each or _NOWHERE for each in by_number.values()]
         self._bounds: NDArray[np.float64] = np.array(boxes, dtype=np.float64).reshape(-1, 6).T
 
     def meeting(self, x: float, y: float, z: float | None, reach: float) -> set[int]:
@@ -132,7 +135,7 @@ class Boxes:
         return {self._numbers[at] for at in np.flatnonzero(within)}
 
 
-_EVERYWHERE: Final = Box(-math.inf, math.inf, -math.inf, math.inf, -math.inf, math.inf)
+EVERYWHERE: Final = Box(-math.inf, math.inf, -math.inf, math.inf, -math.inf, math.inf)
 _NOWHERE: Final = Box(math.inf, -math.inf, math.inf, -math.inf, math.inf, -math.inf)
 
 UNBOUNDED: Final = ZoneMap(words=None, texts=True, numbers=None, open=True)

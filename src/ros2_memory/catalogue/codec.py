@@ -42,7 +42,7 @@ from ros2_memory.analysis.state_changes import (
     StateChanges,
 )
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
-from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
+from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Box, ZoneMap
 from ros2_memory.catalogue.field_columns import outward
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
@@ -211,6 +211,21 @@ def decode_zone_map(packed: bytes) -> ZoneMap:
             box=box,
         )
     except (TypeError, struct.error) as error:
+        raise ValueError(f"not a zone map: {error}") from error
+
+
+def decode_zone_box(packed: bytes) -> Box | None:
+    """Decodes the box of a zone map alone: `EVERYWHERE` of one that is open.
+
+    Raises:
+        ValueError: the bytes are no zone map.
+    """
+    try:
+        flags, _, _ = _ZONES.unpack_from(packed)
+        if flags & _OPEN:
+            return EVERYWHERE
+        return Box(*_BOUNDS.unpack_from(packed, _ZONES.size)) if flags & _BOX else None
+    except struct.error as error:
         raise ValueError(f"not a zone map: {error}") from error
 
 

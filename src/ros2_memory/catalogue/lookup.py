@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
-from ros2_memory.analysis.zone_map import UNBOUNDED, Boxes, united
+from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Boxes, united
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.model import BagState
 
@@ -119,7 +119,13 @@ class SegmentDigests:
 
     def boxes(self, topic: str) -> Boxes:
         """Returns the boxes of the zone maps; cached, since they are small and often asked for."""
-        return self._cached(self._boxes, topic, lambda: Boxes(self.zone_maps(topic)))
+        return self._cached(self._boxes, topic, lambda: self._all_boxes(topic))
+
+    def _all_boxes(self, topic: str) -> Boxes:
+        numbers = self._entries_with(topic)
+        known = self.catalogue.boxes(topic, numbers)
+        # As with zone maps, nothing is ruled out that could not be read.
+        return Boxes({number: known.get(number, EVERYWHERE) for number in numbers})
 
     def field_bounds(self, topic: str, field: str) -> FieldBounds:
         """Returns between which bounds the numbers of a field are, for all entries at once.

@@ -22,6 +22,7 @@ from ros2_memory.catalogue.codec import (
     decode_schema,
     decode_standstills,
     decode_topic_events,
+    decode_zone_box,
     decode_zone_map,
 )
 from ros2_memory.catalogue.database import CatalogueDatabase
@@ -69,7 +70,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.analysis.zone_map import ZoneMap
+    from ros2_memory.analysis.zone_map import Box, ZoneMap
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
@@ -193,12 +194,16 @@ class Catalogue(CatalogueDatabase):
         found: dict[BagKey, int] = self.read(ask, {})
         return [found.get(key) for key in keys]
 
-    # Each of the next six reads one topic of some entries. Entries that hold none of the topic, and
-    # those that were deleted meanwhile, are left out.
+    # Each of the next seven reads one topic of some entries. Entries that hold none of the topic,
+    # and those that were deleted meanwhile, are left out.
 
     def zone_maps(self, topic: str, numbers: Sequence[int]) -> dict[int, ZoneMap]:
         """Returns what can be in the messages of the topic, by entry."""
         return self._packed_of_topic(topic, numbers, ZONE_MAP, decode_zone_map)
+
+    def boxes(self, topic: str, numbers: Sequence[int]) -> dict[int, Box | None]:
+        """Returns the boxes of these zone maps; `EVERYWHERE` of those that are open."""
+        return self._packed_of_topic(topic, numbers, ZONE_MAP, decode_zone_box)
 
     def poses(self, topic: str, numbers: Sequence[int]) -> dict[int, PoseDigest]:
         """Returns the digests of the topic's poses; not where some message carries no pose."""

@@ -314,8 +314,7 @@ class CandidateBags:
         known = {} if digests is None else digests.numbers
         possible: Collection[int] = ()
         if digests is not None and known:
-            if self._condition.can_match(digests.zone_map(topic)):
-                possible = self._possible(digests, topic)
+            possible = self._possible(digests, topic)
             if digests.whole and not possible:
                 self.ruled_out = True
                 return
@@ -333,12 +332,18 @@ class CandidateBags:
         place = self._condition.place
         if place is not None:
             return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
+        if not self._condition.can_match(digests.zone_map(topic)):
+            return ()
         bounds = self._condition.bounds
         if bounds is not None and self._condition.field is not None:
             field = field_named(self._condition.field)
             return digests.field_bounds(topic, field).between(*bounds)
-        maps = digests.zone_maps(topic)
-        return {number for number, each in maps.items() if self._condition.can_match(each)}
+
+        def possible() -> set[int]:
+            maps = digests.zone_maps(topic)
+            return {number for number, each in maps.items() if self._condition.can_match(each)}
+
+        return digests.derived(f"possible {topic} {self._condition!r}", possible)
 
 
 def _search_window(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:
