@@ -18,7 +18,7 @@ from ros2_memory.analysis.bag_frames import BagFrames, TransformColumns, multipl
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
-    decode_track,
+    decode_tracks,
     encode_track,
     track_of,
 )
@@ -254,16 +254,23 @@ def encode_map_track(digest: MapDigest) -> bytes:
     return _HEAD.pack(digest.left_out, len(frame)) + frame + encode_track(digest.track)
 
 
-def decode_map_track(packed: bytes, statics: int) -> MapDigest:
-    """Decodes a map digest, without its sights.
+def decode_map_tracks(stored: Sequence[tuple[bytes, int]]) -> list[MapDigest]:
+    """Decodes map digests, without their sights; each comes with the hash of its statics.
 
     Raises:
-        ValueError: the bytes are not one.
+        ValueError: the bytes of some are not one.
     """
     try:
-        left_out, size = _HEAD.unpack_from(packed)
+        heads = [_HEAD.unpack_from(packed) for packed, _ in stored]
     except struct.error as error:
         raise ValueError(f"not a map digest: {error}") from error
-    end = _HEAD.size + size
-    frame = packed[_HEAD.size : end].decode("utf-8", "surrogatepass")
-    return MapDigest(frame, statics, decode_track(packed[end:]), left_out)
+    ends = [_HEAD.size + size for _, size in heads]
+    tracks = decode_tracks([packed[end:] for (packed, _), end in zip(stored, ends, strict=True)])
+    return [
+        MapDigest(
+            packed[_HEAD.size : end].decode("utf-8", "surrogatepass"), statics, track, left_out
+        )
+        for (packed, statics), end, (left_out, _), track in zip(
+            stored, ends, heads, tracks, strict=True
+        )
+    ]

@@ -27,7 +27,7 @@ from ros2_memory.catalogue.codec import (
 )
 from ros2_memory.catalogue.database import CatalogueDatabase
 from ros2_memory.catalogue.field_columns import field_column
-from ros2_memory.catalogue.map_digest import decode_map_track
+from ros2_memory.catalogue.map_digest import decode_map_tracks
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.sql import (
     COUNTS,
@@ -246,28 +246,29 @@ class Catalogue(CatalogueDatabase):
 
     def maps(self, numbers: Sequence[int]) -> dict[int, MapDigest]:
         """Returns the map digests of entries, without their sights."""
-        return self._of_map(numbers, TRACK, decode_map_track)
+        return self._of_map(numbers, TRACK, decode_map_tracks)
 
     def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
         """Returns, by entry, the hash of the static transforms its map digest was made with."""
-        return self._of_map(numbers, "x''", lambda _, key: key)
+        return self._of_map(numbers, "x''", lambda rows: [key for _, key in rows])
 
     def sights(self, numbers: Sequence[int]) -> dict[int, tuple[int, bytes]]:
         """Returns, by entry, the hash as of `map_keys`, and the bytes of its sights."""
-        return self._of_map(numbers, SIGHTS, lambda plain, key: (key, plain))
+        return self._of_map(numbers, SIGHTS, lambda rows: [(key, plain) for plain, key in rows])
 
     def _of_map(
-        self, numbers: Sequence[int], column: str, decode: Callable[[bytes, int], T]
+        self,
+        numbers: Sequence[int],
+        column: str,
+        decode: Callable[[Sequence[tuple[bytes, int]]], Sequence[T]],
     ) -> dict[int, T]:
-        """Decodes a column of map digests, which it gets with their hash, by entry."""
+        """Decodes a column of map digests, all with their hashes at once, by entry."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, T]:
             model = model_of(connection, NO_TOPIC, column)
             rows = map_rows(connection, column, self.row_ids(numbers))
-            return {
-                self.offset + number: decode(unpacked(stored, model), int(key))
-                for number, key, stored in rows
-            }
+            found = decode([(unpacked(stored, model), int(key)) for _, key, stored in rows])
+            return {self.offset + row[0]: each for row, each in zip(rows, found, strict=True)}
 
         return self.read(ask, {})
 

@@ -18,7 +18,7 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.map_digest import (
     MapDigest,
     MapSettings,
-    decode_map_track,
+    decode_map_tracks,
     encode_map_track,
     statics_of,
 )
@@ -191,7 +191,7 @@ def test_sights_are_collected_with_frames_and_stored(tmp_path: Path) -> None:
 def test_a_map_digest_that_is_stored_is_the_same(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 5, seconds=10)
     [(stored, _)] = digests(memory_of(tmp_path))
-    again = decode_map_track(encode_map_track(stored), stored.statics)
+    [again] = decode_map_tracks([(encode_map_track(stored), stored.statics)])
     assert_same(stored, again)
     assert replace(again, track=stored.track) == stored
     assert math.isclose(again.track.error_m, stored.track.error_m)

@@ -13,6 +13,7 @@ from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
     RobotTrack,
     decode_track,
+    decode_tracks,
     empty_track,
     encode_track,
     track_of,
@@ -71,6 +72,17 @@ def test_a_track_that_is_stored_is_the_same(seed: int) -> None:
         assert np.array_equal(getattr(again, name), getattr(track, name)), name
     assert again.error_m == track.error_m
     assert len(zlib.compress(packed)) < 12 * len(track.times) + 60
+
+
+def test_tracks_that_are_read_together_are_those_of_each() -> None:
+    tracks = [of(driven(seed)) for seed in range(4)]
+    tracks[1:1] = [empty_track(), of(([START], [1.0], [2.0], [math.nan]))]
+    tracks.append(empty_track())
+    packed = [*map(encode_track, tracks)]
+    assert [*map(encode_track, decode_tracks(packed))] == packed
+    assert decode_tracks([]) == []
+    with pytest.raises(ValueError, match="not a track"):
+        decode_tracks([*packed, packed[0][:-1]])
 
 
 def test_a_robot_that_stands_takes_a_few_bytes() -> None:
