@@ -41,6 +41,8 @@ Bytes: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.uint8]]"
 _FIRST_MARKS: Final = (100_000.5, 900_000)
 _OTHER_MARKS: Final = (300_000.25, 800_000)
 
+_DOUBLE: Final = struct.Struct("<d")
+_SINGLE: Final = struct.Struct("<f")
 _MAX_KNOWN: Final = 512
 _MAX_KNOWN_BYTES: Final = 16 << 10
 """Of the payloads whose templates are remembered."""
@@ -145,6 +147,21 @@ class PayloadTemplate:
         if point.z is None:
             return [(x, y, math.nan) for x, y in zip(xs, ys, strict=True)]
         return list(zip(xs, ys, self.column(rows, point.z).tolist(), strict=True))
+
+    def points_in(self, payload: bytes) -> Iterator[Vector3]:
+        """Yields the positions in one payload that `near_position` tests, as `positions` does."""
+        for point in self.points:
+            x, y, z = (
+                math.nan if offset is None else self._number(payload, offset) for offset in point
+            )
+            yield x, y, z
+
+    def _number(self, payload: bytes, offset: int) -> float:
+        number: float
+        [number] = (_DOUBLE if offset in self.layout.doubles else _SINGLE).unpack_from(
+            payload, offset
+        )
+        return number
 
     def _rotations(self, rows: Bytes) -> list[Quaternion | None]:
         """Returns the orientation of each row, as the extractor gives it."""
@@ -276,11 +293,9 @@ class Templates:
 
     def of(self, record: Record) -> PayloadTemplate | None:
         """Returns the template of a message that can be decoded; None where it has none."""
-        key = (record.channel.schema, len(record.payload))
-        payload = np.frombuffer(record.payload, np.uint8)
-        for fixed, common, known in self._known.get(key, ()):
-            if payload[fixed].tobytes() == common:
-                return known
+        met = self._met(record)
+        if met is not None:
+            return met.template
         layout = self._reader.layout(record)
         if layout is None:
             return None
@@ -289,10 +304,24 @@ class Templates:
             if self._count == _MAX_KNOWN:
                 self._known, self._count = {}, 0
             fixed = _fixed(layout)
-            known_ones = self._known.setdefault(key, [])
-            known_ones.append(_KnownTemplate(fixed, payload[fixed].tobytes(), template))
+            common = np.frombuffer(record.payload, np.uint8)[fixed].tobytes()
+            known_ones = self._known.setdefault((record.channel.schema, layout.size), [])
+            known_ones.append(_KnownTemplate(fixed, common, template))
             self._count += 1
         return template
+
+    def known(self, record: Record) -> PayloadTemplate | None:
+        """Returns the template of a message; None where `of` was asked of none like it."""
+        met = self._met(record)
+        return None if met is None else met.template
+
+    def _met(self, record: Record) -> _KnownTemplate | None:
+        known = self._known.get((record.channel.schema, len(record.payload)), ())
+        payload = np.frombuffer(record.payload, np.uint8)
+        for each in known:
+            if payload[each.fixed].tobytes() == each.common:
+                return each
+        return None
 
 
 def _marked_template(

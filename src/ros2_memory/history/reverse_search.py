@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.conditions import parse_condition, refusal_for
 from ros2_memory.analysis.field_ranges import field_named
+from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
@@ -37,7 +38,10 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
+    from ros2_memory.storage.base import Record
 
+_MOST_TEMPLATES: Final = 16
+"""Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
 _MOST_TRUTHS: Final = 65_536
 """Messages of which it is known whether they met a condition: some 8 MB for each question."""
@@ -97,6 +101,8 @@ _TRUTHS: Final = _Truths()
 class ReverseSearch:
     """A search for one condition on the topics of a name or glob.
 
+    Of messages that differ in their numbers alone one is decoded to test positions.
+
     Attributes:
         topics: the recorded topics that match.
 
@@ -111,6 +117,9 @@ class ReverseSearch:
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
         self._truths = _TRUTHS.of(view.memory.extractor, condition)
+        self._place = None if condition.min_score else condition.place
+        self._templates = Templates(view.memory.reader, view.memory.extractor)
+        self._to_learn = _MOST_TEMPLATES
 
     def candidates(self, until: Ns) -> CandidateBags:
         """Returns the bags that can contain a match before a moment."""
@@ -210,12 +219,29 @@ class ReverseSearch:
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
         channel = found.record.channel
-        memory = self._view.memory
         key = hash((found.record.payload, channel.schema, channel.encoding))
         known = self._truths.get(key)
         if known is not None:
             self._has_decoded = True
             return known
+        met = self._is_near(found.record)
+        if met is None:
+            met = self._decoded(found)
+        if met is not None and len(self._truths) < _MOST_TRUTHS:
+            self._truths[key] = met
+        return met
+
+    def _is_near(self, record: Record) -> bool | None:
+        """Whether a message has a position that is near, by its bytes; None where not known so."""
+        template = None if self._place is None else self._templates.known(record)
+        if template is None or self._place is None:
+            return None
+        self._has_decoded = True
+        near = self._place.is_near
+        return any(near(*each) for each in template.points_in(record.payload))
+
+    def _decoded(self, found: StoredMessage) -> bool | None:
+        channel, memory = found.record.channel, self._view.memory
         with self._view.call.stages.timed("extract"):
             try:
                 message = memory.reader.decode(found.record)
@@ -227,8 +253,9 @@ class ReverseSearch:
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
                 self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
                 return None
-        if len(self._truths) < _MOST_TRUTHS:
-            self._truths[key] = met
+        if self._place is not None and self._to_learn:
+            self._to_learn -= 1
+            self._templates.of(found.record)
         return met
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:

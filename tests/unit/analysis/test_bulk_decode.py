@@ -19,6 +19,8 @@ from ros2_memory.analysis.conditions import (
 from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     Msg,
@@ -33,12 +35,13 @@ from tests.support.bags import (
     twist,
     write_mcap,
 )
-from tests.support.memories import extractor
+from tests.support.memories import extractor, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.storage.base import CdrLayout, Record
 
 S = 10**9
@@ -98,6 +101,36 @@ def test_a_bag_has_the_same_digest_either_way(tmp_path: Path, seed: int) -> None
             broken = b"\x00\x01\x00\x00\xff\xff\xff\x7f"
             messages.append(Msg("/chatter", "std_msgs/msg/String", at, broken))
     assert_alike(write_mcap(tmp_path / "bag.mcap", messages))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_position_is_found_in_the_same_messages_either_way(tmp_path: Path, seed: int) -> None:
+    draw = random.Random(seed)
+    messages: list[Msg] = []
+    for n in range(150):
+        at = T0 + n * S
+        x, y = draw.uniform(-2, 2), draw.choice([0.0, 1.0, *ODD])
+        messages.append(odom(at, x, y, vx=0.3))
+        labels = draw.choice([["cup"], ["cup", "person"], []])
+        messages.append(detections(at, labels, at=(x, 0.5, draw.choice([0.0, math.nan]))))
+        child = draw.choice(["base_link", "arm"])
+        messages.append(tf(at, transform(at, "odom", child, (x, y, 0.0), 0.2)))
+    write_mcap(tmp_path / "a" / "a_0.mcap", messages)
+    near: list[JsonValue] = [{"x": 0.3, "y": 0.4}, {"x": 0.0, "y": 1.0, "z": 0.0}]
+    far: JsonValue = {"x": 50.0, "y": 0.0}
+    for place in (*near, far):
+        at_once, singly = (
+            # Extractors of their own: what is known of messages is known for an extractor.
+            replace(memory_of(tmp_path, reader=reader), extractor=extractor.__wrapped__())
+            for reader in (McapReader(), OneByOne())
+        )
+        found = [
+            find_matches(each, Call(), "/*", "near_position", place, limit=200)
+            for each in (at_once, singly)
+        ]
+        assert found[0].sightings == found[1].sightings
+        assert found[0].total == found[1].total
+        assert bool(found[0].sightings) == (place is not far)
 
 
 def test_a_transform_that_is_valid_in_some_messages_only_is_not_lost(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_a_window_cuts_visits(tmp_path: Path) -> None:
     ("given", "reason"),
     [
         ({"where": "attic"}, "there are: corner"),
-        ({"where": {"x": [1, 0], "y": [0, 1]}}, "no range"),
+        ({"where": {"x": [1, 0], "y": [0, 1]}}, "not a range"),
         ({"where": {"x": 1.0}}, "give the name"),
         ({"where": {"x": 1.0, "y": 1.0, "z": 0}}, "has no"),
         ({"where": 5}, "give the name"),
