@@ -112,6 +112,11 @@ def joined(parts: Sequence[Presence]) -> Presence:
     )
 
 
+def shortest_silence(period: Ns) -> Ns:
+    """Returns how long a topic with this period must have no message to count as silent."""
+    return max(SHORTEST_NS, PERIODS * period)
+
+
 def usual_period(presence: Presence) -> Ns | None:
     """Returns the usual time between two messages; None for a topic without a usual rate."""
     octaves = sorted(presence.spacings)
@@ -148,7 +153,7 @@ def silences(presences: Mapping[str, Presence], together: Iterable[Iterable[str]
         others = frozenset(companions.get(topic, ()))
         if others not in on:
             on[others] = _heard([presences[each].runs for each in sorted(others)])
-        limit = max(SHORTEST_NS, PERIODS * period)
+        limit = shortest_silence(period)
         runs = _merged(presences[topic].runs, limit)
         found += _reported([*_silences_of(topic, runs, on[others], limit)], runs)
     return sorted(found, key=lambda each: (each.start, each.end, each.topic))

@@ -101,8 +101,17 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 
 def was_forgotten(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
     """Whether messages of a topic in a window were deleted by request."""
+    return bool(forgotten_spans(bag_dir, topic, window))
+
+
+def forgotten_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
+    """Returns when (log time, half-open) messages of a topic were deleted by request, in order.
+
+    Those intervals that overlap the window, joined where they overlap.
+    """
     losses = read_losses(bag_dir, window.start, window.stop)
-    return any(each.topic == topic and each.by == "forgotten" for each in losses)
+    gone = (each for each in losses if each.topic == topic and each.by == "forgotten")
+    return united((each.start, each.stop) for each in gone)
 
 
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:

@@ -7,7 +7,13 @@ from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.silences import LONGEST_OFF_NS, joined, silences
+from ros2_memory.analysis.silences import (
+    LONGEST_OFF_NS,
+    joined,
+    shortest_silence,
+    silences,
+    usual_period,
+)
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
@@ -126,6 +132,10 @@ class Snapshot:
         """Where topics with a usual rate were silent, in order of time; see `analysis.silences`."""
         together = frozenset(chain.from_iterable(part.together for part in self._dated))
         return tuple(silences(self._presences, together))
+
+    def shortest_silence(self, topic: str) -> Ns:
+        """Returns how long a topic of `silences` must have no message to count as silent."""
+        return shortest_silence(usual_period(self._presences[topic]) or 0)
 
     @cached_property
     def newest_stretch(self) -> Ns | None:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.silences import Silence
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
-from ros2_memory.history.coverage import unix_text, was_forgotten
+from ros2_memory.history.coverage import forgotten_spans, unix_text
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
+    from pathlib import Path
 
-    from ros2_memory.analysis.silences import Silence
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.history.view import View
@@ -25,17 +26,32 @@ _ALIKE_NS: Final[Ns] = 30 * NS_PER_S
 def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
     """Yields all silences in order of time.
 
-    A latched topic holds, and is never silent. Nor was one silent whose messages were deleted by
-    request.
+    A latched topic holds, and is never silent. Nor was one silent where its messages were deleted
+    by request.
     """
     latching, bag_dir = memory.limits.latching, memory.index.bag_dir
     latched: dict[str, bool] = {}
     for each in snapshot.silences:
         if each.topic not in latched:
             latched[each.topic] = latching.is_latched(snapshot, each.topic)
-        span = TimeWindow(each.start + 1, each.end)
-        if not latched[each.topic] and not was_forgotten(bag_dir, each.topic, span):
-            yield each
+        if not latched[each.topic]:
+            yield from _around_forgotten(bag_dir, snapshot, each)
+
+
+def _around_forgotten(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
+    """Yields a silence, or the parts of it before and after messages were deleted by request."""
+    gone = forgotten_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
+    if not gone:
+        yield silence
+        return
+    if silence.length < silence.end - silence.start:
+        return  # the robot was off for a while, and which part that was in is not known
+    begins = [silence.start, *(stop for _, stop in gone)]
+    ends = [*(start for start, _ in gone), silence.end]
+    for start, end in zip(begins, ends, strict=True):
+        if end - start >= snapshot.shortest_silence(silence.topic):
+            goes_on = silence.goes_on and end == silence.end
+            yield Silence(silence.topic, start, end, end - start, goes_on)
 
 
 def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:

@@ -79,6 +79,16 @@ def test_messages_deleted_by_request_are_no_silence(memory: Memory, tmp_path: Pa
     assert "deleted by request" in note
 
 
+def test_around_what_was_deleted_by_request_a_silence_stays_one(
+    memory: Memory, tmp_path: Path
+) -> None:
+    """91 s of silence: 10 s of it deleted leave a part that is long enough, and one that is not."""
+    append_losses(tmp_path, [Loss(SEEN, (BEGIN + 109) * S, (BEGIN + 119) * S, 9, "forgotten")])
+    [left] = asked(memory, tmp_path, "memory_status")["silences"]
+    assert (left["start"], left["end"]) == (BEGIN + 119, BEGIN + 190.000001)
+    assert left["silent_s"] == pytest.approx(71.0)
+
+
 def test_a_recap_has_it_as_an_event(memory: Memory, tmp_path: Path) -> None:
     reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]
