@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
+    from ros2_memory.catalogue.digest_config import DigestConfig
     from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place, Region
@@ -65,6 +66,10 @@ _Port = TypeVar("_Port")
 
 _NEW_OBJECTS = 50_000
 """After so many new objects the server looks for garbage among them."""
+_READ_ALIKE = (
+    "ros2_memory.storage.mcap_reader.McapReader",
+    "ros2_memory.storage.rosbag2_reader.Rosbag2Reader",
+)
 _MOST_SPLITS = 5000
 """The splits of one recording that `bag_dir.state.screened_file` takes."""
 
@@ -363,7 +368,7 @@ def build_memory(settings: Settings, shared: SharedParts | None = None) -> Memor
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.catalogue.lookup import DigestCache
-    from ros2_memory.catalogue.store import Catalogue
+    from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
     from ros2_memory.history.context import Memory
     from ros2_memory.recorder.index_manager import IndexManager
 
@@ -373,7 +378,9 @@ def build_memory(settings: Settings, shared: SharedParts | None = None) -> Memor
     reader = BagDirReader(shared.reader, bag_dir)
     catalogue = Catalogue(
         partial(catalogue_paths, settings),
-        catalogue_fingerprint(settings, schemas),
+        digest_config(settings, schemas),
+        # What a recorder's server found serves who only looks, too.
+        sources=() if settings.data.recording else (bag_dir / FOLDER / FILE,),
         waits_for=bag_dir,
     )
     index = IndexManager(
@@ -415,28 +422,28 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     return (*beside, cache / PACKAGE / name / file) if cache.is_absolute() else beside
 
 
-def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
-    """Returns a hash of all that digests depend on besides the bags.
+def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> DigestConfig:
+    """Returns all that digests depend on besides the bags.
 
     That is settings, message definitions, and this program's version. `schemas` is the schema map
-    of these settings.
+    of these settings. The two readers of the package read a file alike, so that every preset
+    shares one catalogue.
     """
     from ros2_memory.catalogue.digest import DIGEST_VERSION
+    from ros2_memory.catalogue.digest_config import DigestConfig
 
-    folders = [str(folder) for folder in settings.storage.custom_msg_paths]
+    storage = settings.storage
     definitions = [
         (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
-        for folder in settings.storage.custom_msg_paths
+        for folder in storage.custom_msg_paths
         for path in sorted(directories.files_below(Path(folder), ".msg"))
     ]
-    depends_on = (
+    base = (
         package_version(),
         DIGEST_VERSION,
-        settings.storage.target,
+        None if storage.target in _READ_ALIKE else storage.target,
         settings.reader.max_chunk_mb,
-        folders,
         definitions,
-        {name: dict(fields) for name, fields in schemas.items()},
         settings.data.max_array_length,
         settings.data.max_plausible_speed_mps,
         settings.data.pose_topic,
@@ -444,7 +451,12 @@ def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str,
         settings.data.tf_topics,
         settings.data.tf_clock,
     )
-    return hashlib.sha256(json.dumps(depends_on).encode()).hexdigest()[:16]
+    entries = {name: _hash_of(dict(fields)) for name, fields in schemas.items()}
+    return DigestConfig(_hash_of(base), entries)
+
+
+def _hash_of(value: object) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
 
 
 def build_backfill(settings: Settings, memory: Memory) -> Backfill:

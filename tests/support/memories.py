@@ -14,6 +14,7 @@ import yaml
 
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.core.errors import BagError, EpisodicError
@@ -92,7 +93,7 @@ def shipped_extractor(max_array_length: int = 50) -> SchemaExtractor:
 
 def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     """The memory with a catalogue that knows the first `part` of the closed bags."""
-    catalogue = Catalogue([bag_dir / FOLDER / FILE], "test")
+    catalogue = Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test"))
     recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
     digester = Digester(

@@ -8,8 +8,13 @@ import pytest
 from mcp import Client
 
 from ros2_memory import package_version
-from ros2_memory.bootstrap import build_memory, build_reader, build_server
-from ros2_memory.config import load_settings
+from ros2_memory.bootstrap import (
+    build_memory,
+    build_reader,
+    build_server,
+    digest_config,
+)
+from ros2_memory.config import load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -38,6 +43,17 @@ def test_what_a_reader_refuses_is_told_in_its_own_words(tmp_path: Path) -> None:
     refused = settings(tmp_path, f"reader.custom_msg_paths=[{tmp_path}]")
     with pytest.raises(ConfigError, match=r"^reader\.custom_msg_paths: .* holds no"):
         build_reader(refused)
+
+
+@pytest.mark.parametrize("preset", ["robot", "robot_live", "query_only", "replay", "local"])
+def test_every_preset_uses_the_digests_of_every_other(tmp_path: Path, preset: str) -> None:
+    plain, other = settings(tmp_path), settings(tmp_path, f"deployment={preset}")
+    labels = settings(tmp_path, "data.min_score=0.5", "data.labels_file=null")
+    schemas = load_message_schemas(plain)
+    for each in (other, labels):
+        assert digest_config(each, load_message_schemas(each)) == digest_config(plain, schemas)
+    elsewhere = settings(tmp_path, "data.pose_topic=/amcl_pose")
+    assert digest_config(elsewhere, schemas).base != digest_config(plain, schemas).base
 
 
 def test_the_limits_of_the_configuration_reach_the_questions(tmp_path: Path) -> None:

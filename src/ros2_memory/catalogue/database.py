@@ -117,6 +117,7 @@ class CatalogueDatabase:
         paths: where the file may lie, in order of preference; a database in memory serves where
             none can be written. Where the candidates may change, a function that returns those
             of the moment.
+        sources: other files that may be copied to a path that has none yet; only read.
         waits_for: a directory; while it does not exist, nothing is opened or made.
         monotonic: a clock that never steps, in seconds.
     """
@@ -125,10 +126,12 @@ class CatalogueDatabase:
         self,
         paths: Sequence[Path] | Callable[[], Sequence[Path]],
         *,
+        sources: Sequence[Path] = (),
         waits_for: Path | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._candidate_paths = paths if callable(paths) else lambda: paths
+        self._sources = tuple(sources)
         self._waits_for = waits_for
         self._monotonic = monotonic
         self._lock = threading.Lock()
@@ -255,7 +258,7 @@ class CatalogueDatabase:
         if self._opened is None and self._may_open():
             self._tried_s = self._monotonic()
             paths = self._candidate_paths()
-            found = open_file(paths)
+            found = open_file(paths, sources=self._sources)
             self._opened = _in_memory() if isinstance(found, str) else found
             self.trouble = None
             if isinstance(found, str) and paths:
@@ -341,7 +344,11 @@ def _transact(
 
 
 def open_file(
-    paths: Sequence[Path], *, again: bool = False, previous: Path | None = None
+    paths: Sequence[Path],
+    *,
+    again: bool = False,
+    previous: Path | None = None,
+    sources: Sequence[Path] = (),
 ) -> OpenDatabase | str:
     """Opens the database at the first path that can be written; else returns the reason.
 
@@ -350,6 +357,7 @@ def open_file(
         again: whether this was tried before, so that what is logged already is logged at debug.
         previous: its path until now. That file, or else the one at the next path, is copied
             to a path that has none yet.
+        sources: other files that may be copied there; only read.
     """
     reason = ""
     for nth, path in enumerate(paths, start=1):
@@ -357,7 +365,7 @@ def open_file(
             path.parent.mkdir(parents=True, exist_ok=True)
             _refuse_links(path)
             if not path.exists():
-                _copy_first_valid((previous,) if previous else paths[nth:], path)
+                _copy_first_valid((previous,) if previous else (*paths[nth:], *sources), path)
             connection = _connect_and_check(path)
             connection.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
             return OpenDatabase(connection, path, _identities(path))
@@ -384,7 +392,9 @@ def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
                 continue
             temporary.unlink(missing_ok=True)
             _refuse_links(source)
-            address = f"{source.absolute().as_uri()}?mode=ro"
+            # Without a log nobody has it open: as immutable, nothing is made beside it.
+            mode = "mode=ro" if _files_of(source)[1].exists() else "mode=ro&immutable=1"
+            address = f"{source.absolute().as_uri()}?{mode}"
             with (
                 closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
                 closing(sqlite3.connect(temporary)) as copy,

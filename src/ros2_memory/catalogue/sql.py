@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 
 NO_TOPIC: Final = 0
 """The topic of models that belong to no topic."""
-OWN_CONFIG: Final = "(SELECT id FROM configs WHERE text = ?)"
 _TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"
+OF_CONFIGS: Final = f"config {_AMONG}"
 
 # Columns for `topic_rows`. Those of one word are packed, and the word is the kind of their model.
 ZONE_MAP: Final = "zones"
@@ -67,13 +67,15 @@ PACKED_IN: Final = {
 
 
 def entry_rows(
-    connection: sqlite3.Connection, config: str, paths: Sequence[str]
+    connection: sqlite3.Connection, configs: str, paths: Sequence[str]
 ) -> list[sqlite3.Row]:
-    """Returns row id, path, size, mtime and sidecar's mtime of the entries of these files."""
+    """Returns row id, path, size, mtime and sidecar's mtime of the entries of these files.
+
+    `configs` is a JSON list of the ids of configurations, as is `OF_CONFIGS`' parameter.
+    """
     return connection.execute(
-        f"SELECT id, path, size, mtime, sidecar FROM bags"
-        f" WHERE config = {OWN_CONFIG} AND path {_AMONG}",
-        (config, json.dumps(paths)),
+        f"SELECT id, path, size, mtime, sidecar FROM bags WHERE {OF_CONFIGS} AND path {_AMONG}",
+        (configs, json.dumps(paths)),
     ).fetchall()
 
 

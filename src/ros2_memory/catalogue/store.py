@@ -1,10 +1,10 @@
 """The digests of closed bags, in one SQLite file that outlives the process.
 
 Everything here is derived: deleting the file changes no answer, only how long it takes. An entry
-is the digest of one file under one configuration (a hash). The file is identified by its path below
-the bag directory, its size and mtime, and the mtime of the sidecar that says which of its messages
-count. An entry never changes; one that replaces it has another number, and no number is used twice,
-not even after the catalogue's file was lost.
+is the digest of one file under the part of the configuration that it depends on. The file is
+identified by its path below the bag directory, its size and mtime, and the mtime of the sidecar
+that says which of its messages count. An entry never changes; one that replaces it has another
+number, and no number is used twice, not even after the catalogue's file was lost.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from ros2_memory.catalogue.codec import (
     decode_zone_map,
 )
 from ros2_memory.catalogue.database import CatalogueDatabase
+from ros2_memory.catalogue.digest_config import may_be_one
 from ros2_memory.catalogue.field_columns import field_column
 from ros2_memory.catalogue.map_digest import decode_map_tracks
 from ros2_memory.catalogue.packing import unpacked
@@ -33,7 +34,7 @@ from ros2_memory.catalogue.sql import (
     COUNTS,
     EDGES,
     NO_TOPIC,
-    OWN_CONFIG,
+    OF_CONFIGS,
     POSES,
     RANGES,
     RELATCHED,
@@ -72,6 +73,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.analysis.zone_map import Box, ZoneMap
     from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.catalogue.digest_config import DigestConfig
     from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.core.timebase import Ns
@@ -102,7 +104,9 @@ class BagKey(NamedTuple):
 
 
 class Catalogue(CatalogueDatabase):
-    """Stores digests under one configuration. Safe for several threads and several processes.
+    """Stores digests, and finds those that one configuration can use.
+
+    Safe for several threads and several processes.
 
     No error of the file is raised: if it fails, the catalogue has no bag.
 
@@ -110,7 +114,8 @@ class Catalogue(CatalogueDatabase):
         paths: where the file may lie, in order of preference; a database in memory serves where
             none can be written. Where the candidates may change, a function that returns those
             of the moment.
-        config: what digests depend on besides the bag, as a hash.
+        config: what digests depend on besides the bag.
+        sources: other files that may be copied to a path that has none yet; only read.
         waits_for: a directory; until it exists, nothing is opened or made.
         monotonic: a clock that never steps, in seconds.
     """
@@ -118,12 +123,13 @@ class Catalogue(CatalogueDatabase):
     def __init__(
         self,
         paths: Sequence[Path] | Callable[[], Sequence[Path]],
-        config: str,
+        config: DigestConfig,
         *,
+        sources: Sequence[Path] = (),
         waits_for: Path | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__(paths, waits_for=waits_for, monotonic=monotonic)
+        super().__init__(paths, sources=sources, waits_for=waits_for, monotonic=monotonic)
         self._config = config
         self._channels: dict[int, Channel] = {}
 
@@ -148,13 +154,14 @@ class Catalogue(CatalogueDatabase):
 
         def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
             found: dict[str, BagFile] = {}
+            configs = self._usable(connection)
             for number, text in connection.execute("SELECT id, text FROM shapes").fetchall():
                 schema = decode_schema(text)
                 model = model_of(connection, number, COUNTS)
                 cursor = connection.execute(
                     "SELECT path, size, mtime, sidecar, counts FROM bags"  # noqa: S608
-                    f" WHERE config = {OWN_CONFIG} AND shape = ?",
-                    (self._config, number),
+                    f" WHERE {OF_CONFIGS} AND shape = ?",
+                    (configs, number),
                 )
                 while rows := cursor.fetchmany(_BATCH):
                     counts = decode_counts(
@@ -177,8 +184,8 @@ class Catalogue(CatalogueDatabase):
 
         def ask(connection: sqlite3.Connection) -> list[str]:
             rows = connection.execute(
-                f"SELECT path FROM bags WHERE config = {OWN_CONFIG}",  # noqa: S608
-                (self._config,),
+                f"SELECT path FROM bags WHERE {OF_CONFIGS}",  # noqa: S608
+                (self._usable(connection),),
             )
             return [row[0] for row in rows]
 
@@ -188,7 +195,7 @@ class Catalogue(CatalogueDatabase):
         """Returns the number of each file's entry; None where there is none for these bytes."""
 
         def ask(connection: sqlite3.Connection) -> dict[BagKey, int]:
-            rows = entry_rows(connection, self._config, [key.path for key in keys])
+            rows = entry_rows(connection, self._usable(connection), [key.path for key in keys])
             return {BagKey(*key): self.offset + number for number, *key in rows}
 
         found: dict[BagKey, int] = self.read(ask, {})
@@ -456,7 +463,8 @@ class Catalogue(CatalogueDatabase):
         def write(connection: sqlite3.Connection) -> None:
             self._delete_paths(connection, [key.path for key, _ in entries])
             for key, digest in entries:
-                insert_entry(connection, self._config, key, digest)
+                types = [topic.type for topic in digest.summary.schema.topics]
+                insert_entry(connection, self._config.text(types), key, digest)
 
         return self.write(write)
 
@@ -464,7 +472,7 @@ class Catalogue(CatalogueDatabase):
         """Returns the keys from which that of an entry differs in the time of the sidecar alone."""
 
         def ask(connection: sqlite3.Connection) -> set[BagKey]:
-            rows = entry_rows(connection, self._config, [key.path for key in keys])
+            rows = entry_rows(connection, self._usable(connection), [key.path for key in keys])
             known = {path: BagKey(path, *rest) for _, path, *rest in rows}
             return {
                 key
@@ -485,7 +493,7 @@ class Catalogue(CatalogueDatabase):
         def write(connection: sqlite3.Connection) -> None:
             renewed.clear()
             for key, summary in entries:
-                for row_id, *_ in entry_rows(connection, self._config, [key.path]):
+                for row_id, *_ in entry_rows(connection, self._usable(connection), [key.path]):
                     if _summary_of(connection, row_id) == summary:
                         renew_entry(connection, row_id, key.sidecar_ns)
                         renewed.add(key)
@@ -503,31 +511,38 @@ class Catalogue(CatalogueDatabase):
             self.write(write)
 
     def forget_older_configurations(self) -> None:
-        """Deletes entries of other configurations, except of the one that wrote last.
+        """Deletes entries that this configuration cannot use, except of the one that wrote last.
 
         Two programs of different configuration may share the catalogue: if each deleted the
         other's entries, they would digest all bags for ever.
         """
 
         def write(connection: sqlite3.Connection) -> None:
+            configs = dict(connection.execute("SELECT id, text FROM configs").fetchall())
+            others = {number for number, text in configs.items() if not self._config.reads(text)}
             latest = connection.execute(
-                f"SELECT config FROM bags WHERE config IS NOT {OWN_CONFIG}"  # noqa: S608
-                " ORDER BY id DESC LIMIT 1",
-                (self._config,),
+                f"SELECT config FROM bags WHERE {OF_CONFIGS} ORDER BY id DESC LIMIT 1",  # noqa: S608
+                (json.dumps([*others]),),
             ).fetchone()
             if latest is None:
                 return
+            kept = configs[latest[0]]
+            older = [number for number in others if not may_be_one(configs[number], kept)]
             rows = connection.execute(
-                f"SELECT id FROM bags WHERE config IS NOT {OWN_CONFIG}"  # noqa: S608
-                " AND config <> ?",
-                (self._config, latest[0]),
+                f"SELECT id FROM bags WHERE {OF_CONFIGS}",  # noqa: S608
+                (json.dumps(older),),
             )
             delete_entries(connection, [row[0] for row in rows.fetchall()])
 
         self.write(write)
 
+    def _usable(self, connection: sqlite3.Connection) -> str:
+        """Returns the ids of the configurations whose entries are the same under this one."""
+        rows = connection.execute("SELECT id, text FROM configs").fetchall()
+        return json.dumps([number for number, text in rows if self._config.reads(text)])
+
     def _delete_paths(self, connection: sqlite3.Connection, paths: Sequence[str]) -> None:
-        rows = entry_rows(connection, self._config, paths)
+        rows = entry_rows(connection, self._usable(connection), paths)
         delete_entries(connection, [row[0] for row in rows])
 
 

@@ -247,14 +247,20 @@ class Backfill:
     def prune(self) -> None:
         """Removes the entries of deleted files, and those of older configurations.
 
-        Does nothing where there are no bags: the disk of the bags is more likely missing than
-        empty.
+        Keeps those of files that only the reader of another preset opens. Does nothing where there
+        are no bags: the disk of the bags is more likely missing than empty.
         """
         snapshot = self._memory.index.snapshot()
         if snapshot.problem is not None or not snapshot.bags:
             return
         present = {self._key(bag).path for bag in snapshot.timeline.bags}
-        self.catalogue.forget([path for path in self.catalogue.paths() if path not in present])
+        files = {path: self._bag_dir / path for path in self.catalogue.paths()}
+        gone = [
+            path
+            for path, file in files.items()
+            if path not in present and (self._memory.reader.reads(file) or not file.exists())
+        ]
+        self.catalogue.forget(gone)
         self.catalogue.forget_older_configurations()
 
     def _is_unchanged(self, bag: BagFile) -> bool:

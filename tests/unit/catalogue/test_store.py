@@ -15,6 +15,7 @@ import structlog
 from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue, relative
 from ros2_memory.core.model import BagFile, BagState
 from tests.support.bags import boolean, detections, odom, tf, transform
@@ -53,8 +54,11 @@ def topic(digest: Digest, name: str) -> TopicDigest:
     return next(each for each in digest.topics if each.topic == name)
 
 
-def catalogue_in(folder: Path, config: str = "config") -> Catalogue:
-    return Catalogue([folder / FOLDER / FILE], config)
+CONFIG = DigestConfig("config")
+
+
+def catalogue_in(folder: Path, base: str = "config", **entries: str) -> Catalogue:
+    return Catalogue([folder / FOLDER / FILE], DigestConfig(base, entries))
 
 
 def made(folder: Path) -> None:
@@ -192,6 +196,29 @@ def test_of_other_configurations_the_last_to_write_remains(tmp_path: Path) -> No
     assert [holds(each) for each in (one, two, three)] == [False, True, True]
 
 
+def test_a_changed_schema_entry_concerns_the_bags_with_that_type_alone(tmp_path: Path) -> None:
+    states, poses = digest_of(boolean(T0, True)), digest_of(odom(T0, 1.0, 2.0, 0.3))
+    of_states, of_poses = KEY, KEY._replace(path="rec/rec_1.mcap")
+    before = catalogue_in(tmp_path, **{"std_msgs/msg/Bool": "data"})
+    assert before.put_all([(of_states, states), (of_poses, poses)])
+    after = catalogue_in(tmp_path, **{"std_msgs/msg/Bool": "value", "a/msg/Type": "field"})
+    assert [holds(after, key) for key in (of_states, of_poses)] == [False, True]
+    assert [*after.known_files(tmp_path)] == [str(tmp_path / of_poses.path)]
+    assert after.put(of_states, states)
+    assert [holds(each, of_states) for each in (before, after)] == [True, True]
+
+
+def test_of_the_last_to_write_bags_of_all_types_remain(tmp_path: Path) -> None:
+    states, poses = KEY, KEY._replace(path="rec/rec_1.mcap")
+    for base in ("older", "last"):
+        catalogue = catalogue_in(tmp_path, base)
+        catalogue.put(states, digest_of(boolean(T0, True)))
+        catalogue.put(poses, digest_of(odom(T0, 1.0, 2.0, 0.3)))
+    catalogue_in(tmp_path, "now").forget_older_configurations()
+    for base, stays in (("older", False), ("last", True)):
+        assert [holds(catalogue_in(tmp_path, base), key) for key in (states, poses)] == [stays] * 2
+
+
 def test_alone_in_a_catalogue_a_configuration_keeps_what_it_found(tmp_path: Path) -> None:
     catalogue = catalogue_in(tmp_path)
     catalogue.put(KEY, DIGEST)
@@ -291,8 +318,8 @@ def test_where_the_first_place_cannot_be_written_the_next_one_is_used(tmp_path: 
     (tmp_path / "file").write_text("a file, and no folder")
     refused = tmp_path / "file" / FOLDER / FILE
     second = tmp_path / "cache" / FILE
-    assert Catalogue([refused, second], "config").path == second
-    nowhere = Catalogue([refused], "config")
+    assert Catalogue([refused, second], CONFIG).path == second
+    nowhere = Catalogue([refused], CONFIG)
     assert nowhere.path is None
     assert nowhere.put(KEY, DIGEST)
     assert holds(nowhere)
@@ -341,7 +368,7 @@ def test_a_name_that_is_no_text_can_be_kept(tmp_path: Path) -> None:
 
 def test_nothing_is_made_before_the_bag_directory_exists(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
-    catalogue = Catalogue([bag_dir / FOLDER / FILE], "config", waits_for=bag_dir)
+    catalogue = Catalogue([bag_dir / FOLDER / FILE], CONFIG, waits_for=bag_dir)
     assert not catalogue.put(KEY, DIGEST)
     assert catalogue.path is None
     assert not bag_dir.exists()
@@ -354,7 +381,7 @@ class TestAPlaceThatComesUp:
     """As when a recorder comes to bags whose catalogue lies in the cache."""
 
     def catalogue(self, places: list[Path], monotonic: list[float]) -> Catalogue:
-        return Catalogue(lambda: places, "config", monotonic=lambda: monotonic[0])
+        return Catalogue(lambda: places, CONFIG, monotonic=lambda: monotonic[0])
 
     def test_the_content_at_the_previous_path_is_copied(self, tmp_path: Path) -> None:
         beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
@@ -373,30 +400,48 @@ class TestAPlaceThatComesUp:
         assert not catalogue.is_current(number)
         other = KEY._replace(path="rec/later.mcap")
         assert catalogue.put(other, DIGEST)
-        assert not holds(Catalogue([cache], "config"), other)
+        assert not holds(Catalogue([cache], CONFIG), other)
         assert [path.name for path in beside.parent.iterdir() if path.name.startswith(".")] == []
 
     def test_it_takes_the_place_of_none_that_lies_there(self, tmp_path: Path) -> None:
         beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
         other = KEY._replace(path="rec/other.mcap")
-        assert Catalogue([beside], "config").put(other, DIGEST)
-        assert Catalogue([cache], "config").put(KEY, DIGEST)
-        catalogue = Catalogue([beside, cache], "config")
+        assert Catalogue([beside], CONFIG).put(other, DIGEST)
+        assert Catalogue([cache], CONFIG).put(KEY, DIGEST)
+        catalogue = Catalogue([beside, cache], CONFIG)
         assert (holds(catalogue, other), holds(catalogue)) == (True, False)
 
     def test_one_that_is_none_of_this_version_is_not_taken_along(self, tmp_path: Path) -> None:
         beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
-        with closing(Catalogue([cache], "config")) as older:
+        with closing(Catalogue([cache], CONFIG)) as older:
             assert older.put(KEY, DIGEST)
         with closing(sqlite3.connect(cache)) as base:
             base.execute("PRAGMA user_version = 1")
         before = cache.read_bytes()
-        catalogue = Catalogue([beside, cache], "config")
+        catalogue = Catalogue([beside, cache], CONFIG)
         assert (catalogue.path, holds(catalogue)) == (beside, False)
         assert cache.read_bytes() == before
         cache.write_bytes(b"no catalogue at all")
-        third = Catalogue([tmp_path / "third" / FILE, cache], "config")
+        third = Catalogue([tmp_path / "third" / FILE, cache], CONFIG)
         assert third.put(KEY, DIGEST)
+
+    def test_a_new_one_starts_with_what_another_holds_and_leaves_that_alone(
+        self, tmp_path: Path
+    ) -> None:
+        beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
+        with closing(Catalogue([beside], CONFIG)) as other:
+            assert other.put(KEY, DIGEST)
+        before = {each: each.read_bytes() for each in beside.parent.iterdir()}
+        with closing(Catalogue([cache], CONFIG, sources=[beside])) as catalogue:
+            assert (catalogue.path, holds(catalogue)) == (cache, True)
+            assert catalogue.put(KEY._replace(path="rec/later.mcap"), DIGEST)
+        assert {each: each.read_bytes() for each in beside.parent.iterdir()} == before
+
+    def test_a_new_one_starts_with_what_another_program_writes(self, tmp_path: Path) -> None:
+        beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
+        other = Catalogue([beside], CONFIG)
+        assert other.put(KEY, DIGEST)
+        assert holds(Catalogue([cache], CONFIG, sources=[beside]))
 
     def test_it_is_not_left_where_it_may_no_longer_be_made(self, tmp_path: Path) -> None:
         beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE

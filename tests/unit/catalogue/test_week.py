@@ -10,6 +10,7 @@ import pytest
 
 from ros2_memory import queries
 from ros2_memory.catalogue.digest import Digest, Digester
+from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import BagKey, Catalogue
 from ros2_memory.core.bag_summary import BagSummary
@@ -85,7 +86,7 @@ def moved(poses: PoseDigest, by: int) -> PoseDigest:
 
 @pytest.fixture(scope="module")
 def week() -> tuple[Memory, FakeReader]:
-    catalogue, first = Catalogue([], "week"), first_bag()
+    catalogue, first = Catalogue([], DigestConfig("week")), first_bag()
     bags: list[BagFile] = []
     entries: list[tuple[BagKey, Digest]] = []
     for number in range(BAGS):

@@ -21,6 +21,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
@@ -54,7 +55,7 @@ def bag(bag_dir: Path, number: int, *, finish: bool = True) -> Path:
 
 
 def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
-    recall = DigestCache(Catalogue([bag_dir / FOLDER / FILE], "test"), bag_dir)
+    recall = DigestCache(Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test")), bag_dir)
     reader = BagDirReader(McapReader(), bag_dir)
     return replace(memory_of(bag_dir, clock=clock, reader=reader), recall=recall)
 
@@ -249,7 +250,7 @@ def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
 def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Path) -> None:
     bag_dir, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
     bag(bag_dir, 0)
-    recall = DigestCache(Catalogue([tmp_path / FILE], "test"), bag_dir)
+    recall = DigestCache(Catalogue([tmp_path / FILE], DigestConfig("test")), bag_dir)
     memory = replace(memory_of(bag_dir), recall=recall)
     fill_catalogue(backfill_of(memory, bag_dir))
     bag_dir.rename(elsewhere)
