@@ -24,6 +24,7 @@ from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import T0, ask_everything, write_run
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 COMMANDS: Final = {
@@ -161,3 +162,34 @@ def test_it_stays_in_the_cache_where_nothing_is_recorded_though_a_heartbeat_was_
         assert "in the catalogue" in ran.stderr
         assert state(strangers) == before
     assert (strangers / HEARTBEAT_FILE).is_file()
+
+
+def numbered(file: Path) -> dict[str, int]:
+    """The number of each bag's entry; another one where the bag was digested anew."""
+    with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
+        return dict(base.execute("SELECT path, id FROM bags").fetchall())
+
+
+def unshared(found: Mapping[str, object]) -> dict[str, object]:
+    """Without the files by which several programs use one SQLite file, which readers touch too."""
+    return {path: each for path, each in found.items() if not path.endswith(("-shm", "-wal"))}
+
+
+def test_what_a_recorders_preset_indexed_serves_who_only_looks(
+    strangers: Path, tmp_path: Path, env: dict[str, str]
+) -> None:
+    recorded_before(strangers)
+    assert run({**env, "MEMORY_DEPLOYMENT": "robot"}, strangers, "index").returncode == 0
+    indexed = numbered(strangers / FOLDER / FILE)
+    assert indexed
+    before = unshared(state(strangers))
+    assert run({**env, "MEMORY_DEPLOYMENT": "replay"}, strangers, "index").returncode == 0
+    assert unshared(state(strangers)) == before
+    # This preset's reader also opens `.db3` files.
+    [cached] = (tmp_path / "cache").rglob(FILE)
+    found = numbered(cached)
+    assert indexed.items() < found.items()
+    assert {path.rpartition(".")[2] for path in found.keys() - indexed.keys()} == {"db3"}
+    # And the first one's leaves them there.
+    assert run({**env, "MEMORY_DEPLOYMENT": "local"}, strangers, "index").returncode == 0
+    assert numbered(cached) == found
