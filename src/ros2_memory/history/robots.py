@@ -21,8 +21,11 @@ from ros2_memory.history.duplicates import COPY_HORIZON_NS, copy_key
 from ros2_memory.history.merged_stream import bag_span_of
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import View
-from ros2_memory.index.overlaps import Overlapping, overlapping_recordings
-from ros2_memory.index.recordings import recordings_of
+from ros2_memory.index.recordings import (
+    Overlapping,
+    overlapping_recordings,
+    recordings_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.overlaps import Overlapping, overlapping_recordings
+from ros2_memory.index.recordings import Overlapping, overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of
