@@ -22,6 +22,7 @@ import yaml
 from mcp import Client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
+from ros2_memory import cli
 from ros2_memory.config import load_settings
 from ros2_memory.serving.web_app import STREAM_PATH
 from tests.support.documented_history import START_S, write_history
@@ -158,6 +159,33 @@ def test_every_command_runs(block: Block, home: Path) -> None:
             script.append(re.sub(r"(ros2-memory watch)\b", r"\1 --count 1", line))
     done = run(script, home)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+IN_LINES: Final = sorted(
+    {
+        words
+        for path in DOCUMENTS
+        for span in re.findall(r"`([^`\n]+)`", path.read_text(encoding="utf-8"))
+        for words in [tuple(span.split())]
+        if words[:1] == ("ros2-memory",) and len(words) > 1
+    }
+)
+"""Commands within a sentence or a table."""
+
+
+@pytest.mark.parametrize("words", IN_LINES, ids=" ".join)
+def test_a_command_in_a_sentence_is_one_with_these_options(
+    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Placeholders (`PATH`) stand for arguments, and `a|b` for several commands."""
+    names = [each for word in words[1:] for each in word.split("|") if each.islower()]
+    options = [each for each in words if each.startswith("--")]
+    commands = [each for each in names if not each.startswith("-") and "." not in each]
+    calls = [["plot", each] for each in commands[1:]] if commands[:1] == ["plot"] else [commands]
+    for call in calls:
+        assert cli.main([*call, "--help"]) == 0
+        shown = capsys.readouterr().out
+        assert [each for each in options if each not in shown] == []
 
 
 def run(script: list[str], home: Path) -> subprocess.CompletedProcess[str]:
