@@ -10,7 +10,6 @@ import math
 import os
 import subprocess
 import time
-from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -224,7 +223,7 @@ class Backfill:
 
         And what the bags of a segment add up to, so that no process joins a week for its first
         answer. What was computed once is not looked at again, but for the hour before the bags
-        that were digested since, and the segments that this touches.
+        that were digested since.
         """
         with suppress(EpisodicError):
             rows = list_recorded_topics(self._memory, Call())
@@ -242,7 +241,7 @@ class Backfill:
             if any(has_events(each) for each in types):
                 with suppress(EpisodicError):
                     store_shared_events(view, topic, window)
-        store_joined(self._memory, window)
+        store_joined(self._memory)
 
     def prune(self) -> None:
         """Removes the entries of deleted files, and those of older configurations.
@@ -291,8 +290,8 @@ class Backfill:
         return BagKey.of(bag, self._bag_dir)
 
 
-def store_joined(memory: Memory, window: TimeWindow) -> None:
-    """Stores what the bags of each segment in a window, and of the one before, add up to.
+def store_joined(memory: Memory) -> None:
+    """Stores what the bags of each segment add up to.
 
     Nothing is looked at where all of it was stored, be it by another process.
     """
@@ -306,9 +305,8 @@ def store_joined(memory: Memory, window: TimeWindow) -> None:
     mark = f"joined {JOINED_VERSION} all {limits.max_plausible_speed_mps:g} {limits.pose_topic}"
     if catalogue.joined(mark, [numbers]) is not None:
         return
-    at = bisect_right(timeline.segments, window.start, key=lambda each: each.bags[0].start)
-    # The one before a segment that is new has become final with it.
-    window = TimeWindow(timeline.segments[max(at - 2, 0)].bags[0].start, MAX_NS)
+    # Not only what is new: `forget` empties the catalogue of all that was joined.
+    window = TimeWindow.everything()
     with suppress(EpisodicError):
         drive_in(view, window)
     for topic, types in timeline.types.items():

@@ -241,7 +241,7 @@ def test_what_is_stored_of_many_bags_changes_no_answer(
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
         filling = recalling(replace(plain), bag_dir)
         assert filling.recall is not None
-        store_joined(filling, TimeWindow.everything())
+        store_joined(filling)
         # As another process: nothing is in memory.
         recalled = replace(plain, recall=DigestCache(filling.recall.catalogue, bag_dir))
         spans = [(min(moments), max(moments)), sorted(draw.sample(moments, 2))]
