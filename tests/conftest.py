@@ -13,9 +13,11 @@ from unittest.mock import patch
 import pytest
 import structlog
 from coverage import Coverage
+from hydra import compose
 from hypothesis import settings
 from xdist.remote import Producer
 
+from tests.support.measured import is_measured, untraced
 from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
 
@@ -47,54 +49,6 @@ for _number, _handler in (
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
-UNMEASURED = (
-    "faults/test_catalogue_faults.py",
-    "faults/test_failing_reads.py",
-    "faults/test_kills.py",
-    "faults/test_running_server.py",
-    "faults/test_two_servers.py",
-    "fuzz/*.py",
-    "oracle/*.py",
-    "soak/*.py",
-    "test_benchmarks.py",
-    "test_bins.py::test_a_label_counts_the_same",
-    "test_bins.py::test_no_count_depends",
-    "test_cancelled.py",
-    "test_catalogue_versions.py",
-    "test_deep_directories.py",
-    "test_demo.py::test_it_",
-    "test_documents.py",
-    "test_export.py::test_other_programs_open_what_comes_of_public_robots_bags",
-    "test_home_questions.py",
-    "test_home_week.py",
-    "test_home_world.py",
-    "test_hostile_*.py",
-    "test_index_killed.py",
-    "test_live_*.py",
-    "test_looking_only.py",
-    "test_*_real_bags.py",
-    "test_path_length.py",
-    "test_planner_questions.py",
-    "test_real_bags*.py",
-    "test_recap.py::test_a_recap_of_a_place_is_the_same",
-    "test_recorded_sessions.py",
-    "test_reply_size.py",
-    "test_same_answers.py",
-    "test_standstills.py",
-    "test_time_zero.py",
-    "test_trajectory.py::test_a_long_way_is_drawn_in_bounded_memory",
-    "test_trajectory.py::test_a_path_in_very_many_pieces_is_held_in_bounded_memory",
-    "test_week.py",
-)
-"""Tests in which coverage is not measured, which takes up to five times as long as the test itself:
-files, or tests of a file by how their names begin.
-
-They ask much of everything at once, of hours of poses, or of programs over and over; what they run
-is run by other tests of the same room, or of the tools above it, as well.
-"""
-DRAWN = "hypothesis"
-"""The mark of tests that draw their examples: the same lines many times, so not measured either."""
-
 
 def pytest_unconfigure() -> None:
     """Removes what tests left in that cache."""
@@ -104,14 +58,6 @@ def pytest_unconfigure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest first, so that the others are done meanwhile."""
     items.sort(key=lambda item: place(item.nodeid))
-
-
-def is_measured(item: pytest.Item) -> bool:
-    """Whether what a test runs counts for coverage."""
-    if item.get_closest_marker(DRAWN) is not None:
-        return False
-    names = (each.partition("::") for each in UNMEASURED)
-    return not any(item.path.match(file) and item.name.startswith(test) for file, _, test in names)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -174,6 +120,13 @@ def types_compiled_once() -> Iterator[None]:
         return _COMPILED_TYPES[key]
 
     with patch.object(Typestores, "_build", once):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _configuration_composed_unmeasured() -> Iterator[None]:
+    """Hydra runs very many lines of its own to compose a configuration, which most tests do."""
+    with patch("ros2_memory.config.compose", untraced(compose)):
         yield
 
 

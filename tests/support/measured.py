@@ -1,0 +1,97 @@
+"""In which tests coverage is measured, which takes up to five times as long as the test itself.
+
+Measured is the first example of each plain test; what the others run, tests of the same room or of
+the tools above it run as well: 92 % of all lines and branches together, the gate is 85 %.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Final, ParamSpec, TypeVar
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+UNMEASURED: Final = (
+    "faults/*.py",
+    "fuzz/*.py",
+    "integration/*.py",
+    "oracle/*.py",
+    "soak/*.py",
+    "demo/test_robot.py",
+    "test_benchmarks.py",
+    "test_bins.py::test_a_boolean_is_counted",
+    "test_bins.py::test_all_ways",
+    "test_bins.py::test_bags_that_cannot",
+    "test_bins.py::test_the_metres",
+    "test_cancelled.py",
+    "test_catalogue_versions.py",
+    "test_confinement.py::test_no_text_of_a_caller",
+    "test_confinement.py::test_no_tool_reads",
+    "test_deep_directories.py",
+    "test_digest.py::test_the_path_of_joined_bags",
+    "test_documents.py",
+    "test_forget_messages.py::test_whatever_was_done",
+    "test_home_*.py",
+    "test_hostile_*.py",
+    "test_instances.py::test_nearly_every_label",
+    "test_*_real_bags.py",
+    "test_path_length.py",
+    "test_planner_questions.py",
+    "test_real_bags*.py",
+    "test_recap.py::test_stops_under_noise",
+    "test_recap.py::test_the_demos_robot",
+    "test_recorded_sessions.py",
+    "test_reply_size.py",
+    "test_repository.py",
+    "test_same_answers.py",
+    "test_standstills.py",
+    "test_storage_limits.py::test_chunks_beyond",
+    "test_time_zero.py",
+    "test_trajectory.py::test_a_long_way_is_drawn_in_bounded_memory",
+    "test_trajectory.py::test_a_path_in_very_many_pieces_is_held_in_bounded_memory",
+    "test_visits.py",
+    "test_week.py",
+)
+"""Files, or tests of a file by how their names begin, that are not measured.
+
+They ask much of everything at once, of hours of poses, or of programs over and over.
+"""
+DRAWN: Final = "hypothesis"
+"""The mark of tests that draw their examples: the same lines many times, so not measured either."""
+
+
+def is_measured(item: pytest.Item) -> bool:
+    """Whether what a test runs counts for coverage."""
+    if item.get_closest_marker(DRAWN) is not None or not _is_first_example(item):
+        return False
+    names = (each.partition("::") for each in UNMEASURED)
+    return not any(item.path.match(file) and item.name.startswith(test) for file, _, test in names)
+
+
+def _is_first_example(item: pytest.Item) -> bool:
+    """Whether a test has its first value of each parameter, or no parameter."""
+    callspec = getattr(item, "callspec", None)
+    return callspec is None or not any(callspec.indices.values())
+
+
+def untraced(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """The function, of someone else's, run without the tracing that coverage is measured by.
+
+    The tracing goes and comes in one frame, for what counts calls must see their ends.
+    """
+
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        tracing = sys.gettrace()
+        sys.settrace(None)
+        try:
+            return function(*args, **kwargs)
+        finally:
+            sys.settrace(tracing)
+
+    return run
