@@ -26,7 +26,7 @@ from ros2_memory.analysis.motion.robot_track import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.bag_frames import Floats, Mask, Times
+    from ros2_memory.analysis.bag_frames import Floats, Mask, Rotations, Times
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
@@ -38,7 +38,7 @@ ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
 _NEAR_NS: Final[Ns] = 1_000_000_000
 """Between two poses that are farther apart, where the robot was is not known."""
 _FLAT: Final = (0.0, 0.0, 0.0, 1.0)
-_HEAD: Final = struct.Struct("<IH")
+_HEAD: Final = struct.Struct("<IHI")
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +85,7 @@ class MapDigest:
         track: of the robot.
         left_out: how many poses could not be placed.
         sights: what `SightsSource.digest` returned; empty without a builder.
+        own: the same in the poses' own frame, without sights; None where `frame_id` is that.
     """
 
     frame_id: str
@@ -92,6 +93,7 @@ class MapDigest:
     track: RobotTrack
     left_out: int = 0
     sights: bytes = b""
+    own: MapDigest | None = None
 
 
 class RobotPoses(NamedTuple):
@@ -199,7 +201,7 @@ class MapCollector:
 
     def digest(self, statics: Statics) -> MapDigest:
         """Returns the digest of all that was added."""
-        placed, frame_id = self._placed(statics)
+        placed, frame_id, own = self._placed(statics)
         track = track_of(placed.times, placed.x, placed.y, placed.heading)
         return MapDigest(
             frame_id,
@@ -207,10 +209,14 @@ class MapCollector:
             track,
             len(self._times) - len(placed.times),
             b"" if self.sights is None else self.sights.digest(placed),
+            own,
         )
 
-    def _placed(self, statics: Statics) -> tuple[PlacedPoses, str]:
-        """Returns the poses in the map, or in their own frame; and the name of that frame."""
+    def _placed(self, statics: Statics) -> tuple[PlacedPoses, str, MapDigest | None]:
+        """Returns the poses in the map, or in their own frame; and the name of that frame.
+
+        With them, where they are in the map, the digest of them in their own frame.
+        """
         # Poses of one topic nearly always have one frame: those of others are left out.
         own = max(self._frames, key=lambda each: self._frames[each], default="")
         clock = self._settings.tf_clock
@@ -236,41 +242,69 @@ class MapCollector:
         ).reshape(-1, 7)
         x, y, z, qx, qy, qz, qw = numbers.T
         poses = frames.poses(own, times)
+        turned = np.array([pose.orientation is not None for _, pose in pairs], np.bool_)
+        in_own: MapDigest | None = None
+        if self._poses and target != own:
+            track = track_of(times, x, y, _heading((qx, qy, qz, qw), turned))
+            in_own = MapDigest(own, statics.key, track, len(self._times) - len(times))
         if poses is None:
-            return PlacedPoses(frames, times[:0], x[:0], y[:0], x[:0]), target
+            return PlacedPoses(frames, times[:0], x[:0], y[:0], x[:0]), target, in_own
         px, py, _ = poses.points((x, y, z))
-        tx, ty, tz, tw = multiply(poses.rotation, (qx, qy, qz, qw))
-        heading = np.arctan2(2 * (tw * tz + tx * ty), 1 - 2 * (ty * ty + tz * tz))
-        if any(pose.orientation is None for _, pose in pairs):
-            turned = [pose.orientation is not None for _, pose in pairs]
-            heading = np.where(np.array(turned, np.bool_), heading, np.nan)
+        heading = _heading(multiply(poses.rotation, (qx, qy, qz, qw)), turned)
         valid = poses.valid
-        return PlacedPoses(frames, times[valid], px[valid], py[valid], heading[valid]), target
+        placed = PlacedPoses(frames, times[valid], px[valid], py[valid], heading[valid])
+        return placed, target, in_own
+
+
+def _heading(rotations: Rotations, known: Mask) -> Floats:
+    """Returns headings (rad) about z; NaN where an orientation is not known."""
+    x, y, z, w = rotations
+    heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.where(known, heading, np.nan)
 
 
 def encode_map_track(digest: MapDigest) -> bytes:
-    """Encodes a map digest but for its sights and its key, which have columns of their own."""
+    """Encodes the tracks of a map digest, with their frames; all else has columns of its own.
+
+    The one in the poses' own frame follows: mostly its times are those of the other, so together
+    they are packed into little more than one of them.
+    """
     frame = digest.frame_id.encode("utf-8", "surrogatepass")
-    return _HEAD.pack(digest.left_out, len(frame)) + frame + encode_track(digest.track)
+    track = encode_track(digest.track)
+    own = b"" if digest.own is None else encode_map_track(digest.own)
+    return b"".join((_HEAD.pack(digest.left_out, len(frame), len(track)), frame, track, own))
 
 
-def decode_map_tracks(stored: Sequence[tuple[bytes, int]]) -> list[MapDigest]:
-    """Decodes map digests, without their sights; each comes with the hash of its statics.
+def decode_map_tracks(stored: Sequence[tuple[bytes, int]], *, own: bool = False) -> list[MapDigest]:
+    """Decodes map digests, with nothing but their tracks; with `own` in the poses' own frame.
+
+    Each comes with the hash of its statics.
 
     Raises:
         ValueError: the bytes of some are not one.
     """
+    heads, frames, packed = [], [], []
+    for each, _ in stored:
+        head, frame, track, rest = _split(each)
+        if own and rest:
+            head, frame, track, _ = _split(rest)
+        heads.append(head)
+        frames.append(frame.decode("utf-8", "surrogatepass"))
+        packed.append(track)
+    rows = zip(frames, stored, decode_tracks(packed), heads, strict=True)
+    return [MapDigest(frame, statics, track, left) for frame, (_, statics), track, left in rows]
+
+
+def _split(packed: bytes) -> tuple[int, bytes, bytes, bytes]:
+    """Returns how many poses could not be placed, the frame, the track and what follows.
+
+    Raises:
+        ValueError: the bytes are no map digest.
+    """
     try:
-        heads = [_HEAD.unpack_from(packed) for packed, _ in stored]
+        left_out, frame_size, track_size = _HEAD.unpack_from(packed)
     except struct.error as error:
         raise ValueError(f"not a map digest: {error}") from error
-    ends = [_HEAD.size + size for _, size in heads]
-    tracks = decode_tracks([packed[end:] for (packed, _), end in zip(stored, ends, strict=True)])
-    return [
-        MapDigest(
-            packed[_HEAD.size : end].decode("utf-8", "surrogatepass"), statics, track, left_out
-        )
-        for (packed, statics), end, (left_out, _), track in zip(
-            stored, ends, heads, tracks, strict=True
-        )
-    ]
+    begin = _HEAD.size + frame_size
+    end = begin + track_size
+    return left_out, packed[_HEAD.size : begin], packed[begin:end], packed[end:]

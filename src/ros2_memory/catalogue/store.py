@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from functools import partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -251,9 +252,12 @@ class Catalogue(CatalogueDatabase):
 
         return self.read(ask, field_column([], field))
 
-    def maps(self, numbers: Sequence[int]) -> dict[int, MapDigest]:
-        """Returns the map digests of entries, without their sights."""
-        return self._of_map(numbers, TRACK, decode_map_tracks)
+    def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
+        """Returns the map digests of entries, with their track alone.
+
+        With `own` in the poses' own frame.
+        """
+        return self._of_map(numbers, TRACK, partial(decode_map_tracks, own=own))
 
     def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
         """Returns, by entry, the hash of the static transforms its map digest was made with."""

@@ -8,7 +8,6 @@ answer is then computed from the bag, and is the same with the catalogue and wit
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING, Final
 
@@ -94,23 +93,19 @@ class MapDigests:
 
         return self.statics.remembered(digests, valid)
 
-    def made(
-        self, bag: BagFile, sights: SightsSource | None = None, *, in_map: bool = True
-    ) -> MapDigest:
+    def made(self, bag: BagFile, sights: SightsSource | None = None) -> MapDigest:
         """Returns the digest of a bag, read from it; with sights where a builder is given.
 
         What cannot be read of the bag is left out, with a note. Without sights the digests of the
-        bags that were asked for last stay in memory. Without `in_map` all is placed in the poses'
-        own frame.
+        bags that were asked for last stay in memory.
         """
-        settings = self._settings if in_map else replace(self._settings, map_frame=None)
         statics = self.statics.of(bag)
         stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
-        key = (*stat, statics.key, settings, id(self._view.memory.reader))
+        key = (*stat, statics.key, self._settings, id(self._view.memory.reader))
         known = None if sights is not None else _MADE.get(key)
         if known is not None:
             return known
-        reader = _MapReader(self._view, settings, sights)
+        reader = _MapReader(self._view, self._settings, sights)
         made = reader.digest(bag, statics)
         if sights is None and reader.is_complete and bag.state is not BagState.ACTIVE:
             _MADE.put(key, made)

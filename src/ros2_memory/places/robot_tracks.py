@@ -1,7 +1,7 @@
 """Where the robot was in one frame over many bags, and when it was inside of a region.
 
-Joined from the map digests of bags, so that a week costs milliseconds. A bag whose digest is in
-another frame is read, and placed by the transforms of whatever bags have them.
+Joined from the map digests of bags, which have it in the map and in the poses' own frame, so that
+a week costs milliseconds.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ class RobotTracks:
         if digests is not None and len(valid) == len(segment.bags):
             return self._stored(digests, segment, valid)
         bags = [each.bag for each in segment.extents(self._topic, window)]
-        known = {} if digests is None else digests.catalogue.maps([*valid.values()])
+        known = {} if digests is None else self._known(digests, valid)
         found: list[MapDigest] = []
         for bag in reversed([*dict.fromkeys(bags)]):
             stored = known.get(valid.get(bag.file, -1))
             try:
-                found.append(self._made(bag) if stored is None else self._own(bag, stored))
+                found.append(self._made(bag) if stored is None else stored)
             except QueryTimeoutError as error:
                 raise _PartlyReadError(self._columns(found[::-1])[0], bag.end) from error
         return self._columns(found[::-1])
@@ -125,19 +125,18 @@ class RobotTracks:
         """Returns the track of a whole segment, joined once for as long as it is in use."""
 
         def joined() -> tuple[RobotTrack, int]:
-            stored = digests.catalogue.maps([*valid.values()])
+            stored = self._known(digests, valid)
             bags = segment.bags_with(self._topic)
             # An entry that was deleted meanwhile is of a bag that is gone.
-            known = [(bag, stored.get(valid[bag.file])) for bag in bags]
-            return self._columns([self._own(bag, each) for bag, each in known if each is not None])
+            known = [stored.get(valid[bag.file]) for bag in bags]
+            return self._columns([each for each in known if each is not None])
 
         # The numbers of entries do not change in a whole segment, the frame may be another.
         return digests.derived(f"track in {self._frame_id}", joined)
 
-    def _own(self, bag: BagFile, digest: MapDigest) -> MapDigest:
-        """Returns the digest, or one in the poses' own frame where that is asked for."""
-        other = digest.frame_id != self._frame_id and len(digest.track.times)
-        return self._made(bag) if other and not self._is_map else digest
+    def _known(self, digests: SegmentDigests, valid: Mapping[str, int]) -> Mapping[int, MapDigest]:
+        """Returns what is stored of bags, in the poses' own frame unless the map is asked for."""
+        return digests.catalogue.maps([*valid.values()], own=not self._is_map)
 
     def _made(self, bag: BagFile) -> MapDigest:
         """Returns the digest of a bag that has none, unless reading has taken too long."""
@@ -145,7 +144,8 @@ class RobotTracks:
             self._reading = Deadline.after(_READING_S)
         if self._reading.expired():
             raise QueryTimeoutError("reading bags without a digest takes too long")
-        return self._maps.made(bag, in_map=self._is_map)
+        made = self._maps.made(bag)
+        return made if self._is_map or made.own is None else made.own
 
     def _columns(self, found: Sequence[MapDigest]) -> tuple[RobotTrack, int]:
         """Returns the joined track of digests in order of time, and how many poses it lacks."""

@@ -99,7 +99,8 @@ def visits(
     topic = resolve_pose_topic(view)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
-    placement = map_placement(view, pose_frame(view, topic), topic, asked)
+    own_frame = pose_frame(view, topic)
+    placement = map_placement(view, own_frame, topic, asked)
     now = memory.now(wall, view.snapshot.latest)
     if place is None:
         found = place_visits(view, memory.limits.places, placement.frame_id, window)
@@ -118,7 +119,9 @@ def visits(
         )
     search = _VisitSearch(view, topic, placement, place.region)
     by_track = where is not None or start_s is not None or end_s is not None
-    if by_track or placement.moves or not isinstance(place.region, Circle):
+    by_track = by_track or placement.moves or not isinstance(place.region, Circle)
+    # In the poses' own frame as in the map: by the track, where that map moves.
+    if by_track or (asked == own_frame and map_placement(view, own_frame, topic).moves):
         known = _by_track(view, search, placement.frame_id, place, (window, now, limit))
     else:
         known = _by_poses(view, search, now, limit)

@@ -55,6 +55,9 @@ def digests(memory: Memory) -> list[tuple[MapDigest, MapDigest]]:
 def assert_same(one: MapDigest, other: MapDigest) -> None:
     assert encode_map_track(one) == encode_map_track(other)
     assert one.statics == other.statics
+    assert (one.own is None) == (other.own is None)
+    if one.own is not None and other.own is not None:
+        assert_same(one.own, other.own)
 
 
 def test_the_robot_is_placed_in_a_map_that_moves(tmp_path: Path) -> None:
@@ -82,7 +85,7 @@ def test_without_a_map_the_robot_is_placed_in_odometry(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", [odom(BEGIN + n * S // 5, n / 10, 0.0) for n in range(50)])
     [(stored, made)] = digests(memory_of(tmp_path))
     assert_same(stored, made)
-    assert (stored.frame_id, stored.left_out) == ("odom", 0)
+    assert (stored.frame_id, stored.left_out, stored.own) == ("odom", 0, None)
     assert stored.track.x.tolist() == pytest.approx([0.0, 4.9])
 
 
@@ -93,6 +96,9 @@ def test_poses_without_a_transform_are_left_out_and_counted(tmp_path: Path) -> N
     write_mcap(tmp_path / "a.mcap", sorted(messages, key=lambda each: each.log_time))
     [(stored, _)] = digests(memory_of(tmp_path))
     assert (stored.frame_id, stored.left_out) == ("map", 6)
+    assert stored.own is not None
+    assert (stored.own.frame_id, stored.own.left_out) == ("odom", 0)
+    assert stored.own.track.x.tolist() == pytest.approx([0.0, 0.9])
 
 
 def test_an_entry_made_with_other_static_transforms_is_not_used(tmp_path: Path) -> None:
@@ -135,10 +141,13 @@ def test_the_digest_is_the_same_in_the_catalogue_and_from_the_bag(seed: int) -> 
             digests = fresh.bags.digests_of(segment)
             assert digests is not None
             valid = again.valid_in(digests, segment)
-            stored = known.recall.catalogue.maps([*valid.values()])
+            catalogue, numbers = known.recall.catalogue, [*valid.values()]
+            stored, own = catalogue.maps(numbers), catalogue.maps(numbers, own=True)
             for bag in segment.bags:
                 if bag.file in valid:
-                    assert_same(stored[valid[bag.file]], maps.made(bag))
+                    number, made = valid[bag.file], maps.made(bag)
+                    assert_same(stored[number], replace(made, own=None))
+                    assert_same(own[number], replace(made.own or made, own=None))
 
 
 def test_the_order_of_static_transforms_does_not_matter() -> None:
@@ -191,7 +200,11 @@ def test_sights_are_collected_with_frames_and_stored(tmp_path: Path) -> None:
 def test_a_map_digest_that_is_stored_is_the_same(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 5, seconds=10)
     [(stored, _)] = digests(memory_of(tmp_path))
-    [again] = decode_map_tracks([(encode_map_track(stored), stored.statics)])
-    assert_same(stored, again)
-    assert replace(again, track=stored.track) == stored
+    packed = [(encode_map_track(stored), stored.statics)]
+    [again] = decode_map_tracks(packed)
+    assert_same(replace(stored, own=None), again)
+    assert replace(again, track=stored.track, own=stored.own) == stored
+    assert stored.own is not None
+    [own] = decode_map_tracks(packed, own=True)
+    assert_same(stored.own, own)
     assert math.isclose(again.track.error_m, stored.track.error_m)

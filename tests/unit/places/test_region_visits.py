@@ -130,6 +130,32 @@ def test_a_place_of_the_poses_own_frame_is_known_in_a_moving_map_too(tmp_path: P
     assert found.duration / S == pytest.approx(29.8, abs=0.01)
 
 
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+def test_visits_in_the_poses_own_frame_are_those_of_the_recorded_poses(
+    tmp_path: Path, recalls: bool
+) -> None:
+    write_moving_map(tmp_path, 4, seconds=200)
+    memory = memory_of(tmp_path)
+    # Where no frame is the map, visits are counted pose by pose.
+    exact = visits(
+        replace(memory, limits=replace(memory.limits, map_frame=None)),
+        Call(),
+        0.0,
+        0.0,
+        radius_m=1.0,
+        limit=100,
+    )
+    memory = recalling(memory, tmp_path) if recalls else memory
+    found = visits(memory, Call(), 0.0, 0.0, radius_m=1.0, limit=100, frame_id="odom")
+    assert found.frame_id == exact.frame_id == "odom"
+    assert found.total == exact.total > 1
+    for one, other in zip(found.visits, exact.visits, strict=True):
+        assert (one.arrived or 0) / S == pytest.approx((other.arrived or 0) / S, abs=0.5)
+        assert one.duration / S == pytest.approx(other.duration / S, abs=0.5)
+        # Between two poses the robot may have been nearer than at either.
+        assert (one.closest_m or 0.0) <= (other.closest_m or 0.0) + 0.06
+
+
 def answer(memory: Memory, given: dict[str, Any]) -> str:
     replies = Replies(Path("/bags"), 24_000)
     try:
@@ -161,5 +187,6 @@ def test_visits_are_the_same_whatever_the_catalogue_knows(
             {"where": {"x": [-1, 1], "y": [-2, 2]}},
             {"x": 0.5, "y": 0.0, "radius_m": 1.0},
             {"where": {"x": 0, "y": 0, "radius_m": 1.0}, "frame_id": "odom"},
+            {"x": 0.5, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"},
         ):
             assert answer(memory, given) == answer(known, given)
