@@ -436,7 +436,12 @@ class Catalogue(CatalogueDatabase):
         def write(connection: sqlite3.Connection) -> None:
             row_ids = self.row_ids(entries[0])
             key = self._key_of_joined(name, entries)
-            if row_ids and key is not None:
+            listed = json.dumps([number for each in entries for number in self.row_ids(each)])
+            # An entry may be gone since it was read, and what it held is to be forgotten with it.
+            gone = connection.execute(
+                "SELECT value FROM json_each(?) WHERE value NOT IN (SELECT id FROM bags)", (listed,)
+            ).fetchone()
+            if row_ids and key is not None and gone is None:
                 stored = packed_by_model(connection, NO_TOPIC, name, joined)
                 if len(stored) > MOST_JOINED * len(row_ids):
                     stored = b""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import sqlite3
 import threading
 from contextlib import closing
@@ -239,6 +240,21 @@ def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path
     assert catalogue.newest() == after
     assert not holds(catalogue)
     assert catalogue.zone_maps("/odom", [before, after]) == {}
+
+
+def test_what_entries_add_up_to_is_kept_only_while_all_of_them_are_there(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    keys = [KEY, KEY._replace(path="rec/rec_1.mcap"), KEY._replace(path="rec/rec_2.mcap")]
+    assert catalogue.put_all([(each, digest_of(boolean(T0, True))) for each in keys])
+    numbers = [each for each in catalogue.find(keys) if each is not None]
+    catalogue.store_joined("a", [numbers[:2], numbers[2:]], b"together")
+    assert catalogue.joined("a", [numbers[:2], numbers[2:]]) == b"together"
+    assert catalogue.joined("a", [numbers, []]) is None
+    catalogue.store_joined("big", [numbers], random.Random(1).randbytes(9000))
+    assert catalogue.joined("big", [numbers]) == b""
+    catalogue.forget([keys[2].path])
+    catalogue.store_joined("late", [numbers[:2], numbers[2:]], b"together")
+    assert catalogue.joined("late", [numbers[:2], numbers[2:]]) is None
 
 
 def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
