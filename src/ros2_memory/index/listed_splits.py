@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.index.snapshot import Snapshot
 
-_MAX_CACHED_FOLDERS: Final = 1024
+_MAX_CACHED_FOLDERS: Final = 8192
 _MISSING: Final = "metadata.yaml lists it, but it is missing"
 
 
