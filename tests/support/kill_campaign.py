@@ -82,12 +82,16 @@ class Fault:
 
 @dataclass(frozen=True)
 class Loss:
-    """What a recording lost at the end: messages received in its last `seconds`, so many ticks."""
+    """What a recording lost at the end: messages published in its last `seconds`, so many ticks.
+
+    `holds_any`: whether any message reached the disk, so that it certainly received some.
+    """
 
     kind: str
     recording: str
     seconds: float
     ticks: int
+    holds_any: bool
 
 
 @dataclass
@@ -126,8 +130,15 @@ class Campaign:
                     continue
                 last = max([since, *(t.publish_time for t in self.held.get(name, []))])
                 lost_s = max(0, fault.at - last) / NS_PER_S
-                found.append(Loss(fault.kind, name, lost_s, math.floor(lost_s * self.terms.hz)))
+                lost_ticks = math.floor(lost_s * self.terms.hz)
+                holds_any = bool(self.held.get(name))
+                found.append(Loss(fault.kind, name, lost_s, lost_ticks, holds_any))
         return found
+
+    def delivered_late(self) -> list[float]:
+        """How long DDS held the first message of each recording that holds any, in s."""
+        delays = (held[0].log_time - held[0].publish_time for held in self.held.values())
+        return [delay / NS_PER_S for delay in delays]
 
     def _received_since(self, name: str) -> int | None:
         """When a recording had subscribed to everything, and the robot reached it; None: never."""
