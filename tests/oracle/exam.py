@@ -404,13 +404,14 @@ class _Paper:
 
         def check(answer: Any) -> str | None:
             apart = np.hypot(*(planar(topic.rows) - [x, y]).T)
-            inside = apart <= radius - COARSE
+            inside = apart <= radius - COARSE - self._world.track_tolerance
             if "error" in answer:
                 return f"{int(inside.sum())} poses are there" if inside.any() else None
             if answer["total"] == 0:
                 return f"{int(inside.sum())} poses are there" if inside.any() else None
             nearest = min(each["closest_m"] for each in answer["visits"])
-            if answer["total"] > len(answer["visits"]) or abs(nearest - apart.min()) < 2e-3:
+            allowed = 2e-3 + self._world.track_tolerance
+            if answer["total"] > len(answer["visits"]) or abs(nearest - apart.min()) < allowed:
                 return None
             return f"the closest pose is {apart.min():.4f} m away"
 

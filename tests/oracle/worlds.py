@@ -52,6 +52,7 @@ class World:
         stood: how long (s) the robot stood between two times (ns), where the world knows it.
         tf: whether transforms may be asked: `(topic, is it static)`.
         odometry: the topics that carry the robot's pose.
+        track_tolerance: how far (m) `visits` may be off, where the map moves: there it uses tracks.
     """
 
     folder: Path
@@ -59,6 +60,7 @@ class World:
     moved: Callable[[int, int], float] | None = None
     stood: Callable[[int, int], float] | None = None
     path_tolerance: float = 0.0
+    track_tolerance: float = 0.0
     tf: Sequence[tuple[str, bool]] = ()
     odometry: Sequence[str] = ("/odom",)
     settings: Sequence[str] = ()
@@ -88,6 +90,7 @@ def drifting_map(folder: Path, draw: Random) -> World:
         moved=lambda start, end: _length(legs, (start - START) / S, (end - START) / S),
         stood=lambda start, end: _standing(legs, (start - START) / S, (end - START) / S),
         path_tolerance=0.03,
+        track_tolerance=0.05,
         tf=(("/tf", False), ("/tf_static", True)),
     )
 
