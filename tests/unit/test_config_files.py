@@ -174,7 +174,7 @@ class TestLabels:
             ("labels: {mug: [' ']}", "empty spelling, as under 'mug'"),
             ("labels: {mug: [], mug: [cup]}", "duplicate key mug"),
             ("labels: [mug]", "labels: ['mug'] is not allowed; must hold keys"),
-            ("label: {}", "label: unknown key; use one of:  labels"),
+            ("label: {}", "label: unknown key; use one of: labels"),
             ("", "labels: missing"),
         ],
     )
