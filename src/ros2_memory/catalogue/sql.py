@@ -129,6 +129,15 @@ def message_rows(
     ).fetchall()
 
 
+def any_is_gone(connection: sqlite3.Connection, row_ids: Sequence[int]) -> bool:
+    """Returns whether an entry was deleted since it was read.
+
+    What it held is to be forgotten with it: nothing that was computed from it is stored.
+    """
+    gone = "SELECT value FROM json_each(?) WHERE value NOT IN (SELECT id FROM bags) LIMIT 1"
+    return connection.execute(gone, (json.dumps(row_ids),)).fetchone() is not None
+
+
 def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> None:
     """Deletes entries with all that belongs to them, and the cached answers that used them."""
     if not row_ids:

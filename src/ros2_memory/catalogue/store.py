@@ -45,6 +45,7 @@ from ros2_memory.catalogue.sql import (
     TRACK,
     UNDECODABLE,
     ZONE_MAP,
+    any_is_gone,
     delete_entries,
     entry_rows,
     insert_entry,
@@ -405,7 +406,7 @@ class Catalogue(CatalogueDatabase):
 
         def write(connection: sqlite3.Connection) -> None:
             row_ids = self.row_ids(numbers)
-            if len(row_ids) == len(numbers):
+            if len(row_ids) == len(numbers) and not any_is_gone(connection, row_ids):
                 plain = answer.encode("utf-8", "surrogatepass")
                 stored = packed_by_model(connection, NO_TOPIC, _kind_of(question), plain)
                 connection.execute(
@@ -436,12 +437,8 @@ class Catalogue(CatalogueDatabase):
         def write(connection: sqlite3.Connection) -> None:
             row_ids = self.row_ids(entries[0])
             key = self._key_of_joined(name, entries)
-            listed = json.dumps([number for each in entries for number in self.row_ids(each)])
-            # An entry may be gone since it was read, and what it held is to be forgotten with it.
-            gone = connection.execute(
-                "SELECT value FROM json_each(?) WHERE value NOT IN (SELECT id FROM bags)", (listed,)
-            ).fetchone()
-            if row_ids and key is not None and gone is None:
+            used = [number for each in entries for number in self.row_ids(each)]
+            if row_ids and key is not None and not any_is_gone(connection, used):
                 stored = packed_by_model(connection, NO_TOPIC, name, joined)
                 if len(stored) > MOST_JOINED * len(row_ids):
                     stored = b""

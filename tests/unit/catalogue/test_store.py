@@ -255,6 +255,9 @@ def test_what_entries_add_up_to_is_kept_only_while_all_of_them_are_there(tmp_pat
     catalogue.forget([keys[2].path])
     catalogue.store_joined("late", [numbers[:2], numbers[2:]], b"together")
     assert catalogue.joined("late", [numbers[:2], numbers[2:]]) is None
+    catalogue.cache_answer("what", numbers[:2], "kept")
+    catalogue.cache_answer("what", numbers, "late")
+    assert catalogue.cached_answers("what") == {tuple(numbers[:2]): "kept"}
 
 
 def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
