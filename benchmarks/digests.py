@@ -21,7 +21,7 @@ from ros2_memory.analysis.motion.standstills import (
 )
 from ros2_memory.analysis.sights import Look, Spot, Unplaced, decode_sights, encode_sights
 from ros2_memory.bootstrap import build_backfill, build_digester
-from ros2_memory.cli.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_catalogue
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.places.bag_statics import BagStatics

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_backfill, build_memory
-from ros2_memory.cli.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_catalogue
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S

@@ -17,8 +17,8 @@ import structlog
 
 from ros2_memory import cli
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
-from ros2_memory.cli.index import fill_catalogue
-from ros2_memory.cli.recover import recover_files
+from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
-from ros2_memory.cli.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_catalogue
 from ros2_memory.config import load_settings
 from tests.oracle.truth import SLACK_NS, History, Row, Topic, path_of, planar
 

@@ -20,7 +20,7 @@ class DigestConfig:
     """Settings and schema entries, as hashes.
 
     Attributes:
-        base: hash of what every digest depends on.
+        base: hash of the settings and versions on which every digest depends.
         entries: by message type, the hash of its entry in the schema map.
     """
 

@@ -450,7 +450,7 @@ class Catalogue(CatalogueDatabase):
         self.write(write)
 
     def _key_of_joined(self, name: str, entries: Sequence[Sequence[int]]) -> str | None:
-        """Returns the key of what entries add up to: short, for any number; None if some are gone.
+        """Returns the key of a digest joined from entries; None if one of them was deleted.
 
         Entries come in lists, of which each has a meaning.
         """

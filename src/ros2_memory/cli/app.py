@@ -91,7 +91,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         },
     ),
     "forget": CommandEntry(
-        "forget.forget",
+        "maintenance.forget.forget",
         "delete a time window, after confirmation",
         {
             0: "everything in the window is deleted (with --dry-run: would be), or it is empty",
@@ -99,7 +99,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         },
     ),
     "adopt": CommandEntry(
-        "adopt.adopt",
+        "maintenance.adopt.adopt",
         "let the recorder delete bags that it did not make",
         {0: "the recorder owns the bags now, or did before", 1: "there are no bag files"},
     ),
@@ -114,12 +114,12 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         {0: "the server was stopped", 1: "it cannot listen on the address"},
     ),
     "index": CommandEntry(
-        "index.index",
+        "maintenance.index.index",
         "index every bag now, so that answers take milliseconds",
         {0: "every bag that can be indexed is indexed"},
     ),
     "recover": CommandEntry(
-        "recover.recover",
+        "maintenance.recover.recover",
         "repair unfinished MCAP files",
         {0: "every file is whole", 1: "a file could not be repaired"},
     ),

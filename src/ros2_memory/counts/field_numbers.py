@@ -186,7 +186,7 @@ class FieldReader:
 
 
 _AT_FIRST: Final[Ns] = -1
-"""A placeholder for the time of the first message."""
+"""Means the time of the first message, which `_table` inserts."""
 
 
 def _numbers(times: Sequence[Ns], samples: Sequence[Sequence[float]]) -> FieldNumbers:

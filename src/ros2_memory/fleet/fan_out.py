@@ -36,7 +36,7 @@ log = get_logger(__name__)
 class FanOut:
     """Asks robots in threads. A robot that is stuck is not asked again until it is done.
 
-    So a disk that hangs costs one thread, whatever is asked meanwhile. Thread-safe.
+    So a hanging disk blocks one thread, however many questions follow. Thread-safe.
     """
 
     def __init__(self, at_once: int = AT_ONCE) -> None:

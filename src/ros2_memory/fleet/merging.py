@@ -157,7 +157,7 @@ def _rows(
     order: Callable[[JsonObject], float] = newest if oldest_first else lambda row: -newest(row)
     found: list[JsonObject] = []
     for is_ahead in (False, True):
-        # Each reply is in order. A clock that runs ahead says nothing of what is newest.
+        # Each reply is in order. A robot whose clock is ahead does not have the newest row.
         lists = [
             [_named_row(rule, each.name, value, row) for row in _list(value.get(key))]
             for each, value in zip(replies, values, strict=True)

@@ -148,7 +148,7 @@ class _FleetQuestions:
         memory = robot.memory()
         snapshot = memory.index.snapshot()
         if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
-            # It would say "never" of what nobody can know.
+            # "Never" would be a claim about bags that were not searched.
             raise RefusedError(
                 snapshot.problem.replace("recording.bag_dir (MEMORY_BAG_DIR)", "fleet.robots")
             )

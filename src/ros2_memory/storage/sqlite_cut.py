@@ -80,10 +80,10 @@ def cut_sqlite(
         base.execute("BEGIN")
         base.executemany("DELETE FROM messages WHERE rowid = ?", going)
         if base.execute(_HAS_METADATA).fetchone()[0]:
-            told = base.execute("SELECT rowid, metadata FROM metadata").fetchall()
+            rows = base.execute("SELECT rowid, metadata FROM metadata").fetchall()
             base.executemany(
                 "UPDATE metadata SET metadata = ? WHERE rowid = ?",
-                [(edit_metadata(str(text)), row) for row, text in told],
+                [(edit_metadata(str(text)), row) for row, text in rows],
             )
         base.execute("COMMIT")
         base.execute("VACUUM")

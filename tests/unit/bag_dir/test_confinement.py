@@ -25,7 +25,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.state.request_queue import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
 from ros2_memory.catalogue.database import open_file
-from ros2_memory.cli.recover import recover_files
+from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError

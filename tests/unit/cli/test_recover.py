@@ -11,7 +11,7 @@ from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from ros2_memory import cli
-from ros2_memory.cli.recover import RecoveryOutcome, recover_files
+from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap

@@ -11,7 +11,7 @@ import pytest
 
 from ros2_memory.bootstrap import build_memory, digest_config
 from ros2_memory.cli.doctor import _size
-from ros2_memory.cli.recover import recover_files
+from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.retention.clear import clear_bags

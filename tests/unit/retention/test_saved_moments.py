@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
-from ros2_memory.cli.recover import recover_files
+from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import saved_moments

@@ -26,7 +26,7 @@ from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.cli import main
-from ros2_memory.cli.index import describe_progress, fill_catalogue
+from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call

@@ -238,7 +238,7 @@ def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, N
 def _with_budget_sentence(reply: JsonValue) -> JsonValue:
     """Returns a reply of `memory_status` whose budget is a sentence; any other as it is.
 
-    Bags that are only looked at have no budget, and their size is told already.
+    Bags that are only looked at have no budget, and the line above has their size.
     """
     budget = reply.get("budget") if isinstance(reply, dict) else None
     if not isinstance(reply, dict) or not isinstance(budget, dict):

@@ -322,7 +322,7 @@ def _with_breaks(points: Sequence[tuple[Ns, float]]) -> Iterator[tuple[Ns, float
 
 
 def event_rows(asked: Scene, found: Recap | None) -> list[TimelineRow]:
-    """Returns a row of what was recorded, and one for each kind of events that there are."""
+    """Returns a row of what was recorded, and one for each kind of event that occurs."""
     span = asked.window.start, asked.window.stop - 1
     recorded = without([span], [*recording_gaps(asked.view, asked.window)])
     rows = [TimelineRow("recorded", [*map(_unix, recorded)], _COLORS["recorded"])]

@@ -1,0 +1,1 @@
+"""Commands that change what is beside or in bags: the catalogue, repairs, ownership, erasure."""
