@@ -504,6 +504,7 @@ def query_settings_of(settings: Settings) -> QuerySettings:
         max_plausible_speed_mps=data.max_plausible_speed_mps,
         split_duration_s=settings.recording.split_duration_s,
         screened=records and bool(load_exclusions(settings)),
+        recording=settings.data.recording or "",
         include_active=settings.reader.include_active,
         kept=retention_limits(settings) if records else None,
         latching=Latching(

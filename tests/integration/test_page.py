@@ -112,7 +112,7 @@ def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
     assert "30.0 m driven in odom" in label
     assert "2 stops" in label
     # Nobody knows how it came over the gap.
-    assert page.run("return [...map.begins].length") == 2
+    assert page.run("return [...map.paths[0].starts].length") == 2
     assert "stood at x 15.00, y 0.00" in page.text("#events")
     assert "Robot\nx\u00a030.00, y\u00a00.00\u00a0m" in page.text("#moment")
     assert painted(page, "#map") > 1000
@@ -512,6 +512,12 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
     with serving(bag_dir, scratch / "log_two_robots", *given) as server:
         show(chromium, server)
         assert "Robots are mixed: robin, wren overlap" in chromium.text("#mixed")
+        # Each has a path of its own, and the robots are where they were at one time.
+        drawn = "return map.paths.map((each) => [each.name, each.x[0], each.x.at(-1)])"
+        assert chromium.run(drawn) == [["robin", 0, 20], ["wren", 100, 120]]
+        assert "robin\nwren" in chromium.text("#map-key")
+        chromium.run("map.place(arguments[0])", T0_S + 8)
+        assert chromium.run("return map.moments.map((each) => Math.round(each.x))") == [8, 103]
         offered = chromium.run("return [...document.getElementById('recording').options]")
         assert len(offered) == 3
         chromium.run(
@@ -530,6 +536,12 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
         assert "x\u00a02.00" not in chromium.text("#moment")
         show(chromium, server, "#last=all&recording=robin")
         assert chromium.run("return Math.max(...state.view.path.x)") == 20
+        assert chromium.run("return map.paths.length") == 1
+        choose(chromium, "data_time_range")
+        chromium.press("#send")
+        chromium.awaits(ANSWERED)
+        assert "recording robin alone" in chromium.text("#ask-part")
+        assert '"bags": 1' in chromium.text("#told")
         chromium.open("about:blank")
         chromium.open(server.url("/#recording=robim"))
         chromium.awaits("return !document.getElementById('trouble').hidden")

@@ -41,6 +41,7 @@ class Listening(Dispatcher):
         for_resource: bool = False,
         for_page: bool = False,
         robots: frozenset[str] | None = None,
+        part: object = None,
     ) -> Reply:
         self.asked.append(client)
         return Reply("{}")

@@ -39,7 +39,8 @@ class QuerySettings:
 
     Units are the last word of each name. `kept` is how much the recorder keeps; None where nothing
     is recorded, and nothing deleted. `labels` has other spellings by the name that is to be shown.
-    `screened`: no split answers before it was searched for what is to be excluded.
+    `screened`: no split answers before it was searched for what is to be excluded. `recording`: the
+    name of the recording that alone answers; empty where all do.
     """
 
     position_tolerance_m: float = 0.5
@@ -53,6 +54,7 @@ class QuerySettings:
     max_plausible_speed_mps: float = 10.0
     split_duration_s: float = 10.0
     screened: bool = False
+    recording: str = ""
     include_active: bool = False
     kept: RetentionLimits | None = None
     latching: Latching = field(default_factory=lambda: Latching(("/tf_static",)))

@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.state.request_queue import PendingRequest
 from ros2_memory.bag_dir.state.trigger_file import read_trigger_state
@@ -102,13 +103,26 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
 def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     """Returns the newest saved moments, the newest first; `now` is what "ago" counts from.
 
+    Where one recording alone answers, those that hold bags of it.
+
     Raises:
         OSError: they cannot be listed; see `unlisted`.
     """
-    stored = [*stored_moments_in(memory.index.bag_dir)]
+    recording = memory.limits.recording
+    stored = [
+        each
+        for each in stored_moments_in(memory.index.bag_dir)
+        if not recording or _holds(each.folder, recording)
+    ]
     stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
     rules = fired_rules(memory.index.bag_dir)
     return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
+
+
+def _holds(folder: Path, recording: str) -> bool:
+    """Whether a moment's folder holds bags of a recording, or is the recording itself."""
+    own = f"{MOMENTS_FOLDER}/{folder.name}"
+    return recording == own or recording.startswith(f"{own}/") or (folder / recording).is_dir()
 
 
 def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:

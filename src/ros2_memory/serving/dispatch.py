@@ -116,13 +116,15 @@ class Dispatcher:
         for_resource: bool = False,
         for_page: bool = False,
         robots: frozenset[str] | None = None,
+        part: Callable[[Memory], Memory] | None = None,
     ) -> Reply:
         """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
         Where more calls wait than there are threads, `client`s take turns. `for_resource`: whether
         the tools that only the resources use can be named, too. `for_page`: whether the page asks,
         which does not keep its own questions. `robots`: those of a fleet that the client may ask
-        about; None for all.
+        about; None for all. `part` returns the part of the memory that alone answers; tools that
+        write are refused then.
         """
         tools = self._readable if for_resource else self._tools
         begun = time.perf_counter_ns()
@@ -134,7 +136,9 @@ class Dispatcher:
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
             try:
                 try:
-                    outcome, reply = await self._outcome(tools, name, given, call, client)
+                    outcome, reply = await self._outcome(
+                        tools, name, given, call, client, part=part
+                    )
                 except Exception:
                     log.exception("tool_failed")
                     outcome, reply = self._internal()
@@ -214,13 +218,19 @@ class Dispatcher:
         given: Mapping[str, object],
         call: Call,
         client: Hashable,
+        *,
+        part: Callable[[Memory], Memory] | None,
     ) -> tuple[str, Reply]:
         wait = _Wait()
         try:
             tool = _named(name, tools)
+            if part is not None and tool.writes:
+                raise InvalidArgumentsError(f"{name} writes, and is not asked of one recording")
             if excess := excess_in_arguments(given):
                 raise InvalidArgumentsError(excess)
             question = tool.question(given)
+            if part is not None:
+                question = _of_part(question, part)
             queue = self.blocking if tool.blocking else self.quick
             with anyio.move_on_after(self._call_timeout_s):
                 return await queue.run(client, partial(self._ask, question, call, wait))
@@ -270,6 +280,11 @@ class Dispatcher:
         """Returns the reply to a call that failed through a fault of this program."""
         context = structlog.contextvars.get_contextvars()
         return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+
+def _of_part(question: Question, part: Callable[[Memory], Memory]) -> Question:
+    """Returns a question that is asked of a part of the memory."""
+    return lambda memory, call: question(part(memory), call)
 
 
 def _named(name: str, tools: Mapping[str, Tool]) -> Tool:

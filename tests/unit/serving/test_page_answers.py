@@ -5,13 +5,21 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+import httpx2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
 from ros2_memory.analysis.motion.robot_track import RobotTrack, track_of
+from ros2_memory.bag_dir.moment_file import (
+    SavedMoment,
+    SaveRequest,
+    make_moment_folder,
+    write_saved_moment,
+)
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -19,13 +27,16 @@ from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.serving.backfill import Progress
+from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.page import span
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
-from ros2_memory.serving.page.routes import moment_request, span_request
+from ros2_memory.serving.page.routes import moment_request, page_routes, span_request
 from ros2_memory.serving.page.span import MOST_POINTS, cut, span_shown, thinned
 from ros2_memory.serving.question_log import QuestionLog
+from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
+from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import detections, odom, write_mcap
 from tests.support.memories import memory_of, recalling
 
@@ -363,3 +374,65 @@ def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:
     assert names == ["moments/y/e", "moments/x/d", "wren/c", "robin", "robin/b", "robin/a"]
     assert rows[3] == {"name": "robin", "start": BEGIN_S, "end": BEGIN_S + 1, "holds": 2}
     assert len(recordings.alone(memory, "robin").index.snapshot().bags) == 2
+
+
+def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
+    tmp_path: Path,
+) -> None:
+    """Wren's two recordings follow each other, robin drives beside them, and jay long before."""
+    for name, begins, x in (
+        ("jay", -900, 0),
+        ("robin", 0, 10),
+        ("wren/a", 0, 20),
+        ("wren/b", 11, 30),
+    ):
+        at_s = [n / 10 for n in range(101)]
+        messages = [odom(BEGIN + int((begins + s) * S), x + s, 0.0) for s in at_s]
+        write_mcap(tmp_path / name / "0.mcap", messages)
+    memory = memory_of(tmp_path)
+
+    def paths(start_s: int, stop_s: int) -> dict[str, tuple[float, float]]:
+        window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
+        found: Any = Recordings().paths(memory, Call(), window)["paths"]
+        return {each["name"]: (each["x"][0], each["x"][-1]) for each in found}
+
+    assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
+    assert paths(-1000, 30) == {"jay": (0, 10), "robin": (10, 20), "wren": (20, 40)}
+    assert paths(-1000, -800) == {}
+
+
+def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:
+    for n, name in enumerate(("robin", "wren")):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(BEGIN + n * 60 * S, 0.0, 0.0)])
+        request = SaveRequest(f"{n:032x}", f"of {name}", BEGIN, BEGIN + S, BEGIN + S)
+        folder = make_moment_folder(tmp_path, request)
+        write_saved_moment(folder, SavedMoment(request, pending=False))
+        (folder / name).mkdir()
+    memory = memory_of(tmp_path)
+
+    def labels(memory: Memory) -> list[str]:
+        return [each["label"] for each in shown(memory)["moments"]]
+
+    assert sorted(labels(memory)) == ["of robin", "of wren"]
+    assert labels(Recordings().alone(memory, "wren")) == ["of wren"]
+
+
+async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes_is_refused(
+    memory: Memory,
+) -> None:
+    tools = build_tools(memory.limits, writing=True)
+    replies = Replies(memory.index.bag_dir, 9_000)
+    dispatcher = Dispatcher(memory, tools, replies, call_timeout_s=5)
+    app = Starlette(routes=page_routes(dispatcher))
+    transport = httpx2.ASGITransport(app=app)
+    async with httpx2.AsyncClient(transport=transport, base_url="http://x") as client:
+
+        async def asked(tool: str, arguments: str) -> httpx2.Response:
+            given = {"recording": "rec_1", "tool": tool, "arguments": arguments}
+            return await client.get("/page/moment", params=given)
+
+        assert (await asked("data_time_range", "{}")).json()["bags"] == 1
+        refused = (await asked("remember_moment", '{"label": "x"}')).json()
+        assert "remember_moment writes" in refused["detail"]
+        for arguments in ("[]", "{", "[" * 100):
+            assert (await asked("data_time_range", arguments)).status_code == 400

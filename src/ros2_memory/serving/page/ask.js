@@ -84,7 +84,9 @@ at("question").addEventListener("submit", async (event) => {
   at("send").disabled = true;
   const begun = performance.now();
   try {
-    const reply = await call(tool.name, asked);
+    const reply = state.recording ? await fetched(`/page/moment?${new URLSearchParams({
+      recording: state.recording, tool: tool.name, arguments: JSON.stringify(asked) })}`)
+      : await call(tool.name, asked);
     const refused = Boolean(reply && reply.error);
     at("told").textContent = plain(JSON.stringify(reply, null, 2));
     at("outcome").textContent = (refused ? "no answer" : "answered")

@@ -102,6 +102,7 @@ async function look(isMore = false, isPatient = false) {
     lookedAt = Date.now();
     if (reply.things) thingsAt = lookedAt;
     if (reply.status) statusAt = lookedAt;
+    if (reply.recordings && !reply.mixed.length) reply.paths = [];
     if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
     state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
     state.view.recording = recording;
@@ -137,7 +138,7 @@ function always(reply, range) {
     (span) => ({ kind: "thing", ...span, text: `${label} in view` })));
 }
 function whole(reply) {
-  return { path: null, robot: null, places: [], moments: [], ...reply, things: reply.things || [],
+  return { path: null, paths: [], robot: null, places: [], moments: [], ...reply, things: reply.things || [],
     events: reply.events || [], isWhole: Boolean(reply.events && reply.path !== undefined) };
 }
 /* What is shown, with an answer about what came since. */
@@ -236,10 +237,14 @@ function showRecordings(view) {
     at("recording").replaceChildren(...names);
   }
   at("recording").value = state.recording;
-  at("ask-all").hidden = !state.recording;
+  at("ask-one").hidden = !state.recording;
+  at("ask-one").replaceChildren("Answers are from the recording ", bdi(state.recording), " alone.");
   at("mixed").hidden = !mixed.length;
   at("mixed").replaceChildren(...mixed.map((each) => el("p", {}, `! ${each[0].toUpperCase()}${each.slice(1)}.`)),
-    ...(mixed.length ? [el("p", {}, "The map joins their paths. Choose one recording above.")] : []));
+    ...(mixed.length ? [el("p", {}, apart(view)
+      ? "The map has a path for each recording. All else on this page is of all of them together: "
+        + "choose one recording above to see it alone."
+      : "The map joins their paths. Choose one recording above.")] : []));
 }
 function showFilling(catalogue) {
   at("filling").hidden = !catalogue;
@@ -253,14 +258,24 @@ function showKey() {
   const view = state.view;
   const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
-  at("map-key").replaceChildren(one("path", view.distance_m === null || view.distance_m === undefined
-    ? "path" : `path, ${far(view.distance_m)}`), one("now", "robot now"),
-  one("robot", "at the time pointed at"),
+  const left = view.paths_left_out;
+  at("map-key").replaceChildren(...(apart(view) ? [
+    ...map.paths.map((each, n) => one(ofPath(n), each.name)),
+    ...view.paths.filter((each) => each.error).map((each) => el("span", { class: "warn" },
+      "no path of ", bdi(each.name), `: ${each.error}`)),
+    ...(left ? [el("span", { class: "warn" }, `${counted(left, "more path")} left out`)] : [])]
+    : pathKey(view, one)),
   ...(view.isWhole ? [one("stood", `stops, ${map.stops.length}`)] : []),
   one("seen", `things, ${map.things.length}${more}`),
   ...((view.places || []).length ? [one("place", "places")] : []),
-  ...(view.path ? [el("span", {}, "frame ", bdi(view.path.frame))] : []),
-  ...(view.path && !view.path.whole ? [el("span", { class: "warn" }, "older path is being read")] : []));
+  ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame))] : []),
+  ...(map.paths.some((each) => !each.whole)
+    ? [el("span", { class: "warn" }, "older path is being read")] : []));
+}
+function pathKey(view, one) {
+  return [one("path", view.distance_m === null || view.distance_m === undefined
+    ? "path" : `path, ${far(view.distance_m)}`), one("now", "robot now"),
+  one("robot", "at the time pointed at")];
 }
 function showSpan() {
   const { start, end } = state.span;

@@ -19,6 +19,9 @@ function lastBefore(times, t) {
 const meet = (one, other) => one.x < other.x + other.w + 3 && other.x < one.x + one.w + 3
   && one.y < other.y + other.h && other.y < one.y + one.h;
 
+const ofPath = (n) => (n ? `path-${n + 1}` : "path");
+const apart = (view) => Boolean(view.paths && view.paths.length);
+
 class RobotMap {
   /* `told` has time(t, isChosen), thing(thing), stretch(event). */
   constructor(canvas, told) {
@@ -29,7 +32,10 @@ class RobotMap {
     this.fits = true;
     this.centre = { x: 0, y: 0 };
     this.scale = 40;
+    this.paths = [];
+    this.isApart = false;
     this.moment = null;
+    this.moments = [];
     this.chosen = null;
     pointers(canvas, {
       hover: (x, y, event) => this.hover(x, y, event),
@@ -45,24 +51,27 @@ class RobotMap {
 
   show(view) {
     this.view = view;
-    this.begins = new Set(view.path ? view.path.begins : []);
     const path = view.path;
+    // Of several robots each has a path of its own.
+    this.isApart = apart(view);
+    this.paths = this.isApart ? view.paths.filter((each) => each.t) : path ? [path] : [];
+    for (const each of this.paths) each.starts = new Set(each.begins);
     this.things = view.things.filter((each) => path && each.frame === path.frame);
     this.stops = view.events.filter((each) => each.kind === "stop" && each.x !== undefined);
-    const driven = path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame)}` : "no path";
+    const driven = this.isApart ? `paths of ${this.paths.map((each) => plain(each.name)).join(", ")}`
+      : path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame)}` : "no path";
     this.canvas.setAttribute("aria-label", `Map: ${driven}, ${counted(this.stops.length, "stop")}, `
       + `${counted(this.things.length, "thing")}. Arrow keys move it, plus and minus zoom.`);
     this.draw();
   }
 
   /* Where the robot was at a time: between two poses, or at one shortly before. */
-  at(t) {
-    const path = this.view && this.view.path;
+  at(t, path = this.isApart ? null : this.paths[0]) {
     if (!path) return null;
     const n = lastBefore(path.t, t);
     if (n < 0) return null;
     const here = { x: path.x[n], y: path.y[n], yaw: path.yaw[n] };
-    if (n + 1 === path.t.length || this.begins.has(n + 1)) {
+    if (n + 1 === path.t.length || path.starts.has(n + 1)) {
       return t - path.t[n] <= UNSEEN_S ? here : null;
     }
     const share = (t - path.t[n]) / (path.t[n + 1] - path.t[n] || 1);
@@ -75,6 +84,7 @@ class RobotMap {
   /* Puts the robot where it was at a time; null: where it is now. */
   place(t) {
     this.moment = t === null ? null : this.at(t);
+    this.moments = t === null || !this.isApart ? [] : this.paths.map((each) => this.at(t, each));
     this.draw();
   }
   choose(thing) {
@@ -128,21 +138,19 @@ class RobotMap {
     }
     return best;
   }
-  /* The time at which the path is nearest to a point of the canvas, if it is near. */
+  /* The path and the time at which it is nearest to a point of the canvas, if it is near. */
   timeNear(x, y) {
-    const path = this.view && this.view.path;
-    if (!path) return null;
-    let best = null;
+    let best = { t: null };
     let least = NEAR_PX;
-    for (let n = 0; n < path.t.length; n++) {
-      const last = n + 1 === path.t.length || this.begins.has(n + 1);
+    for (const path of this.paths) for (let n = 0; n < path.t.length; n++) {
+      const last = n + 1 === path.t.length || path.starts.has(n + 1);
       const to = last ? n : n + 1;
       const [ax, ay] = [this.px(path.x[n]), this.py(path.y[n])];
       const [dx, dy] = [this.px(path.x[to]) - ax, this.py(path.y[to]) - ay];
       const square = dx * dx + dy * dy;
       const share = square ? clamp(((x - ax) * dx + (y - ay) * dy) / square, 0, 1) : 0;
       const away = Math.hypot(ax + dx * share - x, ay + dy * share - y);
-      if (away <= least) { least = away; best = path.t[n] + (path.t[to] - path.t[n]) * share; }
+      if (away <= least) { least = away; best = { t: path.t[n] + (path.t[to] - path.t[n]) * share, path }; }
     }
     return best;
   }
@@ -160,8 +168,8 @@ class RobotMap {
       this.told.time(stop.t, false);
       return;
     }
-    const t = this.timeNear(x, y);
-    tip(t === null ? "" : clock(t), event);
+    const { t, path } = this.timeNear(x, y);
+    tip(t === null ? "" : `${this.isApart ? `${path.name}, ` : ""}${clock(t)}`, event);
     this.told.time(t, false);
   }
   click(x, y) {
@@ -169,7 +177,7 @@ class RobotMap {
     if (thing) { this.told.thing(thing); return; }
     const stop = this.near(this.stops || [], x, y);
     if (stop) { this.told.stretch(stop); return; }
-    const t = this.timeNear(x, y);
+    const { t } = this.timeNear(x, y);
     if (t !== null) this.told.time(t, true);
   }
 
@@ -178,10 +186,10 @@ class RobotMap {
     const xs = [];
     const ys = [];
     const add = (x, y) => { xs.push(x); ys.push(y); };
-    const { path, places = [], robot } = this.view;
-    if (path) path.t.forEach((_, n) => add(path.x[n], path.y[n]));
+    const { places = [], robot } = this.view;
+    for (const path of this.paths) path.t.forEach((_, n) => add(path.x[n], path.y[n]));
     for (const each of this.things) add(each.x, each.y);
-    if (robot && path && !xs.length) add(robot.x, robot.y);
+    if (robot && this.paths.length && !xs.length) add(robot.x, robot.y);
     for (const each of places) {
       if (each.circle) {
         const [x, y, r] = each.circle;
@@ -209,10 +217,14 @@ class RobotMap {
     this.drawPath(c);
     this.drawStops(c);
     this.drawThings(c, width, height);
-    const { robot, path } = this.view;
-    if (robot && path) this.drawRobot(c, robot, colour("now"), this.moment === null);
+    const { robot } = this.view;
+    if (this.isApart) {
+      this.moments.forEach((each, n) => each && this.drawRobot(c, each, colour(ofPath(n)), true));
+    } else if (robot && this.paths.length) {
+      this.drawRobot(c, robot, colour("now"), this.moment === null);
+    }
     if (this.moment) this.drawRobot(c, this.moment, colour("robot"), true);
-    if (!path || !path.t.length) {
+    if (!this.paths.some((each) => each.t.length)) {
       c.fillStyle = colour("soft");
       c.textAlign = "center";
       c.fillText("No poses in this time.", width / 2, height / 2);
@@ -278,17 +290,17 @@ class RobotMap {
     }
   }
   drawPath(c) {
-    const path = this.view.path;
-    if (!path) return;
-    c.strokeStyle = colour("path");
-    c.lineWidth = 2;
-    c.beginPath();
-    for (let n = 0; n < path.t.length; n++) {
-      const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
-      if (this.begins.has(n)) c.moveTo(x, y);
-      else c.lineTo(x, y);
-    }
-    c.stroke();
+    this.paths.forEach((path, index) => {
+      c.strokeStyle = colour(ofPath(index));
+      c.lineWidth = 2;
+      c.beginPath();
+      for (let n = 0; n < path.t.length; n++) {
+        const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
+        if (path.starts.has(n)) c.moveTo(x, y);
+        else c.lineTo(x, y);
+      }
+      c.stroke();
+    });
   }
   drawStops(c) {
     c.fillStyle = colour("stood");

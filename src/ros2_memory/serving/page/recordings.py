@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import is_kept_apart
-from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.robots import ADVICE, describe_mixed
+from ros2_memory.history.robots import ADVICE, describe_mixed, mixed_recordings
 from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
+from ros2_memory.serving.page.span import path_in
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.model import BagFile, JsonValue
+    from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""
-_MOST_MEMORIES: Final = 8
+MOST_PATHS: Final = 6
+"""Colours that can be told apart on one map."""
+_MOST_MEMORIES: Final = 16
 """Recordings that pages look at and that stay at hand."""
 
 
@@ -85,7 +88,7 @@ class Recordings:
         with self._lock:
             found = self._memories.get(name)
         if found is None:
-            limits = replace(memory.limits, now="latest", kept=None)
+            limits = replace(memory.limits, now="latest", kept=None, recording=name)
             found = replace(memory, index=OneRecording(memory.index, name), limits=limits)
         snapshot = found.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
@@ -113,6 +116,24 @@ class Recordings:
             "mixed": [each.removesuffix(ADVICE) for each in describe_mixed(chosen, call)],
         }
 
+    def paths(self, memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
+        """Returns a path for each robot, where recordings of several overlap in time; else none.
+
+        Each is of one recording, or of a folder of recordings that do not overlap each other.
+        Those that overlap come first, then the newest.
+        """
+        names = _robots(memory, call, window)
+        found: list[JsonValue] = []
+        for name in sorted(names[:MOST_PATHS]):
+            try:
+                path = path_in(self.alone(memory, name), call, window)
+            except EpisodicError as error:
+                found.append({"name": name, "error": str(error)})
+                continue
+            if path is not None:
+                found.append({"name": name, **path})
+        return {"paths": found, "paths_left_out": len(names[MOST_PATHS:])}
+
     def _list(self, memory: Memory) -> list[JsonObject]:
         snapshot = memory.index.published or memory.index.snapshot()
         rows = self._listed.get(snapshot.timeline)
@@ -134,6 +155,38 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
             every = [*chain.from_iterable(inside)]
             rows.append({**_row(folder, every), "holds": len(inside)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
+
+
+def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
+    """Returns the names under which the robots of a window are found, if some overlap in time."""
+    mixed = [each.pair for each in mixed_recordings(memory, call) if each.topic is not None]
+    if not any(window.overlaps(each.start, each.end) for each in mixed):
+        return []
+    root = str(memory.index.bag_dir)
+    names: dict[str, str] = {}
+    ends: dict[str, Ns] = {}
+    for path, bags in recordings_of(memory.index.snapshot()).items():
+        if any(window.overlaps(bag.start, bag.end) for bag in bags):
+            names[path] = name_of(path, bags, root)
+            ends[names[path]] = max(bag.end for bag in bags)
+    pairs = [
+        tuple(names[path] for path in map(str, (each.first, each.second)) if path in names)
+        for each in mixed
+    ]
+    folders = [{*map(_folder, pair)} for pair in pairs if len(pair) == 2]
+    split = {each for folder in folders if len(folder) == 1 for each in folder}
+    overlapping = {name for pair in pairs for name in pair}
+    robots: dict[str, tuple[bool, Ns]] = {}
+    for name, end in ends.items():
+        robot = name if _folder(name) in split else _folder(name)
+        is_mixed, newest = robots.get(robot, (False, end))
+        robots[robot] = (is_mixed or name in overlapping, max(newest, end))
+    return sorted(robots, key=lambda each: (*robots[each], each), reverse=True)
+
+
+def _folder(name: str) -> str:
+    """Returns the folder of the bag directory that holds a recording, or the recording itself."""
+    return name if is_kept_apart(name) else name.partition("/")[0]
 
 
 def _row(name: str, bags: list[BagFile]) -> JsonObject:

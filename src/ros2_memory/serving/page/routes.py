@@ -1,11 +1,13 @@
 """The two endpoints of the page: `/page/span` and `/page/moment`, each a GET that returns JSON.
 
 They answer from the same queries as the tools, in the queue of the tools that may take long. With
-`recording=NAME` they answer from that recording alone.
+`recording=NAME` they answer from that recording alone. `/page/moment` also takes `tool=NAME` and
+its `arguments` as JSON; a tool that writes is refused.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -14,6 +16,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.serving.call_size import excess_in_json
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
@@ -25,6 +29,7 @@ if TYPE_CHECKING:
     from starlette.datastructures import QueryParams
     from starlette.requests import Request
 
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.dispatch import Dispatcher
@@ -40,6 +45,7 @@ _HEADERS: Final = {
 }
 _LONGEST_LABEL: Final = 200
 _LONGEST_NAME: Final = 1000
+_LONGEST_ARGUMENTS: Final = 10_000
 
 
 def page_routes(
@@ -57,6 +63,9 @@ def page_routes(
         shown = span_shown(part, call, asked, progress, dispatcher.questions)
         if "status" in shown:
             shown |= recordings.shown(memory, part, call)
+        if shown.get("mixed") and "path" in shown:
+            window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
+            shown |= recordings.paths(part, call, window)
         return shown
 
     def moment(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
@@ -65,7 +74,17 @@ def page_routes(
     def route(path: str, work: Callable[[QueryParams, Memory, Call], JsonObject]) -> Route:
         async def answer(request: Request) -> Response:
             client = request.client.host if request.client else None
-            reply = await dispatcher.look(partial(work, request.query_params), client)
+            given = request.query_params
+            if path != MOMENT_PATH or "tool" not in given:
+                reply = await dispatcher.look(partial(work, given), client)
+            else:
+                try:
+                    arguments = tool_arguments(given)
+                except InvalidArgumentsError as error:
+                    return Response(f"{error}\n", 400, headers=_HEADERS)
+                reply = await dispatcher.answer(
+                    given["tool"], arguments, client, for_page=True, part=partial(chosen, given)
+                )
             return Response(reply.text, media_type="application/json", headers=_HEADERS)
 
         return Route(path, answer, methods=["GET"])
@@ -109,6 +128,24 @@ def moment_request(given: QueryParams) -> MomentRequest:
         end_s=_number(given, "end"),
         label=label,
     )
+
+
+def tool_arguments(given: QueryParams) -> JsonObject:
+    """Returns the arguments that a query string has for a tool.
+
+    Raises:
+        InvalidArgumentsError: they are no JSON object, or too long.
+    """
+    text = _short(given, "arguments", _LONGEST_ARGUMENTS)
+    try:
+        if excess := excess_in_json(text.encode()):
+            raise InvalidArgumentsError(excess.strip())
+        arguments: JsonValue = json.loads(text or "{}")
+    except ValueError as error:
+        raise InvalidArgumentsError(f"arguments is no JSON: {error}") from error
+    if not isinstance(arguments, dict):
+        raise InvalidArgumentsError("arguments must be a JSON object")
+    return arguments
 
 
 def _short(given: QueryParams, name: str, longest: int) -> str:

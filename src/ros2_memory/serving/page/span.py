@@ -238,23 +238,41 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     newest = track
     if window.stop <= latest or not len(track.times):
         newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
-    kept = thinned(track.x, track.y, track.times)
-    path: JsonObject = {
-        "frame": places.map_frame,
-        "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
-        "x": np.round(track.x[kept], 2).tolist(),
-        "y": np.round(track.y[kept], 2).tolist(),
-        "yaw": [degrees(each) for each in track.heading[kept].tolist()],
-        "begins": _begins(track, kept),
-        "continues": bool(len(kept)) and not bool(track.begins[0]),
-        "whole": found.since is None,
-    }
+    path = _drawn(track, places.map_frame, is_whole=found.since is None)
     named = _places(memory, places.map_frame)
     shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
     notes = [*view.notes.sentences()]
     if found.since is not None:
         notes.append("the path is not complete yet: older bags are still being read")
     return Shown(shown, tuple(notes))
+
+
+def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
+    """Returns the path in a window; None where no topic with poses is recorded.
+
+    Raises:
+        QueryTimeoutError: it is not known within the time of a quick answer.
+    """
+    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    places = robot_places(view, window)
+    if places is None:
+        return None
+    found = RobotTracks(view, places.map_frame).over(window)
+    return _drawn(cut(found.track, window), places.map_frame, is_whole=found.since is None)
+
+
+def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
+    kept = thinned(track.x, track.y, track.times)
+    return {
+        "frame": frame_id,
+        "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
+        "x": np.round(track.x[kept], 2).tolist(),
+        "y": np.round(track.y[kept], 2).tolist(),
+        "yaw": [degrees(each) for each in track.heading[kept].tolist()],
+        "begins": _begins(track, kept),
+        "continues": bool(len(kept)) and not bool(track.begins[0]),
+        "whole": is_whole,
+    }
 
 
 def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
