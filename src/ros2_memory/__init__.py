@@ -34,6 +34,7 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     insights        the tools beyond the specification
     tools           declarations, arguments, replies as JSON
     fleet           the tools of one robot, asked of many, and their replies as one
+    lake            closed bags of many robots as rows of Iceberg tables (the extra `lake`)
     serving         dispatch, MCP, HTTP, access, limits, health
     observability   Prometheus, OpenTelemetry
     demo            the simulated robot of `ros2-memory demo`

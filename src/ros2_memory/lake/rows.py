@@ -1,0 +1,447 @@
+"""The rows of one closed bag, from its digests as the query server has them.
+
+Only detections and the messages of chosen topics are read from the bag itself. The bag is the one
+that the memory sees: messages that count in another recording are left out, as in answers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.motion.standstills import StandstillBuilder
+from ros2_memory.analysis.motion.trajectory import TrajectoryBuilder
+from ros2_memory.analysis.sights import Spot, decode_sights
+from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, has_events
+from ros2_memory.catalogue.codec import encode_poses, encode_standstills, encode_topic_events
+from ros2_memory.catalogue.detector_sights import DetectorSights
+from ros2_memory.catalogue.digest import DIGEST_VERSION
+from ros2_memory.catalogue.map_digest import encode_map_track
+from ros2_memory.catalogue.store import BagKey
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.insights.topic_events import toggled
+from ros2_memory.lake.tables import TABLES, microseconds, topic_key
+from ros2_memory.messages.detections import detections_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.catalogue.map_digest import MapDigest
+    from ros2_memory.catalogue.store import Catalogue
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Memory
+    from ros2_memory.lake.tables import Row
+    from ros2_memory.storage.base import Record
+
+ROWS_VERSION: Final = 1
+"""Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
+_BLOCK: Final = 1 << 20
+_NO_SCORE: Final = -1
+_MM: Final = 1000.0
+_SCORE_UNIT: Final = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class BagContent:
+    """One bag as it is named in a lake.
+
+    Attributes:
+        bag: the bag of the index.
+        bag_id: see `bag_id_of`.
+        sha256: of the bytes of its file, in hexadecimal.
+        made_of: see `made_of`.
+    """
+
+    bag: BagFile
+    bag_id: str
+    sha256: str
+    made_of: str
+
+
+def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
+    """Returns the id of a bag: of its robot, its recording, its file's name and its first message.
+
+    So it is the same wherever the bag is copied to, also into a saved moment, and another one for
+    another bag of the same name. Its size is no part of it: a bag of which messages were deleted
+    by request is the same bag with less in it. `first` is the log time of the first message in the
+    file, whether it counts there or in another recording.
+    """
+    name = json.dumps([robot, bag.recording.name, bag.path.name, first])
+    return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:32]
+
+
+def sha256_of(path: Path) -> str:
+    """Returns the hash of a file's bytes.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb", buffering=0) as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def made_of(memory: Memory, bag: BagFile, config: str, messages: Sequence[str] = ()) -> str | None:
+    """Returns what the rows of a bag depend on besides its bytes; None while it has no digest.
+
+    That is which of its messages count, the static transforms in force, the settings (`config`)
+    and versions of the digest, and the topics whose `messages` are shipped.
+    """
+    catalogue, number = _entry(memory, bag)
+    if number is None:
+        return None
+    counted = [
+        (each.topic, each.type, each.count, each.first, each.last) for each in bag.summary.topics
+    ]
+    statics = catalogue.map_keys([number]).get(number)
+    parts = json.dumps([ROWS_VERSION, DIGEST_VERSION, config, statics, sorted(messages), counted])
+    return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
+
+
+def rows_of(
+    memory: Memory, content: BagContent, messages: Sequence[str] = ()
+) -> dict[str, list[Row]]:
+    """Returns the rows of a bag that has a digest, by table; `messages` are topics to ship whole.
+
+    Raises:
+        BagError: the bag cannot be read.
+        ValueError: it has no digest.
+    """
+    return _BagRows(memory, content).rows(messages)
+
+
+def _entry(memory: Memory, bag: BagFile) -> tuple[Catalogue, int | None]:
+    """Returns the catalogue of a memory, and the number of a bag's entry there."""
+    if memory.recall is None:
+        raise ValueError("a memory without a catalogue has no digests")
+    catalogue = memory.recall.catalogue
+    return catalogue, catalogue.find([BagKey.of(bag, memory.recall.bag_dir)])[0]
+
+
+class _BagRows:
+    """Makes the rows of one bag."""
+
+    def __init__(self, memory: Memory, content: BagContent) -> None:
+        self._memory = memory
+        self._content = content
+        self._bag = content.bag
+        self._catalogue, number = _entry(memory, content.bag)
+        if number is None:
+            raise ValueError(f"{content.bag.file} has no digest")
+        self._number = number
+        self._pose_topic = memory.limits.pose_topic
+        self._types: dict[str, list[str]] = {}
+        for each in self._bag.summary.topics:
+            self._types.setdefault(each.topic, []).append(each.type)
+        self._undecodable = 0
+        self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+
+    def rows(self, messages: Sequence[str]) -> dict[str, list[Row]]:
+        in_map, own = self._maps()
+        events = {
+            topic: self._events(topic)
+            for topic, types in self._types.items()
+            if any(map(has_events, types))
+        }
+        self._add_poses(in_map, own)
+        self._add_digests(in_map, own, events)
+        self._add_things(in_map)
+        stood_s = self._add_events(events)
+        self._add_messages(events, messages, in_map)
+        self._add_bag(in_map, stood_s)
+        return self._rows
+
+    def _maps(self) -> tuple[MapDigest | None, MapDigest | None]:
+        """Returns the map digest, and that in the poses' own frame where it is another."""
+        number = self._number
+        in_map = self._catalogue.maps([number]).get(number)
+        own = self._catalogue.maps([number], own=True).get(number)
+        if in_map is None or own is None or own.frame_id == in_map.frame_id:
+            return in_map, None
+        return in_map, own
+
+    def _events(self, topic: str) -> TopicEvents | None:
+        return self._catalogue.topic_events(topic, [self._number]).get(self._number)
+
+    def _add_bag(self, in_map: MapDigest | None, stood_s: float | None) -> None:
+        bag, content, number = self._bag, self._content, self._number
+        digest = self._catalogue.poses(self._pose_topic, [number]).get(number)
+        driven = None
+        if digest is not None:
+            builder = TrajectoryBuilder(self._memory.limits.max_plausible_speed_mps)
+            builder.join(digest)
+            driven = builder.result()
+        self._rows["bags"].append(
+            (
+                bag.recording.name,
+                bag.path.name,
+                bag.size,
+                content.sha256,
+                bag.mtime_ns,
+                content.made_of,
+                bag.start,
+                bag.end,
+                microseconds(bag.start),
+                bag.summary.count,
+                self._undecodable,
+                len(self._rows["sightings"]),
+                self._pose_topic,
+                None if in_map is None else in_map.frame_id,
+                None if driven is None else driven.poses,
+                None if driven is None else driven.totals.distance_m,
+                None if driven is None else driven.totals.gap_m,
+                None if driven is None else driven.max_speed,
+                stood_s,
+            )
+        )
+
+    def _add_poses(self, in_map: MapDigest | None, own: MapDigest | None) -> None:
+        key = topic_key(self._pose_topic)
+        for each in (in_map, own):
+            if each is None:
+                continue
+            track, frame = each.track, each.frame_id
+            columns = (track.times, track.x, track.y, track.heading, track.begins)
+            error_m = round(track.error_m, 6)
+            self._rows["poses"] += [
+                (
+                    self._pose_topic,
+                    key,
+                    frame,
+                    time,
+                    microseconds(time),
+                    x,
+                    y,
+                    _finite(heading),
+                    begins,
+                    error_m,
+                )
+                for time, x, y, heading, begins in zip(
+                    *(column.tolist() for column in columns), strict=True
+                )
+            ]
+
+    def _add_digests(
+        self,
+        in_map: MapDigest | None,
+        own: MapDigest | None,
+        events: Mapping[str, TopicEvents | None],
+    ) -> None:
+        version, number, catalogue = str(DIGEST_VERSION), self._number, self._catalogue
+
+        def add(topic: str, kind: str, packed: bytes) -> None:
+            summaries = self._bag.summary.of(topic)
+            first = min((each.first for each in summaries), default=self._bag.start)
+            last = max((each.last for each in summaries), default=self._bag.end)
+            count = sum(each.count for each in summaries)
+            self._rows["digests"].append(
+                (topic, topic_key(topic), kind, version, None, count, first, last, packed)
+            )
+
+        for each in self._bag.summary.topics:
+            self._rows["digests"].append(
+                (
+                    each.topic,
+                    topic_key(each.topic),
+                    "topic",
+                    version,
+                    each.type,
+                    each.count,
+                    each.first,
+                    each.last,
+                    None,
+                )
+            )
+        for topic in self._types:
+            poses = catalogue.poses(topic, [number]).get(number)
+            if poses is not None:
+                add(topic, "poses", encode_poses(poses))
+            stood = catalogue.standstills(topic, [number]).get(number)
+            if stood is not None:
+                add(topic, "standstills", encode_standstills(stood))
+            found = events.get(topic, NO_EVENTS)
+            if found is not NO_EVENTS:
+                add(topic, "events", encode_topic_events(found))
+        if in_map is not None:
+            add(self._pose_topic, "map", encode_map_track(replace(in_map, own=own)))
+            add("", "sights", self._sights())
+
+    def _sights(self) -> bytes:
+        return self._catalogue.sights([self._number]).get(self._number, (0, b""))[1]
+
+    def _add_things(self, in_map: MapDigest | None) -> None:
+        packed = self._sights()
+        if not packed or in_map is None:
+            return
+        sights = decode_sights(packed)
+        for spot in sights.spots.tolist():
+            topic, label = sights.topics[spot[Spot.TOPIC]], sights.labels[spot[Spot.LABEL]]
+            best = spot[Spot.BEST]
+            self._rows["things"].append(
+                (
+                    topic,
+                    topic_key(topic),
+                    label,
+                    spot[Spot.N],
+                    spot[Spot.FIRST],
+                    spot[Spot.LAST],
+                    microseconds(spot[Spot.FIRST]),
+                    sights.frame_id,
+                    spot[Spot.X] / _MM,
+                    spot[Spot.Y] / _MM,
+                    spot[Spot.Z] / _MM,
+                    spot[Spot.DEV] / _MM,
+                    None if best == _NO_SCORE else best / _SCORE_UNIT,
+                )
+            )
+
+    def _add_events(self, events: Mapping[str, TopicEvents | None]) -> float | None:
+        """Adds the events of the bag alone, and returns how long the robot stood in it."""
+
+        def add(
+            topic: str, kind: str, first: Ns, last: Ns | None, text: str, **more: object
+        ) -> None:
+            values = (more.get(name) for name in ("value", "count", "x", "y"))
+            self._rows["events"].append(
+                (topic, topic_key(topic), kind, first, last, microseconds(first), text, *values)
+            )
+
+        for topic, found in events.items():
+            if found is None:
+                continue
+            for seen in found.visible.intervals():
+                add(topic, "thing", seen.first, seen.last, seen.label, value=seen.best)
+            for flip in found.toggles:
+                add(topic, "flip", flip.time, None, toggled(topic, flip), value=float(flip.value))
+            for error in found.errors:
+                add(topic, "error", error.first, error.last, error.text, count=error.reports)
+        pose_topic, number = self._pose_topic, self._number
+        digest = self._catalogue.standstills(pose_topic, [number]).get(number)
+        if digest is None:
+            return None
+        builder = StandstillBuilder()
+        builder.join(digest)
+        standstills = builder.standstills()
+        for start, end, box in standstills:
+            x, y, _ = box.centre
+            add(pose_topic, "stop", start, end, "stood", x=x, y=y)
+        for time, before_mps, after_mps in builder.drops:
+            text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
+            add(pose_topic, "drop", time, None, text, value=before_mps - after_mps)
+        return unix_from_ns(sum(each.end - each.start for each in standstills))
+
+    def _add_messages(
+        self,
+        events: Mapping[str, TopicEvents | None],
+        messages: Sequence[str],
+        in_map: MapDigest | None,
+    ) -> None:
+        """Reads the detections of the bag, and the messages of the chosen topics."""
+        wants = DetectorSights(self._memory.reader, self._memory.extractor).wants
+        # What the digest of a topic rules out is not read.
+        seen = {
+            topic
+            for topic, found in events.items()
+            if (found is None or found.visible.size or found.left_out)
+            and any(wants(topic, each) for each in self._types[topic])
+        }
+        whole = {topic for topic in messages if topic in self._types}
+        if not seen and not whole:
+            return
+        robot = _RobotAt(in_map)
+        numbers: dict[str, int] = {}
+        records = self._memory.reader.records(
+            self._bag.path, tuple(sorted(seen | whole)), TimeWindow.everything()
+        )
+        for record in records:
+            topic = record.channel.topic
+            nth = numbers[topic] = numbers.get(topic, -1) + 1
+            if topic in whole:
+                self._rows["messages"].append(self._message(record, nth))
+            if topic in seen:
+                self._rows["sightings"] += self._sightings(record, nth, robot)
+
+    def _sightings(self, record: Record, nth: int, robot: _RobotAt) -> Iterator[Row]:
+        memory, channel, time = self._memory, record.channel, record.log_time
+        try:
+            message = memory.reader.decode(record)
+        except UndecodableError:
+            self._undecodable += 1
+            return
+        value = memory.extractor.exact(message, channel.type)
+        detections = detections_of(value, memory.extractor.frame(message))
+        if not detections:
+            return
+        start = (
+            channel.topic,
+            topic_key(channel.topic),
+            channel.type,
+            time,
+            microseconds(time),
+            nth,
+        )
+        end = robot.at(time)
+        for each in detections:
+            place = each.place or (None, None, None)
+            yield (*start, each.label, each.score, each.frame_id, *place, *end)
+
+    def _message(self, record: Record, nth: int) -> Row:
+        memory, channel, time = self._memory, record.channel, record.log_time
+        value = reason = None
+        try:
+            message = memory.reader.decode(record)
+            shown = memory.extractor.exact(message, channel.type)
+            value = json.dumps(shown, ensure_ascii=False, separators=(",", ":"))
+        except UndecodableError as error:
+            reason = error.reason
+        return (
+            channel.topic,
+            topic_key(channel.topic),
+            channel.type,
+            time,
+            microseconds(time),
+            record.publish_time,
+            nth,
+            value,
+            reason,
+        )
+
+
+class _RobotAt:
+    """Where the robot was, by the track of a bag."""
+
+    def __init__(self, in_map: MapDigest | None) -> None:
+        self._track: RobotTrack | None = None
+        self._frame = ""
+        if in_map is not None and len(in_map.track.times):
+            self._track, self._frame = in_map.track, in_map.frame_id
+
+    def at(self, time: Ns) -> tuple[str | None, float | None, float | None]:
+        """Returns the frame, x and y (m); nulls where the track has a gap, or has not begun."""
+        track = self._track
+        if track is None:
+            return None, None, None
+        after = int(np.searchsorted(track.times, time, side="right"))
+        if after == 0:
+            return None, None, None
+        last = after == len(track.times)
+        if last or track.begins[after]:
+            # Between two pieces the newest place that is known counts.
+            return self._frame, float(track.x[after - 1]), float(track.y[after - 1])
+        begin, end = int(track.times[after - 1]), int(track.times[after])
+        share = (time - begin) / (end - begin)
+        x = float(track.x[after - 1] + share * (track.x[after] - track.x[after - 1]))
+        y = float(track.y[after - 1] + share * (track.y[after] - track.y[after - 1]))
+        return self._frame, x, y
+
+
+def _finite(number: float) -> float | None:
+    return number if np.isfinite(number) else None

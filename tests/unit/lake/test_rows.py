@@ -1,0 +1,183 @@
+"""The rows of a bag say what the memory answers about it."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from ros2_memory.analysis.motion.odometry import PoseDigest
+from ros2_memory.catalogue.codec import decode_poses, decode_standstills, decode_topic_events
+from ros2_memory.catalogue.store import BagKey
+from ros2_memory.core.model import BagFile
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import TimeRange
+from ros2_memory.insights.recap import recap
+from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of
+from ros2_memory.lake.tables import TABLES, to_arrow, topic_key
+from tests.support.bags import detections, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.fleets import LENGTH_S, NOW, SEEN, SeededRobot, seeded, write_robot
+from tests.support.memories import memory_of, recalling
+
+Table = list[dict[str, object]]
+
+
+def lake_rows(memory: Memory, bag: BagFile, messages: tuple[str, ...] = ()) -> dict[str, Table]:
+    """The rows of a bag with names."""
+    content = BagContent(bag, "id", "0" * 64, "made")
+    found = rows_of(memory, content, messages)
+    return {
+        name: [dict(zip(TABLES[name].columns, row, strict=True)) for row in rows]
+        for name, rows in found.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def robot() -> SeededRobot:
+    return seeded("kitchen")
+
+
+@pytest.fixture(scope="module")
+def memory(robot: SeededRobot, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    bag_dir = write_robot(robot, tmp_path_factory.mktemp("bags"))
+    return recalling(memory_of(bag_dir, clock=FixedClock(NOW)), bag_dir)
+
+
+@pytest.fixture(scope="module")
+def both(memory: Memory) -> list[dict[str, Table]]:
+    return [lake_rows(memory, bag, ("/is_docked",)) for bag in memory.index.snapshot().bags]
+
+
+def joined(both: list[dict[str, Table]], name: str) -> Table:
+    return [row for rows in both for row in rows[name]]
+
+
+def test_each_detection_is_a_row(robot: SeededRobot, both: list[dict[str, Table]]) -> None:
+    rows = joined(both, "sightings")
+    assert [(row["time_ns"], row["label"]) for row in rows] == [
+        (at * NS_PER_S, label) for at, label in robot.seen
+    ]
+    assert {row["topic"] for row in rows} == {SEEN}
+    assert {row["robot_frame"] for row in rows} == {"map"}
+    assert sum(int(str(rows["bags"][0]["detections"])) for rows in both) == len(robot.seen)
+
+
+def test_a_detection_knows_which_message_of_its_topic_has_it(tmp_path: Path) -> None:
+    seen = [detections(at * NS_PER_S, [*labels]) for at, labels in ((1, "ab"), (2, ""), (3, "a"))]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", seen)
+    memory = recalling(memory_of(tmp_path), tmp_path)
+    rows = lake_rows(memory, memory.index.snapshot().bags[0])["sightings"]
+    assert [(row["label"], row["message"]) for row in rows] == [("a", 0), ("b", 0), ("a", 2)]
+
+
+def test_poses_are_within_their_error_of_what_the_robot_drove(both: list[dict[str, Table]]) -> None:
+    poses = [row for row in joined(both, "poses") if row["frame_id"] == "odom"]
+    first = min(int(str(row["time_ns"])) for row in poses)
+    assert {row["frame_id"] for row in joined(both, "poses")} == {"map", "odom"}
+    for row in poses:
+        second = (int(str(row["time_ns"])) - first) / NS_PER_S
+        x, y = float(str(row["x"])), float(str(row["y"]))
+        apart = math.dist((x, y), (math.sin(second / 10) * 3, 0.1 * second))
+        assert apart <= float(str(row["error_m"])) + 1e-9
+
+
+def test_digests_fold_to_what_the_memory_answers(
+    robot: SeededRobot, memory: Memory, both: list[dict[str, Table]]
+) -> None:
+    packed = {
+        (str(row["topic"]), str(row["kind"])): row["packed"]
+        for row in both[0]["digests"]
+        if row["kind"] != "topic"
+    }
+    [numbers] = _numbers(memory, memory.index.snapshot().bags[0])
+    catalogue = memory.recall.catalogue if memory.recall else None
+    assert catalogue is not None
+    assert _poses(packed) == catalogue.poses("/odom", [numbers])[numbers]
+    stood = packed["/odom", "standstills"]
+    assert isinstance(stood, bytes)
+    assert decode_standstills(stood) == catalogue.standstills("/odom", [numbers])[numbers]
+    events = packed[SEEN, "events"]
+    assert isinstance(events, bytes)
+    assert decode_topic_events(events) == catalogue.topic_events(SEEN, [numbers])[numbers]
+    counts = Counter[str]()
+    for row in joined(both, "digests"):
+        if row["kind"] == "topic":
+            counts[str(row["topic"])] += int(str(row["messages"]))
+    assert counts["/odom"] == LENGTH_S
+
+
+def _numbers(memory: Memory, bag: BagFile) -> list[int]:
+    assert memory.recall is not None
+    found = memory.recall.catalogue.find([BagKey.of(bag, memory.recall.bag_dir)])
+    return [each for each in found if each is not None]
+
+
+def _poses(packed: Mapping[tuple[str, str], object]) -> PoseDigest:
+    poses = packed["/odom", "poses"]
+    assert isinstance(poses, bytes)
+    return decode_poses(poses)
+
+
+def test_metres_of_a_bag_are_those_of_a_recap_of_it(
+    memory: Memory, both: list[dict[str, Table]]
+) -> None:
+    for rows in both:
+        row = rows["bags"][0]
+        start, end = (int(str(row[name])) / NS_PER_S for name in ("start_ns", "end_ns"))
+        told = recap(memory, Call(), TimeRange(start, end))
+        assert row["distance_m"] == pytest.approx(told.distance_m, abs=1e-6)
+
+
+def test_messages_of_a_chosen_topic_are_whole(both: list[dict[str, Table]]) -> None:
+    assert [row["value"] for row in joined(both, "messages")] == [
+        '{"value":false}',
+        '{"value":true}',
+        '{"value":false}',
+    ]
+    assert not [row for row in joined(both, "messages") if row["undecodable"]]
+
+
+def test_a_bag_has_one_id_wherever_it_lies(tmp_path: Path) -> None:
+    message = detections(NS_PER_S, ["cup"])
+    write_mcap(tmp_path / "one" / "rec" / "rec_0.mcap", [message])
+    write_mcap(tmp_path / "two" / "moments" / "x" / "rec" / "rec_0.mcap", [message])
+    write_mcap(tmp_path / "three" / "rec" / "rec_0.mcap", [replace(message, log_time=2)])
+    bags = [memory_of(tmp_path / each).index.snapshot().bags[0] for each in ("one", "two", "three")]
+    ids = [bag_id_of("kitchen", bag, bag.start) for bag in bags]
+    assert ids[0] == ids[1]
+    assert ids[2] != ids[0]
+    assert bag_id_of("hall", bags[0], bags[0].start) != ids[0]
+
+
+def test_what_rows_are_made_of_changes_with_what_counts(memory: Memory) -> None:
+    one, two = memory.index.snapshot().bags
+    assert made_of(memory, one, "config") == made_of(memory, one, "config")
+    assert made_of(memory, one, "config") != made_of(memory, one, "other")
+    assert made_of(memory, one, "config") != made_of(memory, one, "config", ["/odom"])
+    assert made_of(memory, one, "config") != made_of(memory, two, "config")
+
+
+def test_arrow_tables_are_sorted_and_carry_the_keys(memory: Memory) -> None:
+    content = BagContent(memory.index.snapshot().bags[0], "id", "", "")
+    rows = rows_of(memory, content)["digests"]
+    table = to_arrow(TABLES["digests"], "kitchen", date(2026, 11, 20), {"a": rows, "b": rows[:1]})
+    assert table.num_rows == len(rows) + 1
+    assert Counter(table["bag_id"].to_pylist()) == {"a": len(rows), "b": 1}
+    keys = list(zip(*(table[name].to_pylist() for name in TABLES["digests"].order), strict=True))
+    assert keys == sorted(keys)
+    assert to_arrow(TABLES["poses"], "kitchen", date(2026, 11, 20), {}).num_rows == 0
+
+
+def test_lone_surrogates_of_a_hostile_bag_are_escaped() -> None:
+    row = ("/a", "a", "t", 1, 0, 0, 0, "bad \udc80", None)
+    table = to_arrow(TABLES["messages"], "kitchen", date(2026, 11, 20), {"a": [row]})
+    assert table["value"].to_pylist() == ["bad \\udc80"]
+
+
+def test_a_topic_key_has_no_slash() -> None:
+    assert topic_key("/vision/scene/objects") == "vision.scene.objects"
