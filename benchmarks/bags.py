@@ -25,7 +25,7 @@ from benchmarks import payloads
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -78,6 +78,19 @@ FOUND: Final = Topic("/vision/find_object/detections_meta", payloads.DETECTIONS,
 TF_STATIC: Final = Topic("/tf_static", "tf2_msgs/msg/TFMessage", 1, "transient_local")
 TOPICS: Final = (ODOM, TF, CMD_VEL, SCENE, FOUND, TF_STATIC)
 MESSAGES_OF_A_SPLIT: Final = sum(topic.messages for topic in TOPICS)
+MAP_TF: Final = Topic("/tf", "tf2_msgs/msg/TFMessage", 60 * SPLIT_S)
+"""Each sixth of its messages corrects `map -> odom`; the others are those of `TF`."""
+BATTERY: Final = Topic("/battery_state", "sensor_msgs/msg/BatteryState", SPLIT_S)
+STATUS: Final = Topic("/robot/status", "std_msgs/msg/String", SPLIT_S)
+ROSOUT: Final = Topic("/rosout", "rcl_interfaces/msg/Log", 2 * SPLIT_S, "transient_local")
+ROBOT_TOPICS: Final = (ODOM, MAP_TF, CMD_VEL, SCENE, FOUND, TF_STATIC, BATTERY, STATUS, ROSOUT)
+"""Those of a robot with a localiser, a battery, a state and a log."""
+
+
+def with_idle(topics: Sequence[Topic], count: int) -> tuple[Topic, ...]:
+    """Returns the topics and so many of one short text a split, `count` in all."""
+    idle = range(count - len(topics))
+    return (*topics, *(Topic(f"/idle/topic_{nth:04}", STATUS.type, 1) for nth in idle))
 
 
 class Split(NamedTuple):
@@ -95,6 +108,7 @@ class History:
 
     folder: Path
     bags: int
+    topics: tuple[Topic, ...] = TOPICS
 
     @property
     def start(self) -> int:
@@ -115,7 +129,13 @@ class History:
             yield Split(number, path, self.start + number * SPLIT_NS, nth)
 
 
-def made(folder: Path, bags: int, *, jobs: int | None = None) -> History:
+def made(
+    folder: Path,
+    bags: int,
+    *,
+    jobs: int | None = None,
+    topics: tuple[Topic, ...] = TOPICS,
+) -> History:
     """The history of so many splits in `folder`, taken as it lies there or made.
 
     Raises:
@@ -123,10 +143,11 @@ def made(folder: Path, bags: int, *, jobs: int | None = None) -> History:
     """
     if bags < 1:
         raise ValueError(f"a history of {bags} bags cannot be made: give 1 or more")
-    place = folder / f"bags_{bags}"
-    history = History(place, bags)
-    seal = folder / f"bags_{bags}.json"
-    facts = {"format": _FORMAT, "bags": bags, "messages_of_a_split": MESSAGES_OF_A_SPLIT}
+    name = f"bags_{bags}" if topics == TOPICS else f"bags_{bags}_{len(topics)}_topics"
+    place = folder / name
+    history = History(place, bags, topics)
+    seal = folder / f"{name}.json"
+    facts = {"format": _FORMAT, "bags": bags, "messages_of_a_split": _messages(topics)}
     if seal.is_file() and json.loads(seal.read_text(encoding="utf-8")) == facts:
         return history
     seal.unlink(missing_ok=True)
@@ -150,11 +171,11 @@ def _record(history: History, splits: list[Split]) -> None:
     """Writes one recording."""
     splits[0].path.parent.mkdir(parents=True)
     for split in splits:
-        _write(split, splits[: split.nth + 1])
+        _write(split, splits[: split.nth + 1], history.topics)
         # A bag that was closed long ago, as most bags of a history were.
         closed = split.start + SPLIT_NS
         os.utime(split.path, ns=(closed, closed))
-    text = "rosbag2_bagfile_information:\n" + indent(metadata(splits), "  ") + "\n"
+    text = "rosbag2_bagfile_information:\n" + indent(metadata(splits, history.topics), "  ") + "\n"
     folder = splits[0].path.parent
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
     write_handover(folder, _handover(history, splits))
@@ -184,24 +205,24 @@ def _name(recording: int) -> str:
     return f"rec_{recording:04}"
 
 
-def _write(split: Split, so_far: Sequence[Split]) -> None:
+def _write(split: Split, so_far: Sequence[Split], topics: Sequence[Topic]) -> None:
     noise = np.random.default_rng(split.number)
     with split.path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="ros2-memory benchmark")
-        channels = _declared(writer)
-        rows = [row for topic in TOPICS for row in _rows(split, topic, channels[topic], noise)]
+        channels = _declared(writer, topics)
+        rows = [row for topic in topics for row in _rows(split, topic, channels[topic], noise)]
         rows.sort(key=lambda row: row[0])
         for sequence, (log_time, publish_time, channel, payload) in enumerate(rows):
             writer.add_message(channel, log_time, payload, publish_time, sequence)
-        writer.add_metadata("rosbag2", {"serialized_metadata": metadata(so_far)})
+        writer.add_metadata("rosbag2", {"serialized_metadata": metadata(so_far, topics)})
         writer.finish()
 
 
-def _declared(writer: Writer) -> dict[Topic, int]:
+def _declared(writer: Writer, topics: Sequence[Topic]) -> dict[Topic, int]:
     schemas = {
         name: writer.register_schema(name, "ros2msg", definition(name).encode())
-        for name in dict.fromkeys(topic.type for topic in TOPICS)
+        for name in dict.fromkeys(topic.type for topic in topics)
     }
     return {
         topic: writer.register_channel(
@@ -210,7 +231,7 @@ def _declared(writer: Writer) -> dict[Topic, int]:
             schemas[topic.type],
             {"offered_qos_profiles": QOS.format(durability=topic.durability)},
         )
-        for topic in TOPICS
+        for topic in topics
     }
 
 
@@ -218,7 +239,7 @@ def _rows(
     split: Split, topic: Topic, channel: int, noise: np.random.Generator
 ) -> list[tuple[int, int, int, bytes]]:
     """Log time, publish time, channel and payload of a topic's messages."""
-    if topic is TF_STATIC:
+    if topic == TF_STATIC:
         recording_began = split.start - split.nth * SPLIT_NS
         return [(split.start, recording_began, channel, payloads.fixed_frames())]
     published = split.start + np.arange(topic.messages) * (SPLIT_NS // topic.messages)
@@ -233,35 +254,47 @@ def _payloads(
     split: Split, topic: Topic, published: NDArray[np.int64], noise: np.random.Generator
 ) -> list[bytes]:
     t = (published - (END_NS - WEEK * SPLIT_NS)) / 1e9
-    if topic is ODOM:
-        return payloads.odometry(t, published, split.number)
-    if topic is TF:
-        return payloads.moving_frame(t, published, split.number)
-    if topic is CMD_VEL:
-        return payloads.command(t)
-    skill, fewest, most = ("scene", 3, 9) if topic is SCENE else ("find_object", 0, 3)
+    made_of: dict[Topic, Callable[[], list[bytes]]] = {
+        ODOM: lambda: payloads.odometry(t, published, split.number),
+        TF: lambda: payloads.moving_frame(t, published, split.number),
+        MAP_TF: lambda: payloads.corrected_frames(t, published, split.number),
+        CMD_VEL: lambda: payloads.command(t),
+        BATTERY: lambda: payloads.battery(t, published),
+        ROSOUT: lambda: payloads.logged(published, noise),
+    }
+    if topic in made_of:
+        return made_of[topic]()
+    if topic.type == STATUS.type:
+        return payloads.states(t)
+    skill, fewest, most = ("scene", 3, 9) if topic == SCENE else ("find_object", 0, 3)
     return [
         payloads.detections(stamp, skill, int(noise.integers(fewest, most)), noise)
         for stamp in published.tolist()
     ]
 
 
-def metadata(splits: Sequence[Split]) -> str:
+def _messages(topics: Sequence[Topic]) -> int:
+    """How many messages of the topics a split holds."""
+    return sum(topic.messages for topic in topics)
+
+
+def metadata(splits: Sequence[Split], topics: Sequence[Topic] = TOPICS) -> str:
     """What rosbag2 tells of a recording (its metadata, version 9) when it has these splits."""
+    each = _messages(topics)
     lines = [
         "version: 9",
         "storage_identifier: mcap",
         f"duration:\n  nanoseconds: {len(splits) * SPLIT_NS}",
         f"starting_time:\n  nanoseconds_since_epoch: {splits[0].start}",
-        f"message_count: {len(splits) * MESSAGES_OF_A_SPLIT}",
+        f"message_count: {len(splits) * each}",
         "topics_with_message_count:",
-        *(_topic_told(topic, len(splits)) for topic in TOPICS),
+        *(_topic_told(topic, len(splits)) for topic in topics),
         'compression_format: ""',
         'compression_mode: ""',
         "relative_file_paths:",
         *(f"  - {split.path.name}" for split in splits),
         "files:",
-        *(_split_told(split) for split in splits),
+        *(_split_told(split, each) for split in splits),
         "custom_data: ~",
         "ros_distro: jazzy",
     ]
@@ -277,11 +310,11 @@ def _topic_told(topic: Topic, splits: int) -> str:
     )
 
 
-def _split_told(split: Split) -> str:
+def _split_told(split: Split, messages: int) -> str:
     return (
         f"  - path: {split.path.name}\n    starting_time:\n"
         f"      nanoseconds_since_epoch: {split.start}\n    duration:\n"
-        f"      nanoseconds: {SPLIT_NS}\n    message_count: {MESSAGES_OF_A_SPLIT}"
+        f"      nanoseconds: {SPLIT_NS}\n    message_count: {messages}"
     )
 
 

@@ -41,6 +41,12 @@ _LABELS: Final = (
     *("helmet", "vest", "glove", "hammer", "wrench", "cable", "tape", "carton", "barrel", "fan"),
 )
 _CONFIDENCE: Final = 0.97
+_LOG: Final = (
+    "Passing new path to controller.",
+    "Received a goal, begin computing control effort.",
+    "Reached the goal!",
+    "Control loop missed its desired rate of 20.0000 Hz",
+)
 # What stands for a field until it is filled: no other bytes of a message equal these.
 _MARKS: Final = {
     "x": 1.1e101,
@@ -117,6 +123,68 @@ def command_of(speed: Floats, turning: Floats) -> list[bytes]:
     """One `geometry_msgs/msg/Twist` for each pair of m/s and rad/s."""
     columns = {"vx": np.round(speed, 2), "wz": np.round(turning, 2)}
     return _filled(_command(), np.zeros(len(speed), np.int64), columns)
+
+
+def corrected_frames(t: Floats, stamps: NDArray[np.int64], seed: int) -> list[bytes]:
+    """As `moving_frame`; each sixth has odom in map instead, as a localiser corrects it."""
+    frames = moving_frame(t, stamps, seed)
+    late, drift = t[5::6], np.sin(t[5::6] / 700.0)
+    at = (0.4 * drift + 0.01 * np.sin(late / 3.0), 0.3 * np.cos(late / 900.0), 0.02 * drift)
+    frames[5::6] = frames_of(at, stamps[5::6], ("map", "odom"))
+    return frames
+
+
+def battery(t: Floats, stamps: NDArray[np.int64]) -> list[bytes]:
+    """One `sensor_msgs/msg/BatteryState` for each moment: 0.25 to 0.95, in turns of two hours."""
+    charge = np.round(0.6 + 0.35 * np.cos(2.0 * np.pi * t / 7_200.0), 3)
+    return [
+        serialized(
+            "sensor_msgs/msg/BatteryState",
+            header=header(stamp, ""),
+            **dict.fromkeys(("temperature", "current", "charge", "capacity"), float("nan")),
+            voltage=12.0 + 3.0 * share,
+            design_capacity=4.0,
+            percentage=share,
+            power_supply_status=2,
+            power_supply_health=1,
+            power_supply_technology=2,
+            present=True,
+            cell_voltage=np.zeros(0, np.float32),
+            cell_temperature=np.zeros(0, np.float32),
+            location="",
+            serial_number="",
+        )
+        for share, stamp in zip(charge.tolist(), stamps.tolist(), strict=True)
+    ]
+
+
+def states(t: Floats) -> list[bytes]:
+    """One `std_msgs/msg/String` for each moment: what the robot does."""
+    names = ("driving", "waiting", "looking", "docked")
+    return [_text(names[int(moment // 45.0) % 4]) for moment in t.tolist()]
+
+
+def logged(stamps: NDArray[np.int64], chance: np.random.Generator) -> list[bytes]:
+    """One `rcl_interfaces/msg/Log` for each moment; a hundredth are warnings."""
+    drawn = chance.random((len(stamps), 2)).tolist()
+    return [
+        serialized(
+            "rcl_interfaces/msg/Log",
+            stamp=time(stamp),
+            level=30 if warned < 0.01 else 20,
+            name="controller_server",
+            msg=f"{_LOG[int(which * len(_LOG))]} (control cost {which:.6f})",
+            file="controller.cpp",
+            function="computeControl",
+            line=421,
+        )
+        for (which, warned), stamp in zip(drawn, stamps.tolist(), strict=True)
+    ]
+
+
+@cache
+def _text(words: str) -> bytes:
+    return serialized("std_msgs/msg/String", data=words)
 
 
 @cache

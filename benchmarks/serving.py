@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Self
 
 from benchmarks import ours
@@ -18,7 +19,6 @@ from benchmarks.report import Figure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
     from types import TracebackType
 
 _MAX_MB: Final = 200.0
@@ -80,6 +80,12 @@ class Served:
     def resident_mb(self, field: str) -> float:
         """Its resident memory, see `footprint.resident_mb`."""
         return resident_mb(field, str(self._process.pid))
+
+    def processor_s(self) -> float:
+        """The processor time that it has used, in seconds."""
+        stat = Path(f"/proc/{self._process.pid}/stat").read_text(encoding="ascii")
+        user, system = stat.rpartition(")")[2].split()[11:13]
+        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
     def _request(self, method: str, params: Mapping[str, object]) -> dict[str, object]:
         self._asked += 1

@@ -7,7 +7,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
-from benchmarks import ours, report
+from benchmarks import one_robot, ours, report
 from benchmarks.__main__ import main, measured
 from benchmarks.bags import MESSAGES_OF_A_SPLIT, ODOM, TOPICS, made
 from benchmarks.copies import copied
@@ -171,3 +171,12 @@ def test_the_substring_search_goes_through_what_the_digests_hold(history: Histor
     label = next(word for word in week.text.split() if word.isalpha())
     assert week.text.count(f"{label}\n") >= 3
     assert NEVER_SEEN not in week.text
+
+
+def test_what_one_robots_user_asks_is_answered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["--bags", "1", "--topics", "10", "--only", "level", "--dir", str(tmp_path)]
+    assert one_robot.main(asked) == 0
+    rows = [row for row in capsys.readouterr().out.splitlines() if row.startswith("| log")]
+    assert ["error" in row for row in rows] == [False]
