@@ -97,13 +97,13 @@ def calls(days: int) -> list[Asked]:
     yesterday: dict[str, JsonValue] = {"start": max(end - 2 * DAY, start), "end": end - DAY}
     rectangle: JsonValue = {"x": [7, 12], "y": [5, 9]}
     circle: JsonValue = {"x": 6.0, "y": 8.3, "radius_m": 1.0}
-    off_dock = _condition(messages.DOCKED.topic, "equals", value=False)
+    off_dock = condition(messages.DOCKED.topic, "equals", value=False)
     docked: JsonValue = off_dock
-    seen = _condition(VISION.topic, "contains", "chair")
-    bumped = _condition(messages.BUMPER.topic, "equals", value=True)
-    low = {**_condition(messages.BATTERY.topic, "below", 0.3), "field": "percentage"}
-    logged = _condition("/rosout", "contains", "plan")
-    near = _condition(messages.ODOM.topic, "near_position", {"x": 3.2, "y": 1.6})
+    seen = condition(VISION.topic, "contains", "chair")
+    bumped = condition(messages.BUMPER.topic, "equals", value=True)
+    low = {**condition(messages.BATTERY.topic, "below", 0.3), "field": "percentage"}
+    logged = condition("/rosout", "contains", "plan")
+    near = condition(messages.ODOM.topic, "near_position", {"x": 3.2, "y": 1.6})
     compared: dict[str, JsonValue] = {
         **today,
         **{f"with_{name}": value for name, value in yesterday.items()},
@@ -175,7 +175,8 @@ def calls(days: int) -> list[Asked]:
     ]
 
 
-def _condition(topic: str, kind: str, value: JsonValue) -> dict[str, JsonValue]:
+def condition(topic: str, kind: str, value: JsonValue) -> dict[str, JsonValue]:
+    """Returns the arguments of a condition on a topic."""
     return {"topic": topic, "condition_type": kind, "value": value}
 
 

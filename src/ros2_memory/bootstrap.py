@@ -358,10 +358,13 @@ def shared_parts(settings: Settings) -> SharedParts:
     return SharedParts(build_reader(settings), schemas, extractor)
 
 
-def build_memory(settings: Settings, shared: SharedParts | None = None) -> Memory:
+def build_memory(
+    settings: Settings, shared: SharedParts | None = None, *, setting: str | None = None
+) -> Memory:
     """Returns the memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
 
-    `shared` is what it has in common with other memories; its own where None.
+    `shared` is what it has in common with other memories; its own where None. `setting` is the one
+    that the user named the bags in, where it is another than `recording.bag_dir`.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
@@ -370,6 +373,7 @@ def build_memory(settings: Settings, shared: SharedParts | None = None) -> Memor
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
     from ros2_memory.history.context import Memory
+    from ros2_memory.index.scan import BAG_DIR_SETTING
     from ros2_memory.recorder.index_manager import IndexManager
 
     clock = WallClock()
@@ -393,6 +397,7 @@ def build_memory(settings: Settings, shared: SharedParts | None = None) -> Memor
         include_active=settings.reader.include_active,
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
         only=settings.data.recording,
+        setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
     return Memory(index, reader, shared.extractor, clock, query_settings_of(settings), recall)
@@ -548,7 +553,6 @@ def build_dispatcher(
     fleet: Fleet | None = None,
 ) -> Dispatcher:
     """Returns what answers tool calls from a memory, or from those of a fleet's robots."""
-    from ros2_memory.fleet.tools import fleet_tools
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.replies import Replies
     from ros2_memory.tools.spec_tools import build_tools, readable_tools
@@ -560,6 +564,8 @@ def build_dispatcher(
         writing=server.write_tools,
     )
     if fleet is not None:
+        from ros2_memory.fleet.tools import fleet_tools
+
         tools = fleet_tools(tools, fleet, server.max_reply_chars)
     return Dispatcher(
         memory,

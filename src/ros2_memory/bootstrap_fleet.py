@@ -28,11 +28,11 @@ def build_fleet(settings: Settings) -> Fleet | None:
     Raises:
         ConfigError: other settings are not those of a fleet, or a robot's places are refused.
     """
-    from ros2_memory.fleet.robots import Fleet, Robot
-
     fleet = settings.fleet
     if not fleet.robots:
         return None
+    from ros2_memory.fleet.robots import Fleet, Robot
+
     _require_only_reading(settings)
     shared = shared_parts(settings)
     robots = []
@@ -62,7 +62,7 @@ def robot_settings(settings: Settings, name: str) -> Settings:
 
 
 def _memory_of(own: Settings, shared: SharedParts, *, has_places: bool) -> Memory:
-    memory = build_memory(own, shared)
+    memory = build_memory(own, shared, setting="fleet.robots")
     if has_places:
         return memory
     # `data.places_file` is about some other map.

@@ -40,6 +40,7 @@ DELETING: Final = {
 RECORDING: Final = {
     f"ros2_memory.{room}" for room in ("recorder.ros2bag", "recorder.supervisor", "retention.clear")
 }
+FLEET: Final = {"ros2_memory.fleet"}
 PEOPLE: Final = {"pyarrow", "ros2_memory.cli", "ros2_memory.demo", "typer"}
 
 
@@ -92,7 +93,10 @@ def test_a_command_imports_what_it_needs(env: dict[str, str]) -> None:
         ("index",): SERVING | DELETING | RECORDING,
         ("topics",): SERVING | DELETING | RECORDING,
         ("info",): SERVING | DELETING | RECORDING,
-        ("ask", "get_position_seconds_ago", "seconds_ago=0"): SERVING | DELETING | RECORDING,
+        ("ask", "get_position_seconds_ago", "seconds_ago=0"): SERVING
+        | DELETING
+        | RECORDING
+        | FLEET,
         ("forget", "--last", "100", "--dry-run"): SERVING | RECORDING,
     }
     for (words, absent), there in zip(without.items(), of_commands([*without], env), strict=True):
@@ -123,16 +127,18 @@ def test_the_server_imports_nothing_that_records_deletes_or_is_for_people(
     env: dict[str, str],
 ) -> None:
     program = (
-        "from ros2_memory import bootstrap, config, server\n"
+        "from ros2_memory import bootstrap, bootstrap_fleet, config, server\n"
         "settings = config.load_settings()\n"
         "memory = bootstrap.build_memory(settings)\n"
+        "assert bootstrap_fleet.build_fleet(settings) is None\n"
         "bootstrap.build_server(settings, memory, bootstrap.build_telemetry(settings, memory))\n"
         "bootstrap.build_backfill(settings, memory)\n"
         "seen()\n"
     )
     ((*there,),) = imported(program, env)
     observing = {"opentelemetry.sdk", "prometheus_client", "ros2_memory.observability.prometheus"}
-    assert (DELETING | RECORDING | PEOPLE | observing | {"httpx", "jsonschema"}) & {*there} == set()
+    absent = DELETING | RECORDING | PEOPLE | FLEET | observing | {"httpx", "jsonschema"}
+    assert absent & {*there} == set()
 
 
 def test_what_tests_start_need_not_compile_what_it_imports() -> None:

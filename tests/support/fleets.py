@@ -85,7 +85,7 @@ def write_robot(robot: SeededRobot, bag_dir: Path) -> Path:
 
 def fleet_memory(bag_dir: Path, limits: QuerySettings | None = None) -> Memory:
     """A robot's memory, asked at `NOW`."""
-    return memory_of(bag_dir, clock=FixedClock(NOW), limits=limits)
+    return memory_of(bag_dir, clock=FixedClock(NOW), limits=limits, setting="fleet.robots")
 
 
 def fleet_over(folder: Path, names: tuple[str, ...], *, shared_map: bool = False) -> Fleet:

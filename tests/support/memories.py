@@ -22,6 +22,7 @@ from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
+from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import map_settings
 from ros2_memory.recorder.index_manager import IndexManager
@@ -58,8 +59,9 @@ def memory_of(
     reader: BagReader | None = None,
     limits: QuerySettings | None = None,
     include_active: bool = False,
+    setting: str = BAG_DIR_SETTING,
 ) -> Memory:
-    """The memory over `bag_dir`, rescanned at every question.
+    """The memory over `bag_dir`, which `setting` names, rescanned at every question.
 
     Unless a clock is given it is later by an hour, and than all that tests write: what is
     unfinished was left so by a crash, and nothing is dated in the future.
@@ -74,6 +76,7 @@ def memory_of(
         refresh_s=0.0,
         split_duration_s=10.0,
         include_active=include_active,
+        setting=setting,
     )
     return Memory(index, reader, extractor(), timed, limits or QuerySettings())
 

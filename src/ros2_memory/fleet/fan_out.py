@@ -24,9 +24,9 @@ T = TypeVar("T")
 AT_ONCE: Final = 4
 """Robots that are asked at once: most of it is Python, which runs one thread at a time."""
 _OF_ONE: Final = 0.4
-"""The part of the time of a call that one robot may take."""
+"""The part of the time of a call that one robot of several may take."""
 _OF_ALL: Final = 0.9
-"""The part that all may take together; the rest is for merging what they answer."""
+"""The part that all may take together, or one alone; the rest is for merging the answers."""
 _GRACE: Final = 0.05
 """How much later than its limit a robot counts as stuck: a disk that hangs heeds no limit."""
 
@@ -48,7 +48,7 @@ class FanOut:
     ) -> Mapping[str, T | EpisodicError]:
         """Returns, by robot and in their order, what `work` returned, or the error why not.
 
-        Every robot is in it. Takes 0.9 of the time that is left of the call, at most.
+        Every robot is in it. Takes 0.95 of the time that is left of the call, at most.
         """
         return _Round(self._at_once, self._stuck, robots, work, call).results()
 
@@ -70,7 +70,7 @@ class _Round(Generic[T]):
         self._work = work
         self._call = call
         left_s = call.deadline.left_s()
-        self._limit_s = left_s * _OF_ONE
+        self._limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
         self._grace_s = left_s * _GRACE
         self._end_s = time.monotonic() + left_s * _OF_ALL
         self._changed = threading.Condition()
@@ -135,7 +135,7 @@ class _Round(Generic[T]):
             daemon=True,
         )
         thread.start()
-        running[robot.name] = thread, min(now_s + limit_s + self._grace_s, self._end_s)
+        running[robot.name] = thread, now_s + limit_s + self._grace_s
 
     def _run(self, robot: Robot, call: Call) -> None:
         done: T | EpisodicError
@@ -152,6 +152,5 @@ class _Round(Generic[T]):
             self._changed.notify()
 
     def _too_slow(self) -> QueryTimeoutError:
-        return QueryTimeoutError(
-            f"no answer in {self._limit_s:.3g} s; ask about it alone, or about a shorter window"
-        )
+        do = "ask about it alone, or about" if len(self._robots) > 1 else "ask about"
+        return QueryTimeoutError(f"no answer in {self._limit_s:.3g} s; {do} a shorter window")

@@ -106,10 +106,27 @@ class _FleetQuestions:
         question = self.tool.question(own)
         name = given.get(ROBOT)
         if name is not None:
-            return lambda _, call: _of_one(self.fleet.named(name, call), question, call)
+            return lambda _, call: self._of_one(self.fleet.named(name, call), question, call)
         if self.tool.name not in ANSWER_FOR_ALL:
-            return lambda _, call: _of_one(self.fleet.the_one(self.tool.name, call), question, call)
+            return lambda _, call: self._of_one(
+                self.fleet.the_one(self.tool.name, call), question, call
+            )
         return lambda _, call: self._of_all(question, own, call)
+
+    def _of_one(self, robot: Robot, question: Question, call: Call) -> OfRobot:
+        """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
+
+        Raises:
+            EpisodicError: it has none.
+        """
+
+        def ask(_: Robot, own: Call) -> OneAnswer:
+            return _single(question(robot.memory(), own))
+
+        answer = self.fan_out.ask([robot], ask, call)[robot.name]
+        if isinstance(answer, EpisodicError):
+            raise answer
+        return OfRobot(robot.name, robot.bag_dir, answer)
 
     def _of_all(self, question: Question, given: Mapping[str, object], call: Call) -> OfFleet:
         robots = self.fleet.allowed(call)
@@ -149,9 +166,7 @@ class _FleetQuestions:
         snapshot = memory.index.snapshot()
         if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
             # "Never" would be a claim about bags that were not searched.
-            raise RefusedError(
-                snapshot.problem.replace("recording.bag_dir (MEMORY_BAG_DIR)", "fleet.robots")
-            )
+            raise RefusedError(snapshot.problem)
         answer = question(replace(memory, clock=now), call)
         value = as_json(_single(answer), robot.bag_dir)
         latest = snapshot.latest
@@ -166,10 +181,6 @@ class _FleetQuestions:
         schema = properties.get("limit") if isinstance(properties, dict) else None
         default = schema.get("default") if isinstance(schema, dict) else None
         return default if isinstance(default, int) else None
-
-
-def _of_one(robot: Robot, question: Question, call: Call) -> OfRobot:
-    return OfRobot(robot.name, robot.bag_dir, _single(question(robot.memory(), call)))
 
 
 def _single(answer: Answer) -> OneAnswer:

@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import FileNotes, FileState, classify
-from ros2_memory.index.scan import YOUNG_NS, ScanResult, Tree
+from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.index.unchanged_bags import KINDS, UnchangedBags
@@ -80,6 +80,7 @@ class BagTable:
             they are unchanged.
         only: the name of the one recording that counts; see `scan.Tree`.
         packs: whether the summaries of bags that will not change are packed.
+        setting: the one that names the directory, for sentences.
     """
 
     def __init__(
@@ -90,11 +91,12 @@ class BagTable:
         known: Callable[[], Mapping[str, BagFile]] | None,
         only: str | None = None,
         packs: bool = False,
+        setting: str = BAG_DIR_SETTING,
     ) -> None:
         self._packs = packs
         self._reader = reader
         self._known = known
-        self._tree = Tree(bag_dir, only)
+        self._tree = Tree(bag_dir, only, setting=setting)
         self._unchanged = UnchangedBags()
         self._files: dict[str, FileNotes] = {}
         self._links = HardLinks(bag_dir)

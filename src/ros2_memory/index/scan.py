@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a young one proves nothing."""
 
+BAG_DIR_SETTING: Final = "recording.bag_dir (MEMORY_BAG_DIR)"
+"""The setting that names the bag directory, unless another one does."""
+
 LOST_AND_FOUND: Final = "lost+found"
 """A folder in the root of every ext4 file system, which only root may open."""
 
@@ -139,10 +142,14 @@ class Tree:
         root: the directory.
         only: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
             and its like): nothing else is found then.
+        setting: the one that names the root, for sentences.
     """
 
-    def __init__(self, root: Path, only: str | None = None) -> None:
+    def __init__(
+        self, root: Path, only: str | None = None, *, setting: str = BAG_DIR_SETTING
+    ) -> None:
         self._root = str(root)
+        self._setting = setting
         self._only = None if only is None else f"{self._root.rstrip('/')}/{only.strip('/')}"
         self._named = None if only is None else paths_named(self._root, only)
         self._folders: dict[str, _Folder] = {}
@@ -161,8 +168,8 @@ class Tree:
         fault = self._descend(before, now, result)
         if fault is not None and not _is_gone(fault) and before:
             self._folders = before
-            return ScanResult(problem=_problem(fault))
-        problem = self._unmounted() if fault is None else _problem(fault)
+            return ScanResult(problem=self._problem(fault))
+        problem = self._unmounted() if fault is None else self._problem(fault)
         if problem is None and not self._has_named():
             problem = f"no bag is named {self._only} (data.recording)"
         if problem is not None:
@@ -222,6 +229,14 @@ class Tree:
         if any(folder.files for folder in self._folders.values()):
             self._device = device
         return None if self._device in {None, device} else _OTHER_DISK
+
+    def _problem(self, error: OSError) -> str:
+        """Returns a sentence on a bag directory that cannot be listed."""
+        if isinstance(error, FileNotFoundError):
+            return f"the bag directory does not exist (yet): check {self._setting}"
+        if isinstance(error, NotADirectoryError):
+            return f"the bag directory is a file, not a directory: correct {self._setting}"
+        return f"the bag directory cannot be read: {error.strerror or error}"
 
     def _has_named(self) -> bool:
         folders = self._folders.values()
@@ -385,12 +400,3 @@ def _is_folder(link: Path) -> bool:
         return link.is_dir()
     except OSError:
         return True
-
-
-def _problem(error: OSError) -> str:
-    """Returns a sentence on a bag directory that cannot be listed."""
-    if isinstance(error, FileNotFoundError):
-        return "the bag directory does not exist (yet): check recording.bag_dir (MEMORY_BAG_DIR)"
-    if isinstance(error, NotADirectoryError):
-        return "the bag directory is a file, not a directory: correct recording.bag_dir"
-    return f"the bag directory cannot be read: {error.strerror or error}"

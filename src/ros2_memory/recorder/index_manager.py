@@ -22,6 +22,7 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import ms_from_ns, ns_from_unix
 from ros2_memory.index.bag_table import BagTable
 from ros2_memory.index.file_state import ScanContext
+from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.retention.collect import Collected
 from ros2_memory.retention.foreign import ForeignBags
@@ -63,6 +64,7 @@ class IndexManager:
         trusts_mtime: whether a young file without an end is being written; else it may be a copy,
             and its content decides.
         only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
+        setting: the one that names the bag directory, for sentences.
 
     Attributes:
         bag_dir: the bag directory.
@@ -82,7 +84,9 @@ class IndexManager:
         include_active: bool = False,
         trusts_mtime: bool = True,
         only: str | None = None,
+        setting: str = BAG_DIR_SETTING,
     ) -> None:
+        self._setting = setting
         self._trusts_mtime = trusts_mtime
         self._only = only
         self.bag_dir = bag_dir
@@ -162,7 +166,14 @@ class IndexManager:
     def _new_table(self) -> BagTable:
         # Who deletes bags looks at few of them; who answers looks at all of them.
         packs = self._collector is not None
-        return BagTable(self.bag_dir, self._reader, known=self._known, only=self._only, packs=packs)
+        return BagTable(
+            self.bag_dir,
+            self._reader,
+            known=self._known,
+            only=self._only,
+            packs=packs,
+            setting=self._setting,
+        )
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         with _gc_paused() if self.published is None else nullcontext():

@@ -108,6 +108,21 @@ def test_as_many_as_are_asked_at_once_may_hang_and_the_rest_still_answers(
     assert [each for each in found.values() if isinstance(each, str)] == ["fine", "fine"]
 
 
+def test_one_alone_may_take_most_of_the_time_and_is_not_told_to_be_asked_alone(
+    released: threading.Event,
+) -> None:
+    limits: list[float] = []
+
+    def hangs(_robot: Robot, call: Call) -> None:
+        limits.append(call.deadline.left_s())
+        released.wait()
+
+    error = FanOut().ask(robots(1), hangs, Call(Deadline.after(0.5)))["r0"]
+    assert isinstance(error, QueryTimeoutError)
+    assert "alone" not in str(error)
+    assert 0.4 < limits[0] <= 0.45
+
+
 def test_a_robot_is_told_when_its_time_is_up() -> None:
     def heeds(_robot: Robot, call: Call) -> str:
         while not call.deadline.expired():

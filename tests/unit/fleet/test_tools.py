@@ -6,14 +6,21 @@ The oracle is a server of each robot alone.
 from __future__ import annotations
 
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.errors import (
+    BusyError,
+    EpisodicError,
+    InvalidArgumentsError,
+    QueryTimeoutError,
+)
 from ros2_memory.core.regions import Circle, Place
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
@@ -35,6 +42,8 @@ from tests.support.memories import asked
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from ros2_memory.history.context import Memory
 
 NAMES = ("r1", "r2", "r3")
 MOST_CHARS = 10**6
@@ -261,6 +270,30 @@ class TestTrouble:
             "no answer of away: the bag directory does not exist (yet): check fleet.robots"
         ]
         assert str(tmp_path) not in json.dumps(found)
+        status = reply(Fleet(robots, FixedClock(NOW)), "memory_status", {"robot": "away"})
+        assert "check fleet.robots" in status["trust"]
+
+    def test_one_that_hangs_blocks_one_thread_however_often_it_is_asked(self, folder: Path) -> None:
+        released = threading.Event()
+
+        def hangs() -> Memory:
+            released.wait()
+            return fleet_memory(folder / "r1")
+
+        fleet = Fleet([Robot("r1", folder / "r1", hangs)], FixedClock(NOW))
+        tools = fleet_tools(build_tools(QuerySettings()), fleet, MOST_CHARS)
+        (tool,) = (each for each in tools if each.name == "list_frames")
+        asked: Any = tool.question({"robot": "r1"})
+        with pytest.raises(QueryTimeoutError):
+            asked(None, Call(Deadline.after(0.2)))
+        for _ in range(3):
+            with pytest.raises(BusyError):
+                asked(None, Call(Deadline.after(0.2)))
+        stuck = [each for each in threading.enumerate() if each.name == "robot-r1"]
+        assert len(stuck) == 1
+        released.set()
+        stuck[0].join()
+        assert asked(None, Call())
 
     def test_where_nobody_has_data_the_reason_is_that_of_all(self, folder: Path) -> None:
         found = reply(fleet_over(folder, NAMES), "find_matches", LAST | {"topic": "/none"})

@@ -225,9 +225,11 @@ def test_a_root_that_is_no_directory_is_a_problem_and_empties_the_tree(
     scanned = tree.scan(NOW, [str(path)])
     assert scanned.gone == {str(path)}
     assert scanned.stamps == {}
-    assert ("does not exist" if kind == "missing" else "recording.bag_dir") in (
-        scanned.problem or ""
-    )
+    words = "does not exist (yet): check" if kind == "missing" else "is a file, not a directory"
+    assert words in (scanned.problem or "")
+    assert (scanned.problem or "").endswith("recording.bag_dir (MEMORY_BAG_DIR)")
+    named = Tree(bags, setting="fleet.robots").scan(NOW, ()).problem or ""
+    assert named.endswith(" fleet.robots")
     bags.unlink(missing_ok=True)
     (tmp_path / "aside").rename(bags)
     assert _names(tree.scan(NOW, ())) == ["a.mcap"]
