@@ -12,12 +12,11 @@ from unittest.mock import patch
 
 import pytest
 import structlog
-from coverage import Coverage
 from hydra import compose
 from hypothesis import settings
 from xdist.remote import Producer
 
-from tests.support.measured import is_measured, untraced
+from tests.support.measured import is_measured, nothing_measured, untraced
 from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
 
@@ -63,14 +62,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Measures no coverage in some tests and their fixtures."""
-    measuring = Coverage.current()
-    if measuring is None or is_measured(item):
+    if is_measured(item):
         return (yield)
-    measuring.stop()
-    try:
+    with nothing_measured():
         return (yield)
-    finally:
-        measuring.start()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

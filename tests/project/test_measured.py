@@ -6,8 +6,9 @@ import sys
 from pathlib import PurePath
 
 import pytest
+from coverage import Coverage
 
-from tests.support.measured import UNMEASURED, is_measured, untraced
+from tests.support.measured import UNMEASURED, is_measured, nothing_measured, untraced
 from tests.support.workers import TESTS
 
 
@@ -27,7 +28,29 @@ def test_whatever_is_not_measured_is_there() -> None:
 def test_of_several_examples_the_first_is_measured(
     request: pytest.FixtureRequest, one: int, other: str
 ) -> None:
-    assert is_measured(request.node) == ((one, other) == (1, "a"))
+    measured = (one, other) == (1, "a")
+    assert is_measured(request.node) == measured
+    if not measured:
+        assert Coverage.current() is None
+        assert "coverage" not in type(sys.gettrace()).__module__
+
+
+def test_every_measurement_that_runs_is_stopped_and_goes_on() -> None:
+    before = Coverage.current()
+    outer, inner = (Coverage(data_file=None) for _ in range(2))
+    outer.start()
+    inner.start()
+    try:
+        tracing = sys.gettrace()
+        with nothing_measured():
+            assert Coverage.current() is None
+            assert sys.gettrace() is None
+        assert Coverage.current() is inner
+        assert type(sys.gettrace()) is type(tracing)
+    finally:
+        inner.stop()
+        outer.stop()
+    assert Coverage.current() is before
 
 
 def test_what_is_run_untraced_leaves_the_tracing_as_it_was() -> None:
