@@ -16,6 +16,7 @@ from hydra import compose
 from hypothesis import settings
 from xdist.remote import Producer
 
+from tests.support.examples import examples
 from tests.support.measured import is_measured, nothing_measured, untraced
 from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.typestore import MessageType
 
 # A loaded machine is slow, not wrong.
-settings.register_profile("steady", deadline=None)
+settings.register_profile("steady", deadline=None, max_examples=examples(100))
 settings.load_profile("steady")
 
 # Also for the programs that tests start: nothing is to be left in the user's own.

@@ -6,7 +6,6 @@ EPISODIC_LONG=1 tries a hundred times as many; so does `python -m tests.fuzz`, w
 from __future__ import annotations
 
 import asyncio
-import os
 import random
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,14 +18,15 @@ from tests.fuzz.good import goods, sqlites
 from tests.fuzz.holding import hold, truth_of
 from tests.fuzz.mutant import mutant_of
 from tests.fuzz.trial import World
+from tests.support.examples import LONG
 
 if TYPE_CHECKING:
     from tests.fuzz.oracle import Readable
 
 SEED: Final = 1
-LONG: Final = 100 if os.environ.get("EPISODIC_LONG") == "1" else 1
-OF_EACH: Final = 3 * LONG
-OF_INDEXES: Final = 12 * LONG
+TIMES: Final = 100 if LONG else 1
+OF_EACH: Final = 3 * TIMES
+OF_INDEXES: Final = 12 * TIMES
 _INDEXES: Final = ("message_indexes", "chunk_indexes", "statistics", "sqlite_indexes")
 _NAMES: Final = [*CLASSES]
 _THIRDS: Final = [_NAMES[third::3] for third in range(3)]

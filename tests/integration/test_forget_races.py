@@ -25,6 +25,7 @@ from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state.request_queue import PendingRequest
 from ros2_memory.core.directories import identity_of
 from tests.support.bags import odom, write_mcap
+from tests.support.examples import LONG
 from tests.support.housekeepers import size_of
 from tests.support.memories import ROOT
 from tests.support.processes import until
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state.request_queue import Outcome
 
 S = 10**9
-ROUNDS = 24 if os.environ.get("EPISODIC_LONG") == "1" else 8
+ROUNDS = 24 if LONG else 8
 SPLITS = 12
 T0 = time.time_ns() // S * S - 3600 * S
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from tests.support.examples import LONG
 from tests.support.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
 from tests.support.ros_processes import real_or_double
 from tests.timing import Watch, driven
@@ -22,7 +23,7 @@ from tests.timing import Watch, driven
 if TYPE_CHECKING:
     from pathlib import Path
 
-KILLS: Final = 50 if os.environ.get("EPISODIC_LONG") == "1" else 10
+KILLS: Final = 50 if LONG else 10
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
 CHUNK_BYTES: Final = 16384  # recorder.chunk_bytes
 PROMISED_S: Final = 2.0

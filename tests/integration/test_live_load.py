@@ -22,6 +22,7 @@ from ros2_memory.bag_dir.state.lost_file import read_losses
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_recorder_reception import publishing
+from tests.support.examples import LONG
 from tests.support.live_recorder import NS_PER_S, bag_files, machine
 from tests.support.ros_processes import ros_environment, wait_for
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from tests.support.live_recorder import LiveRecorder, Machine
     from tests.support.real_recorder import RealRecorder
 
-LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
 LOAD_S: Final = 3600 if LONG else 8
 LOAD: Final = [f"/sensor_{number}" for number in range(10 if LONG else 3)]
 HZ: Final = 200 if LONG else 50

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import pytest
 
+from tests.support.examples import LONG
 from tests.support.live_recorder import NS_PER_S, await_moment, bag_files, machine, ticks
 from tests.support.ros_processes import (
     RECORDERS,
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from tests.support.live_recorder import LiveRecorder
 
-ROTATIONS: Final = 100 if os.environ.get("EPISODIC_LONG") == "1" else 3
+ROTATIONS: Final = 100 if LONG else 3
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "13"))
 HZ: Final = 50.0
 LONGEST_STALL_S: Final = 1.0

@@ -30,6 +30,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.examples import LONG
 from tests.support.housekeepers import keeper_of, own_all, size_of
 from tests.support.live_recorder import answer
 from tests.support.memories import memory_of
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-SPLITS: Final = 200 if os.environ.get("EPISODIC_LONG") == "1" else 30
+SPLITS: Final = 200 if LONG else 30
 KEPT_SPLITS: Final = 6
 SLACK: Final = 8192
 """Bytes of the heartbeat, of metadata and of carried messages that are about to be counted."""

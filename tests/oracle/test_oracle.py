@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +10,7 @@ import pytest
 from tests.oracle.exam import Server, examine
 from tests.oracle.truth import History
 from tests.oracle.worlds import WORLDS, World
+from tests.support.examples import LONG
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.xdist_group("heavy")
 
-LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
 QUESTIONS: Final = 2000 if LONG else 50
 SEEDS: Final = range(5) if LONG else range(1)
 

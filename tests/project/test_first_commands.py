@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from tests.support.examples import LONG
 from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
 pytestmark = pytest.mark.skipif(
-    os.environ.get("EPISODIC_LONG") != "1",
+    not LONG,
     reason="installs from the network, for a minute: EPISODIC_LONG=1",
 )
 FIRST: Final = re.search(

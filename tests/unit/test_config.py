@@ -16,6 +16,7 @@ from ros2_memory.config import NullRecorderNode, Settings, load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.recorder.base import NullRecorder
 from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, refusal
+from tests.support.examples import examples
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
     codec="utf-8", exclude_characters="\0"
@@ -153,7 +154,7 @@ class TestEnvironment:
         wanted = Path(value) if expected is None else expected
         assert getattr(getattr(settings, section), key) == wanted
 
-    @settings(max_examples=30)  # each composes the whole configuration
+    @settings(max_examples=examples(30))  # each composes the whole configuration
     @given(st.text(PATH_CHARACTERS, min_size=1))
     def test_any_path_arrives_as_it_was_written(self, name: str) -> None:
         if "${" in name:

@@ -28,6 +28,7 @@ from ros2_memory.history.view import View
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import MapDigests, map_settings
 from tests.support.bags import odom, tf, transform, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import extractor, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
@@ -126,7 +127,7 @@ def test_an_entry_made_with_other_static_transforms_is_not_used(tmp_path: Path) 
     assert maps.made(first).track.x.tolist()[0] == 5.0
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 10_000))
 def test_the_digest_is_the_same_in_the_catalogue_and_from_the_bag(seed: int) -> None:
     with TemporaryDirectory() as folder:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from dataclasses import replace
 from functools import partial
@@ -27,6 +26,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.serving.backfill import store_joined
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
+from tests.support.examples import LONG, examples
 from tests.support.memories import memory_of, recalling
 from tests.support.random_histories import S, write_history
 
@@ -78,7 +78,7 @@ CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
     ("near_position", {"x": 80, "y": 0.5, "z": 1.0}),
 )
 
-EXAMPLES = 200 if os.environ.get("EPISODIC_LONG") == "1" else 20
+EXAMPLES = 200 if LONG else 10
 """Histories for each clock, others in every run; some hundred questions are asked of each."""
 
 FIELDS = ("goal", "detections.label", "position", "value", "data", "nowhere")
@@ -251,7 +251,7 @@ def test_what_is_stored_of_many_bags_changes_no_answer(
                 assert answer(recalled, ask) == answer(plain, ask), (seed, size, span)
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32))
 def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed: int) -> None:
     draw = random.Random(seed)

@@ -21,6 +21,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.random_histories import write_history
 
@@ -223,7 +224,7 @@ def test_bags_without_a_digest_are_read_for_seconds_only(
     assert f"only what is after {BEGIN // S + 19}.000001 is counted" in answer.notes[0]
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), by=st.sampled_from(BYS), part=st.sampled_from([0.5, 1.0]))
 def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> None:
     with TemporaryDirectory() as folder:
@@ -308,7 +309,7 @@ def test_bags_that_cannot_have_a_label_are_not_read(
                 assert count_matches(known, Call(), OBJECTS, "contains", label, by="day") == answer
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(20), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     labels=st.lists(st.sets(st.sampled_from(["cat", "cattle", "dog"])), min_size=2, max_size=8),
     busy=st.integers(0, 255),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call
 from ros2_memory.places.visits import visits
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
@@ -139,7 +140,7 @@ def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path)
     assert "no place is named" in none["detail"]
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(15), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 10_000),
     part=st.sampled_from([0.4, 1.0]),

@@ -19,6 +19,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, log_entry, odom, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
@@ -105,7 +106,9 @@ def in_groups(memory: Memory, window: TimeWindow) -> list[int]:
 
 
 @settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=examples(12),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 0.5, 1.0]), stamped=st.booleans())
 @example(seed=3, part=1.0, stamped=True)
@@ -155,7 +158,7 @@ QUESTIONS: tuple[Callable[[Memory, Path], object], ...] = (
 )
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=examples(8), deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_questions_get_equal_answers_with_and_without_the_catalogue(seed: int) -> None:
     with TemporaryDirectory() as folder:

@@ -18,6 +18,7 @@ from ros2_memory.history.view import View
 from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
@@ -221,7 +222,9 @@ def takeovers(draw: st.DrawFn) -> tuple[list[list[Msg]], list[int]]:
 
 
 @settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=examples(60),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(takeovers())
 def test_every_message_counts_exactly_once_however_recordings_overlap(

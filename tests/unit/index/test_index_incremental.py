@@ -22,6 +22,7 @@ from ros2_memory.bag_dir.heartbeat import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Clock
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.support.examples import examples
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ class World:
                 os.utime(folder, ns=(self.clock.at,) * 2)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(script=st.lists(steps, max_size=40))
 def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
     script: list[tuple[str, str, int]],

@@ -17,6 +17,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import data_time_range, topic_range
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import memory_of
 
 S: Final = 10**9
@@ -67,7 +68,7 @@ def test_topics_that_were_written_one_after_another_are_no_sign_of_it(
     assert set_back(tmp_path / "a.mcap", messages, layout) == 0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(
     times=st.lists(st.integers(0, 100), min_size=1, max_size=30),
     name=st.sampled_from(list(LAYOUTS)),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import NoDataReason
 from ros2_memory.tools.arguments import MOST_TIMES
 from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling, replied
 from tests.support.random_histories import write_history
 
@@ -128,7 +129,7 @@ def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
     assert "notes" not in alone
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), data=st.data())
 def test_in_odd_histories_each_is_answered_as_alone_with_and_without_the_catalogue(
     seed: int, data: st.DataObject

@@ -19,6 +19,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
 from tests.support.bags import Msg, goals, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import memory_of, recalling, replied
 
 S = 10**9
@@ -177,7 +178,7 @@ def test_a_reply_has_a_row_for_each_goal_and_counts_them_by_day(tmp_path: Path) 
 ENDS = st.sampled_from([4, 5, 6])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9), ENDS), min_size=1, max_size=4),
     st.integers(1, 5),

@@ -43,6 +43,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import write_moving_map
 from tests.support.random_histories import write_history
@@ -248,7 +249,7 @@ def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
     assert sum(parts) == over(memory, 0, 18).stood == 18 * S
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     legs=st.lists(
         st.tuples(st.floats(2.9, 4.1) | st.floats(4.1, 12.0), st.floats(1.0, 4.0)),
@@ -566,7 +567,7 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     assert set(json.loads(reply)["events"][0]) == keys
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
 def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
     draw = random.Random(seed)
@@ -712,7 +713,7 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 10_000),
     part=st.sampled_from([0.3, 1.0]),

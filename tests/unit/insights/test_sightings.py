@@ -32,6 +32,7 @@ from ros2_memory.tools.replies import Replies
 from tests.support.bags import boolean, detections, odom, text, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
@@ -405,7 +406,7 @@ ASKED: tuple[tuple[str, str, JsonValue], ...] = (
 )
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(40), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.0, 0.5, 1.0]))
 def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
     seed: int, part: float

@@ -21,6 +21,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
@@ -130,7 +131,7 @@ def test_the_metres_of_a_stop_are_none_and_speeds_are_those_inside(tmp_path: Pat
     assert between(9, 12) == pytest.approx((2.98, 1.0), abs=0.05)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 10_000), part=st.sampled_from([0.3, 1.0]), moving=st.booleans())
 def test_what_was_driven_inside_is_the_same_whatever_the_catalogue_knows(
     seed: int, part: float, moving: bool

@@ -17,6 +17,7 @@ from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
+from tests.support.examples import examples
 from tests.support.memories import memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
@@ -164,7 +165,7 @@ def answer(memory: Memory, given: dict[str, Any]) -> str:
         return replies.error(error).text
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(15), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 10_000),
     part=st.sampled_from([0.3, 1.0]),

@@ -22,6 +22,7 @@ from ros2_memory.places.scope import WhileCondition
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import position
 from tests.support.bags import Msg, boolean, odom, text, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
@@ -154,7 +155,7 @@ def test_what_is_no_condition_is_refused(tmp_path: Path, condition: object, reas
     assert reason in reply["detail"]
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 10_000), part=st.sampled_from([0.3, 1.0]), moving=st.booleans())
 def test_scopes_are_the_same_whatever_the_catalogue_knows(
     seed: int, part: float, moving: bool

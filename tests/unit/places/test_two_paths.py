@@ -19,6 +19,7 @@ from ros2_memory.places.two_paths import (
     placed_standstills,
     stood_at,
 )
+from tests.support.examples import examples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,7 +54,7 @@ ways = st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=1, max_s
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(ways, ways)
 @example([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)])
 @example([(0.0, 0.0, 0.0), (5.0, 3.0, 0.0)], [(0.0, 1.0, 1.0), (5.0, 1.0, -3.0)])
@@ -129,7 +130,7 @@ stands = st.lists(
 )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(stands, stands)
 def test_every_standstill_is_of_one_place_and_near_to_it(
     one: list[PlacedStandstill], two: list[PlacedStandstill]

@@ -32,6 +32,7 @@ from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
@@ -298,7 +299,7 @@ def test_a_robot_that_passes_over_a_place_was_no_farther_than_its_nearest_pose(
     assert visit.closest_at == BEGIN + 10 * S
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
@@ -361,7 +362,7 @@ def test_total_is_what_was_counted_where_the_time_is_over(tmp_path: Path) -> Non
     assert len(totals) > 1
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
 def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
     draw = random.Random(seed)

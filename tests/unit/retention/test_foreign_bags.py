@@ -25,6 +25,7 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.examples import examples
 from tests.support.housekeepers import (
     NOW,
     PLENTY,
@@ -171,7 +172,7 @@ class TestRetention:
         house.apply()
         assert not (bags / A).exists()
 
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=examples(25), deadline=None)
     @given(
         ours=st.lists(st.booleans(), min_size=1, max_size=6),
         budget=st.integers(1, 60_000),

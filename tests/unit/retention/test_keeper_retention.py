@@ -15,6 +15,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.examples import examples
 from tests.support.housekeepers import (
     NOW,
     PLENTY,
@@ -180,7 +181,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(steps=STEPS, budget=st.integers(3, 9), share=st.integers(0, 5))
 def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
     tmp_path_factory: pytest.TempPathFactory,

@@ -21,6 +21,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Channel, Closing, Record, Schema
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
+from tests.support.examples import examples
 from tests.support.reader_cases import ALL, FILES, Shelf
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ _windows = st.tuples(st.integers(-1, 14), st.integers(-1, 14)).map(lambda ends: 
 
 
 @on_every_shelf
-@settings(max_examples=30)
+@settings(max_examples=examples(30))
 @given(messages=_messages(), topics=_some_topics, window=_windows)
 def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
     shelf: Shelf, messages: list[Msg], topics: set[str], window: TimeWindow
@@ -110,7 +111,7 @@ def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
 
 
 @on_every_shelf
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(messages=_messages(), window=_windows)
 def test_log_times_are_those_of_the_records(
     shelf: Shelf, messages: list[Msg], window: TimeWindow
@@ -123,7 +124,7 @@ def test_log_times_are_those_of_the_records(
 
 
 @on_every_shelf
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 @given(messages=_messages())
 def test_a_summary_counts_what_the_messages_say(shelf: Shelf, messages: list[Msg]) -> None:
     with tempfile.TemporaryDirectory() as folder:

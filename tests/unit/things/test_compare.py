@@ -26,6 +26,7 @@ from ros2_memory.results import (
 from ros2_memory.tools.reply_json import render
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import log_entry
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling, replied
 from tests.unit.things.test_find import (
     AWAY,
@@ -357,7 +358,9 @@ def test_numbers_differ_by_a_tenth_and_by_more_than_noise(
 
 
 @settings(
-    max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=examples(10),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
     seed=st.integers(0, 2**32), split_s=st.sampled_from([3.0, 10.0, 1000.0]), part=st.floats(0, 1)

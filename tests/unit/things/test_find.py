@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import Msg, detections, header, make, odom, point, tf, transform, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling, replied
 
 if TYPE_CHECKING:
@@ -333,7 +334,9 @@ QUESTIONS: tuple[dict[str, object], ...] = (
 
 
 @settings(
-    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=examples(15),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
     seed=st.integers(0, 2**32), split_s=st.sampled_from([3.0, 10.0, 1000.0]), part=st.floats(0, 1)

@@ -15,6 +15,7 @@ from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
+from tests.support.examples import examples
 from tests.support.hostile_arguments import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
 from tests.support.memories import memory_of
 from tests.support.robot_run import ANSWERED, write_run
@@ -58,7 +59,8 @@ def held(reply: Reply) -> Any:
 
 
 @settings(
-    max_examples=300, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+    max_examples=examples(300),
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 @given(call=calls(TOOLS))
 def test_any_arguments_are_answered_or_told_what_is_wrong(

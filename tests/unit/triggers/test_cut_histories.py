@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, boolean
+from tests.support.examples import examples
 from tests.support.watched_bags import T0, WatchedBags, flag, rule
 from tests.unit.triggers.test_fold import expected
 
@@ -24,7 +25,7 @@ def published(at: int, value: bool, late: int) -> Msg:
     return Msg(made.topic, made.type, made.log_time, made.body, at)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=examples(15), deadline=None)
 @given(
     VALUES,
     st.sampled_from([0, S * 3 // 2, S * 7 // 2]),

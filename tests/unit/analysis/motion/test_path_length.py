@@ -29,6 +29,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
+from tests.support.examples import examples
 from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
@@ -217,7 +218,7 @@ def cuts_of(poses: Points, count: int, seed: int) -> list[int]:
     return sorted(np.random.default_rng(seed).choice(len(poses), count, replace=False).tolist())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 @given(
     st.sampled_from([20, 50]),
     st.floats(0.1, 2.0),
@@ -235,7 +236,7 @@ def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most(
     )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 300))
 def test_without_noise_any_cuts_give_the_same_length(seed: int, count: int) -> None:
     poses = arc(0.5, 20, 60)

@@ -20,6 +20,7 @@ from ros2_memory.analysis.motion.standstills import (
 )
 from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
 from ros2_memory.core.timebase import NS_PER_S
+from tests.support.examples import examples
 
 Poses = list[tuple[int, tuple[float, float, float]]]
 S = NS_PER_S
@@ -132,7 +133,7 @@ def worlds(draw: st.DrawFn, noise: float = 0.0) -> World:
     )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(worlds())
 def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     period = made.period + 1e-6
@@ -146,7 +147,7 @@ def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     assert len(long) <= len(found) <= len(possible)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(worlds(), CUTS)
 def test_where_a_history_is_cut_into_bags_changes_no_end_by_more_than_a_message(
     made: World, parts: list[float]
@@ -161,7 +162,7 @@ def test_where_a_history_is_cut_into_bags_changes_no_end_by_more_than_a_message(
         assert abs(span[1] - near[1]) <= made.period + 1e-6
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(worlds(noise=0.01), CUTS)
 def test_noise_is_cut_into_bags_as_it_is_found_without_cuts(
     made: World, parts: list[float]
@@ -174,7 +175,7 @@ def test_noise_is_cut_into_bags_as_it_is_found_without_cuts(
         assert abs(one.end - other.end) <= made.period * S + 1
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100), deadline=None)
 @given(
     st.one_of(worlds(), worlds(noise=0.01)),
     st.integers(2, 15),
@@ -242,7 +243,7 @@ def test_a_robot_that_creeps_under_noise_does_not_stand(speed: float) -> None:
     assert stood(standstills_of(made.poses)) < 4
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=examples(20), deadline=None)
 @given(
     st.floats(0.0, 0.06),
     st.sampled_from([0.0, 0.001, 0.01]),
@@ -300,7 +301,7 @@ def test_a_jump_ends_a_standstill() -> None:
 
 
 @given(worlds(), CUTS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=examples(30), deadline=None)
 def test_standstills_are_in_order_apart_and_long(made: World, parts: list[float]) -> None:
     found = from_bags(made.poses, cuts_of(made.poses, parts))
     times = {time for time, _ in made.poses}
@@ -337,7 +338,7 @@ def check_disjoint(found: tuple[Standstill, ...], poses: Poses) -> None:
     assert sum(each.end - each.start for each in found) <= poses[-1][0] - poses[0][0]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(restless(), CUTS)
 def test_standstills_under_any_noise_are_in_order_and_disjoint(
     poses: Poses, parts: list[float]

@@ -22,6 +22,7 @@ from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.embedded import custom_data
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.examples import examples
 from tests.support.housekeepers import OURS, embedding, lines, own_all
 from tests.support.simulated_recorders import World
 
@@ -252,7 +253,7 @@ class TestWhatAKillLeaves:
         (tmp_path / A / f"{A}_0.mcap").touch()
         assert not claimed(tmp_path).owns(tmp_path / A)
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=examples(60), deadline=None)
     @given(cut=st.integers(0, 200), junk=st.sampled_from([b"", b"\0\0\0\0", b"{", b"[" * 5000]))
     def test_a_power_cut_amid_an_append_costs_that_line_alone(
         self, tmp_path_factory: pytest.TempPathFactory, cut: int, junk: bytes
@@ -280,7 +281,7 @@ class TestWhatAKillLeaves:
         assert again.exists()
         assert again.bag_dir_id == own.bag_dir_id
 
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=examples(100), deadline=None)
     @given(data=st.binary(max_size=300))
     def test_whatever_stands_in_the_list_no_directory_is_made_up(
         self, tmp_path_factory: pytest.TempPathFactory, data: bytes
@@ -514,7 +515,7 @@ class TestVersionsBeforeTheList:
         self.beat(tmp_path, A)
         assert not claimed(tmp_path).owns(tmp_path / A)
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=examples(60), deadline=None)
     @given(
         faults=st.lists(
             st.tuples(
@@ -536,7 +537,7 @@ class TestVersionsBeforeTheList:
         if any(path.stat().st_size for path in (bag_dir / A).iterdir()):
             assert not claimed(bag_dir).owns(bag_dir / A)
 
-    @settings(max_examples=300, deadline=None)
+    @settings(max_examples=examples(300), deadline=None)
     @given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
     def test_no_copy_of_a_single_file_is_adopted_whichever_bit_is_wrong(
         self, tmp_path_factory: pytest.TempPathFactory, at: int, bit: int
@@ -622,7 +623,7 @@ class TestEmbedded:
         with pytest.raises(OSError, match="No such file"):
             custom_data(tmp_path / "x.mcap")
 
-    @settings(max_examples=100, deadline=None)
+    @settings(max_examples=examples(100), deadline=None)
     @given(at=st.integers(0, 400), value=st.integers(0, 255))
     def test_a_damaged_file_never_raises_more_than_an_oserror(
         self, tmp_path_factory: pytest.TempPathFactory, at: int, value: int

@@ -34,6 +34,7 @@ from ros2_memory.recorder.handover.recovery import recover_handovers, settle_han
 from ros2_memory.recorder.handover.union import compare_recordings
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
+from tests.support.examples import examples
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -175,7 +176,7 @@ SPLITS = st.lists(st.floats(2, 10), max_size=2).map(sorted).map(tuple)
 DOUBLED = st.frozensets(st.integers(60, 180), max_size=6)
 
 
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 @given(
     stalls=st.tuples(STALLS, STALLS),
     splits=st.tuples(SPLITS, SPLITS),

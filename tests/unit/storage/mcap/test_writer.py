@@ -18,6 +18,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.support.examples import examples
 from tests.support.fakes import files_limited_to
 from tests.support.reader_cases import LAYOUTS
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
@@ -105,7 +106,9 @@ class TestRewriting:
         assert result.lost_bytes > 0
         assert any("ends early" in note for note in result.notes)
 
-    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+    @settings(
+        suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(60)
+    )
     @given(share=st.floats(0.0, 1.0), name=st.sampled_from(["small chunks", "zstd", "unchunked"]))
     def test_wherever_a_file_is_cut_what_was_readable_is_in_the_copy(
         self, tmp_path: Path, share: float, name: str

@@ -1,0 +1,21 @@
+"""How much a test tries of what it could try any number of: more with EPISODIC_LONG=1.
+
+Each run draws other examples, so what many short runs try together is what a long one tries.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Final
+
+LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
+"""Whether a run may take hours."""
+_FEWEST: Final = 8
+
+
+def examples(full: int) -> int:
+    """How many examples of a property are drawn: `full` in a long run, else a third, at least 8.
+
+    Of a property that has fewer than 8 in full, all.
+    """
+    return full if LONG else min(full, max(_FEWEST, full // 3))
