@@ -38,7 +38,7 @@ from pydantic.dataclasses import dataclass
 from pydantic.types import PathType
 from pydantic_core import to_jsonable_python
 
-from ros2_memory.config_errors import foreign_errors_as_config_error, validated
+from ros2_memory.config_errors import foreign_errors_as_config_error, line_of, validated
 from ros2_memory.config_sources import (
     INTERFACES_VARIABLE,
     Sources,
@@ -624,6 +624,13 @@ def load_rules(settings: Settings) -> Mapping[str, KeepRule]:
     return _load_file(TriggersFile, "recording.keep_when", settings.recording.keep_when).rules
 
 
+_FAILS_CLOSED: Final = (
+    "Neither the recorder nor the server starts while these rules cannot be read: what they "
+    "exclude could be recorded or served. Correct the file; to exclude nothing, let it contain "
+    "only `rules: {}`"
+)
+
+
 def load_exclusions(settings: Settings) -> Mapping[str, ExcludeRule]:
     """Returns the rules of `recording.exclude_when`, by name.
 
@@ -631,14 +638,18 @@ def load_exclusions(settings: Settings) -> Mapping[str, ExcludeRule]:
         ConfigError: the file is missing, is not YAML, or its content is refused.
     """
     path = settings.recording.exclude_when
-    return _load_file(ExclusionsFile, "recording.exclude_when", path).rules
+    try:
+        return _load_file(ExclusionsFile, "recording.exclude_when", path).rules
+    except ConfigError as error:
+        raise ConfigError(f"{error}\n{_FAILS_CLOSED}") from error
 
 
 def _load_file(model: type[_T], key: str, path: Path) -> _T:
     """Returns the content of a YAML file that a key names, as an instance of a model."""
 
-    def source(_key: str) -> str:
-        return f"in {path}, which {key} names"
+    def source(fault: str) -> str:
+        line = line_of(path, fault)
+        return f"in {path}{f', line {line}' if line else ''}, which {key} names"
 
     with foreign_errors_as_config_error(f"{key}: {path}", source):
         data = OmegaConf.to_container(OmegaConf.load(path), resolve=True)

@@ -52,7 +52,7 @@ from ros2_memory.history.no_data import (
     seconds,
     with_notes,
 )
-from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
+from ros2_memory.history.reverse_search import ReverseSearch, condition_of, notes_on_never
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.view import (
     AtTime,
@@ -258,7 +258,10 @@ def find_last_match(
     search = ReverseSearch(view, topic, condition)
     found = search.newest(until)
     if found is None:
-        notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+        notes = (
+            *_never(view, search, until),
+            *notes_on_never(view, search.topics, condition, min_score),
+        )
         return results.Match(None, notes=notes)
     note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
@@ -295,7 +298,10 @@ def value_when(
     search = ReverseSearch(view, condition_topic, condition)
     found = search.newest(until)
     if found is None:
-        notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+        notes = (
+            *_never(view, search, until),
+            *notes_on_never(view, search.topics, condition, min_score),
+        )
         return results.ValueWhen(None, notes=notes)
     note_unread(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)

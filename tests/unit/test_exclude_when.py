@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from ros2_memory.bootstrap import build_housekeeper, build_reader, exclusions_of
+from ros2_memory.bootstrap import build_housekeeper, build_reader, exclusions_of, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 
@@ -62,6 +62,30 @@ def test_what_cannot_be_is_refused_with_the_reason(tmp_path: Path, rule: str, re
     with pytest.raises(ConfigError, match=reason) as refused:
         rules(tmp_path, f"rules: {{a: {{{rule}}}}}")
     assert "exclusions.yaml" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "where"),
+    [
+        ("rules:\n  a:\n    topic: /x\n    conditon_type: equals\n", "line 4, which"),
+        ("rules:\n  a: {topic: /x}\n", "condition_type: missing; give it a value .*line 2, which"),
+        ("rules:\n  a\n    topic: /x\n", "line 3, column"),
+        ("rulez: {}\n", "rulez: unknown key.*line 1, which"),
+    ],
+)
+def test_a_server_does_not_start_with_rules_that_it_cannot_read(
+    tmp_path: Path, text: str, where: str
+) -> None:
+    """Fails closed: what they exclude could be served. The error names file, line and remedy."""
+    path = tmp_path / "exclusions.yaml"
+    path.write_text(text)
+    settings = load_settings([f"recording.exclude_when={path}", f"recording.bag_dir={tmp_path}"])
+    with pytest.raises(ConfigError, match=where) as refused:
+        query_settings_of(settings)
+    assert str(path) in str(refused.value)
+    assert "to exclude nothing, let it contain only `rules: {}`" in str(refused.value)
+    path.write_text("rules: {}\n")
+    assert not query_settings_of(settings).screened
 
 
 def test_a_recording_of_too_many_splits_is_refused(tmp_path: Path) -> None:

@@ -13,17 +13,18 @@ from threading import Lock
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
-from ros2_memory.analysis.conditions import parse_condition, refusal_for
+from ros2_memory.analysis.conditions import NearPosition, parse_condition, refusal_for
 from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason
+from ros2_memory.core.text import Reason, listed
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
+from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 _MOST_TEMPLATES: Final = 16
 """Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
+_MOST_FRAMES: Final = 3
+"""Topics of which the frame is told: each costs a message."""
 _MOST_TRUTHS: Final = 65_536
 """Messages of which it is known whether they met a condition: some 8 MB for each question."""
 
@@ -63,12 +66,35 @@ def condition_of(
     return parse_condition(condition_type, value, settings.position_tolerance_m, field, least)
 
 
-def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
-    """Returns the note on a limit of scores that the question does not have, for "never"."""
-    if min_score is not None or not condition.min_score:
-        return ()
-    least = f"{condition.min_score:g}"
-    return (f"detections with a score below {least} do not count here, unless min_score is given",)
+def notes_on_never(
+    view: View, topics: Sequence[str], condition: Condition, min_score: float | None
+) -> Iterator[str]:
+    """Yields what a question that found nothing did not ask for: scores, and another frame."""
+    if min_score is None and condition.min_score:
+        least = f"{condition.min_score:g}"
+        yield f"detections with a score below {least} do not count here, unless min_score is given"
+    if isinstance(condition.test, NearPosition):
+        frames = [(topic, _frames_of(view, topic)) for topic in topics[:_MOST_FRAMES]]
+        named = [f"{', '.join(each)} ({topic})" for topic, each in frames if each]
+        if named:
+            yield f"near_position compared x and y in the frame of each message: {listed(named)}"
+
+
+def _frames_of(view: View, topic: str) -> list[str]:
+    """Returns the frames of the positions in a topic's newest message; none where not known."""
+    try:
+        found = view.stream.newest(topic, TimeWindow.everything())
+    except QueryTimeoutError:
+        return []
+    message = None if found is None else view.bags.decode(found)
+    if found is None or message is None:
+        return []
+    extractor, type_name = view.memory.extractor, found.record.channel.type
+    own = extractor.frame(message)
+    seen = detections_of(extractor.exact(message, type_name), own)
+    frames = {each.frame_id for each in seen if each.place is not None}
+    pose = extractor.pose(message, type_name)
+    return sorted(filter(None, frames or {own if pose is None else pose.frame_id}))
 
 
 class _Truths:

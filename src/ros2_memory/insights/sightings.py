@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics
-from ros2_memory.history.reverse_search import ReverseSearch, condition_of, unasked_limit
+from ros2_memory.history.reverse_search import ReverseSearch, condition_of, notes_on_never
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
@@ -149,8 +149,9 @@ def find_matches(
         found = _with_fields(view, found, collected.selected, fields)
     note_unread(view, searched, nothing=not found, search=True)
     if not found:
-        silences = describe_silences(view, matching_topics(view, topic), searched)
-        for sentence in (*silences, *unasked_limit(condition, min_score)):
+        topics = matching_topics(view, topic)
+        silences = describe_silences(view, topics, searched)
+        for sentence in (*silences, *notes_on_never(view, topics, condition, min_score)):
             view.notes.add(sentence)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)

@@ -165,6 +165,17 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     assert note in queries.find_last_match(*asked).notes
 
 
+@pytest.mark.parametrize("recalls", [False, True])
+def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recalls: bool) -> None:
+    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
+    memory = recalling(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
+    place: JsonValue = {"x": 9.0, "y": 9.0}
+    asked = (memory, Call(), "/odom", "near_position", place)
+    note = "near_position compared x and y in the frame of each message: odom (/odom)"
+    assert note in find_matches(*asked).notes
+    assert note in queries.find_last_match(*asked).notes
+
+
 def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Path) -> None:
     def seen(label: str, score: float, x: float) -> dict[str, JsonValue]:
         return {"label": label, "score": score, "position": {"x": x, "y": 1.0, "z": 0.0}}
