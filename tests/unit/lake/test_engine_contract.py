@@ -1,0 +1,161 @@
+"""What `lake/engines/base.py` promises of a `LakeEngine`, checked with every adapter."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import date, timedelta
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from pyiceberg.catalog.sql import SqlCatalog
+
+from ros2_memory.core.errors import RefusedError
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine
+from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.files import Lake
+from ros2_memory.lake.tables import TABLES, Row, open_tables, to_arrow
+
+DAY = date(2026, 11, 20)
+ODD = ("it's", 'a "cup"', "back\\slash", "$label", "%_", "x'; SELECT 1 --", "ß 茶")
+LONG = os.environ.get("EPISODIC_LONG") == "1"
+HAS_RAY = all(importlib.util.find_spec(each) for each in ("daft", "ray"))
+
+
+def seen(label: str, second: int, score: float | None = 0.5) -> Row:
+    at = second * 10**9
+    where = (1.0, 2.0, None, None, None, None)
+    return ("/seen", "seen", "T", at, at // 1000, 0, label, score, "map", *where)
+
+
+def duckdb_engine() -> Iterator[LakeEngine]:
+    engine = DuckdbEngine(memory_mb=256, threads=1)
+    yield engine
+    engine.close()
+
+
+def ray_engine() -> Iterator[LakeEngine]:
+    """On two nodes, each with one processor."""
+    from ray.cluster_utils import Cluster  # noqa: PLC0415 - not installed everywhere
+
+    from ros2_memory.lake.engines.ray_engine import RayEngine  # noqa: PLC0415
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster.add_node(num_cpus=1)
+    yield RayEngine(cluster.address)
+    cluster.shutdown()
+
+
+RAY = pytest.mark.skipif(
+    not (LONG and HAS_RAY), reason="starts a cluster: EPISODIC_LONG=1, with the extra ray"
+)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(duckdb_engine, id="duckdb"),
+        pytest.param(ray_engine, id="ray", marks=RAY),
+    ],
+)
+def engine(request: pytest.FixtureRequest) -> Iterator[LakeEngine]:
+    yield from request.param()
+
+
+@pytest.fixture(scope="module")
+def catalog(tmp_path_factory: pytest.TempPathFactory) -> SqlCatalog:
+    """Three robots, each with two days."""
+    folder = tmp_path_factory.mktemp("lake")
+    catalog = SqlCatalog("lake", uri=f"sqlite:///{folder}/lake.sqlite", warehouse=folder.as_uri())
+    table = open_tables(catalog, ["sightings", "bags"])["sightings"]
+    for robot in ("attic", "hall", "it's"):
+        for day in (0, 1):
+            rows = [seen(label, 100 * day + nth) for nth, label in enumerate(ODD)]
+            rows.append(seen("unscored", 100 * day, None))
+            part = to_arrow(
+                TABLES["sightings"], robot, DAY + timedelta(days=day), {f"{robot}{day}": rows}
+            )
+            table.append(part)
+    return catalog
+
+
+@pytest.fixture
+def lake(catalog: SqlCatalog, engine: LakeEngine) -> Lake:
+    return Lake(catalog, engine)
+
+
+def test_it_filters_groups_and_orders(lake: Lake) -> None:
+    found = lake.select(
+        "SELECT robot, max(time_ns) AS newest, count(*) AS n, CAST(sum(time_ns) AS BIGINT) AS s"
+        " FROM sightings WHERE label = $label AND (score IS NULL OR score >= $least)"
+        " GROUP BY robot ORDER BY robot DESC LIMIT 2",
+        ["sightings"],
+        {"label": "%_", "least": 0.25},
+    )
+    at = 10**9 * (ODD.index("%_") + 100)
+    assert found.to_pylist() == [
+        {"robot": robot, "newest": at, "n": 2, "s": 2 * at - 100 * 10**9}
+        for robot in ("it's", "hall")
+    ]
+
+
+def test_a_text_is_never_sql(lake: Lake) -> None:
+    sql = "SELECT DISTINCT label FROM sightings WHERE label IN $labels ORDER BY label"
+    found = lake.select(sql, ["sightings"], {"labels": ODD})
+    assert found["label"].to_pylist() == sorted(ODD)
+    one_by_one = "SELECT count(*) AS n FROM sightings WHERE label = $label AND robot = $robot"
+    for label in ODD:
+        counted = lake.select(one_by_one, ["sightings"], {"label": label, "robot": "it's"})
+        assert counted["n"].to_pylist() == [2]
+
+
+def test_nothing_is_in_no_values(lake: Lake) -> None:
+    sql = "SELECT label FROM sightings WHERE label IN $labels"
+    assert lake.select(sql, ["sightings"], {"labels": ()}).num_rows == 0
+
+
+def test_only_files_of_these_robots_and_days_are_read(lake: Lake) -> None:
+    sql = "SELECT DISTINCT robot, day FROM sightings ORDER BY robot, day"
+    one = lake.select(sql, ["sightings"], robots=["hall", "it's"], days=(DAY, DAY))
+    assert one.to_pylist() == [{"robot": "hall", "day": DAY}, {"robot": "it's", "day": DAY}]
+    assert lake.select(sql, ["sightings"], robots=[]).num_rows == 0
+
+
+def test_two_tables_are_joined_and_one_may_be_empty(lake: Lake) -> None:
+    sql = "SELECT s.label FROM sightings s JOIN bags b ON s.bag_id = b.bag_id AND s.robot = b.robot"
+    assert lake.select(sql, ["sightings", "bags"]).num_rows == 0
+    inside = "SELECT label FROM sightings WHERE bag_id IN (SELECT bag_id FROM things)"
+    assert lake.select(inside, ["sightings", "things"]).num_rows == 0
+
+
+def test_a_column_that_a_file_lacks_is_null(tmp_path: Path, engine: LakeEngine) -> None:
+    schema = TABLES["things"].arrow_schema()
+    rows: Row = ("/seen", "seen", "cup", 1, 0, 0, 0, "map", 1.0, 2.0, 0.0, 0.1, None)
+    old = to_arrow(TABLES["things"], "hall", DAY, {"a": [rows]}).drop_columns(["spread_m"])
+    pq.write_table(old, tmp_path / "old.parquet")
+    files = DataFiles(schema, ((tmp_path / "old.parquet").as_uri(),), {})
+    found = engine.select("SELECT label, spread_m FROM things", {"things": files}, {})
+    assert found.to_pylist() == [{"label": "cup", "spread_m": None}]
+
+
+def test_a_file_that_is_gone_is_reported_without_its_path(
+    tmp_path: Path, engine: LakeEngine
+) -> None:
+    schema = TABLES["things"].arrow_schema()
+    files = DataFiles(schema, ((tmp_path / "gone.parquet").as_uri(),), {})
+    with pytest.raises(RefusedError, match="the lake cannot be read") as raised:
+        engine.select("SELECT label FROM things", {"things": files}, {})
+    assert str(tmp_path) not in str(raised.value)
+
+
+def test_threads_ask_at_once(lake: Lake) -> None:
+    sql = "SELECT count(*) AS n FROM sightings WHERE label = $label"
+
+    def count(label: str) -> object:
+        return lake.select(sql, ["sightings"], {"label": label})["n"].to_pylist()
+
+    with ThreadPoolExecutor(4) as pool:
+        assert [*pool.map(count, ODD * 2)] == [[6]] * len(ODD) * 2
