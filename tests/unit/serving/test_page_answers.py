@@ -170,6 +170,15 @@ def test_where_a_part_takes_too_long_the_others_are_shown(
     assert found["path"]["x"][-1] == 30.0
 
 
+@pytest.mark.parametrize(("waiting", "is_shown"), [(0, False), (3, False), (4, True)])
+def test_bags_that_were_just_closed_are_no_catalogue_that_is_being_filled(
+    memory: Memory, waiting: int, is_shown: bool
+) -> None:
+    """A robot that records always has one: the page would ask for everything again and again."""
+    found = shown(memory, progress=lambda: Progress(closed=50, waiting=waiting, refused=0))
+    assert (found["catalogue"] is not None) == is_shown
+
+
 def test_numbers_come_in_bins_with_their_bounds(memory: Memory) -> None:
     signal = "/odom:twist.twist.linear.x"
     [found] = shown(memory, f"last=1000&signal={signal}")["signals"]

@@ -315,16 +315,17 @@ class RobotMap {
       c.stroke();
     }
   }
-  /* The newest things have their names, as far as there is room. */
+  /* The newest things have their names, as far as there is room beside all markers. */
   drawThings(c, width, height) {
-    for (const each of this.things) {
-      const [x, y] = [this.px(each.x), this.py(each.y)];
-      if (x < -20 || y < -20 || x > width + 20 || y > height + 20) continue;
-      const isChosen = this.chosen && this.chosen.label === each.label
-        && this.chosen.x === each.x && this.chosen.y === each.y;
+    const shown = this.things.map((each) => ({ ...each, px: this.px(each.x), py: this.py(each.y) }))
+      .filter(({ px, py }) => px > -20 && py > -20 && px < width + 20 && py < height + 20);
+    const isChosen = (each) => this.chosen && this.chosen.label === each.label
+      && this.chosen.x === each.x && this.chosen.y === each.y;
+    for (const each of shown) {
+      const { px: x, py: y } = each;
       c.fillStyle = colour("seen");
-      c.strokeStyle = colour(isChosen ? "ink" : "card");
-      c.lineWidth = isChosen ? 2.5 : 1.5;
+      c.strokeStyle = colour(isChosen(each) ? "ink" : "card");
+      c.lineWidth = isChosen(each) ? 2.5 : 1.5;
       c.beginPath();
       c.moveTo(x, y - 6);
       c.lineTo(x + 6, y);
@@ -333,17 +334,24 @@ class RobotMap {
       c.closePath();
       c.fill();
       c.stroke();
+      this.taken.push({ x: x - 6, y: y - 6, w: 12, h: 12 });
+    }
+    for (const each of shown) {
+      const { px: x, py: y } = each;
       const name = plain(each.label).slice(0, 24);
-      const wide = c.measureText(name).width;
-      const right = x + 9 + wide < width - 2;
-      const box = { x: right ? x + 9 : x - 9 - wide, y: y - 7, w: wide, h: 14 };
-      if (!isChosen && this.taken.some((one) => meet(one, box))) continue;
+      const w = c.measureText(name).width;
+      const boxes = [[x + 9, y - 7], [x - 9 - w, y - 7], [x - w / 2, y - 21], [x - w / 2, y + 7]]
+        .map(([left, top]) => ({ x: left, y: top, w, h: 14 }))
+        .filter((box) => box.x >= 0 && box.x + w < width - 2);
+      const free = boxes.find((box) => !this.taken.some((one) => meet(one, box)));
+      const box = free || (isChosen(each) ? boxes[0] : null);
+      if (!box) continue;
       this.taken.push(box);
       c.lineWidth = 3;
       c.strokeStyle = colour("card");
-      c.strokeText(name, box.x, y + 4);
+      c.strokeText(name, box.x, box.y + 11);
       c.fillStyle = colour("ink");
-      c.fillText(name, box.x, y + 4);
+      c.fillText(name, box.x, box.y + 11);
     }
   }
   drawRobot(c, robot, fill, isFilled) {

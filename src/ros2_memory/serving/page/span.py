@@ -61,6 +61,7 @@ _QUICK_S: Final = 0.8
 _PART_S: Final = 8.0
 """How long each part of an answer may take; of a patient one the latter. The page shows what there
 is, and asks again for the rest."""
+_NEWEST_BAGS: Final = 3
 _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
 
@@ -136,7 +137,7 @@ def span_shown(
         "now": moment(_now(memory, snapshot)),
         "latest": moment(latest),
         "catalogue": None
-        if filling is None or not filling.waiting
+        if filling is None or _keeps_up(filling)
         else {"closed": filling.closed, "waiting": filling.waiting},
     }
     if questions is not None and questions.is_on:
@@ -201,6 +202,11 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
         questions,
     )
     return "-".join(map(str, counts))
+
+
+def _keeps_up(filling: Progress) -> bool:
+    """Whether the catalogue lacks nothing but the newest of many bags, as while recording."""
+    return filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
 
 
 def _question(kept: KeptQuestion) -> JsonObject:
