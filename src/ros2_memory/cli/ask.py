@@ -18,6 +18,7 @@ from ros2_memory.cli.options import (
     Recording,
     Sets,
     Verbose,
+    is_folder,
     load_to_look,
     open_memory,
     parse_duration,
@@ -65,7 +66,8 @@ def ask(
     given: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="key=value|JSON", help="Arguments of the tool, and settings (data.now=latest)."
+            metavar="key=value|JSON",
+            help="Arguments of the tool, settings (data.now=latest), and a bag or folder.",
         ),
     ] = None,
     *,
@@ -84,7 +86,9 @@ def ask(
     words = [*(given or ())]
     if tool is not None and _SETTING.fullmatch(tool):
         tool, words = None, [tool, *words]
-    of_settings = [each for each in words if _SETTING.fullmatch(each)]
+    if tool is not None and is_folder(tool) and tool not in complete(tool):
+        tool, words = None, [tool, *words]
+    of_settings = [each for each in words if _SETTING.fullmatch(each) or is_folder(each)]
     loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = None if bag_dir is not None else build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)

@@ -184,6 +184,14 @@ def _is_path(word: str) -> bool:
         return False
 
 
+def is_folder(word: str) -> bool:
+    """Returns whether a word is a bag or a folder: a path that is there, and no JSON."""
+    try:
+        return "=" not in word and Path(word).exists()
+    except (OSError, ValueError):
+        return False
+
+
 def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
     """Returns the folder of a file, and the recording to look at there: the file itself."""
     if file.name == METADATA_FILE:

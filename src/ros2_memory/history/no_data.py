@@ -83,7 +83,7 @@ def resolve_pose_topic(
         detail = f"no topic {configured} is recorded, which data.pose_topic names"
         topics = topics_with(view, what)
         if not topics and what == "position":
-            topics = _topics_that_show_poses(view)
+            topics = topics_that_show_poses(view)
         if topics:
             those = {"position": "poses", "velocity": "velocities"}[what]
             which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
@@ -99,7 +99,7 @@ def resolve_pose_topic(
                 f"{listed(fixes)}: {advice}"
             )
         elif what == "velocity" and (
-            posed := topics_with(view, "position") or _topics_that_show_poses(view)
+            posed := topics_with(view, "position") or topics_that_show_poses(view)
         ):
             detail += (
                 f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
@@ -118,7 +118,7 @@ def resolve_pose_topic(
         raise NoDataError(error.reason, detail, error.notes) from error
 
 
-def _topics_that_show_poses(view: View) -> list[str]:
+def topics_that_show_poses(view: View) -> list[str]:
     """Returns topics of types outside the schema map whose newest message has a pose.
 
     Each with its type behind it, of at most `MOST_TRIED` topics: for an error alone.

@@ -9,17 +9,22 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory import cli
 from ros2_memory.cli.output import format_time
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import battery, boolean, odom, text, write_mcap
+from tests.support.bags import battery, boolean, odom, text, tf, transform, write_mcap
 from tests.support.memories import memory_of
+from tests.unit.test_positions import fix
 
 pytest.importorskip("matplotlib", reason="needs the extra plot")
 
 from ros2_memory.cli.plot import scene
+from ros2_memory.cli.plot.without_poses import east_north
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,6 +64,62 @@ def test_where_the_poses_are_on_another_topic_it_names_the_option(
     write_mcap(tmp_path / "bag.mcap", [odom(T0, 0.0, 0.0, topic="/base/odometry")])
     assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 2
     assert "set data.pose_topic=/base/odometry, or give --topic" in capsys.readouterr().err
+
+
+def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> None:
+    """The map jumps by 1 m, as it does when the robot finds where it is."""
+    messages = [
+        tf(
+            T0 + n * S // 10,
+            transform(T0 + n * S // 10, "map", "odom", (float(n >= 50), 0.0, 0.0)),
+            transform(T0 + n * S // 10, "odom", "base_link", (n / 10, 0.0, 0.0)),
+            transform(T0 + n * S // 10, "base_link", "arm", (0.0, n / 10, 0.0)),
+        )
+        for n in range(101)
+    ]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    asked = scene_of(tmp_path)
+    path, line, _ = scene.path_in(asked, None, None)
+    assert path.frame == "map"
+    assert (path.xs[0], path.xs[-1]) == pytest.approx((0.0, 11.0))
+    assert line.startswith("11.0 m in 10.0 s; base_link in map by transforms")
+    path, _, _ = scene.path_in(asked, "/tf", "odom")
+    assert path.frame == "odom"
+    assert path.xs[-1] == pytest.approx(10.0)
+    with pytest.raises(NoDataError, match="kitchen"):
+        scene.path_in(asked, None, "kitchen")
+
+
+def test_without_poses_and_transforms_it_is_that_of_the_satellite_receiver(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [fix(T0 + n * S, n * 1e-4, -n * 2e-4) for n in (0, 1, 2)])
+    path, line, _ = scene.path_in(scene_of(tmp_path), None, None)
+    assert path.frame == "east and north of 48.123457, 11.765432"
+    # One minute of latitude is a nautical mile, 1852 m, within 1 %.
+    assert path.ys == pytest.approx([0.0, 1852 * 0.006, 2 * 1852 * 0.006], rel=0.01)
+    shrunk = math.cos(math.radians(48.12))
+    assert path.xs == pytest.approx(
+        [0, -1852 * 0.012 * shrunk, -2 * 1852 * 0.012 * shrunk], rel=0.01
+    )
+    assert line.endswith("by 3 of 3 fixes of /fix")
+    assert scene.path_in(scene_of(tmp_path), "/fix", None)[0] == path
+
+
+@given(
+    latitude=st.floats(-80, 80),
+    longitude=st.floats(-180, 180),
+    metres=st.tuples(st.floats(-5000, 5000), st.floats(-5000, 5000)),
+)
+def test_metres_east_and_north_lead_back_to_the_fix(
+    latitude: float, longitude: float, metres: tuple[float, float]
+) -> None:
+    """By the distance along the great circle, of a sphere that is off by 0.6 % at most."""
+    origin = Geodetic(latitude, longitude, 0.0)
+    radius = 6_371_000.0
+    north = latitude + math.degrees(metres[1] / radius)
+    east = longitude + math.degrees(metres[0] / radius / math.cos(math.radians(latitude)))
+    wrapped = (east + 180) % 360 - 180
+    found = east_north(origin, Geodetic(north, wrapped, 0.0))
+    assert math.dist(found, metres) <= 0.007 * math.hypot(*metres) + 1e-3
 
 
 def test_times_in_errors_are_printed_as_they_are_typed(bags: Path, capsys: Capture) -> None:

@@ -28,7 +28,6 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import with_local_times
 from ros2_memory.cli.plot.scene import (
     MOST_TOPICS,
-    DrawnPath,
     Stop,
     day_of,
     event_lines,
@@ -48,6 +47,7 @@ from ros2_memory.history.no_data import resolve_topic
 
 if TYPE_CHECKING:
     from ros2_memory.cli.plot.drawing import Picture
+    from ros2_memory.cli.plot.without_poses import DrawnPath
     from ros2_memory.core.regions import Place
 
 FORMATS: Final = (".svg", ".png", ".pdf")

@@ -51,7 +51,8 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from ros2_memory.cli.plot.scene import DrawnPath, Signal, Stop, TimelineRow
+    from ros2_memory.cli.plot.scene import Signal, Stop, TimelineRow
+    from ros2_memory.cli.plot.without_poses import DrawnPath
     from ros2_memory.core.regions import Place
 
 _STYLE: Final = {

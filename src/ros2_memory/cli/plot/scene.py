@@ -8,10 +8,9 @@ from datetime import datetime, time, timedelta
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numpy as np
-
 from ros2_memory.cli.options import parse_time, present
 from ros2_memory.cli.output import format_duration
+from ros2_memory.cli.plot.without_poses import DrawnPath, path_without_poses
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import without
@@ -66,24 +65,6 @@ _ROWS: Final = {
 }
 """The kinds of events in a recap, and the name of each one's row, the first one on top."""
 _TOPIC: Final = "#94a3b8"
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnPath:
-    """A driven path in a frame: where (m) and when, and which points the robot jumped to."""
-
-    frame: str
-    times: tuple[float, ...]
-    xs: tuple[float, ...]
-    ys: tuple[float, ...]
-    jumps: tuple[bool, ...]
-
-    def at(self, time: float) -> tuple[float, float]:
-        """Returns where the robot was, between two points on the line between them."""
-        return (
-            float(np.interp(time, self.times, self.xs)),
-            float(np.interp(time, self.times, self.ys)),
-        )
 
 
 class TimelineRow(NamedTuple):
@@ -182,10 +163,14 @@ def path_in(
 ) -> tuple[DrawnPath, str, Sequence[str]]:
     """Returns the path, a line on it, and notes; in the map where transforms lead there.
 
+    Without a topic of poses, by transforms or by a satellite receiver.
+
     Raises:
         InvalidArgumentsError: the topic has no poses, or nothing places them in the frame.
         NoDataError: there is none in this time.
     """
+    if topic is not None and (other := path_without_poses(asked.view, asked.window, topic, frame)):
+        return other
     map_frame = asked.memory.limits.map_frame
     for each in (frame,) if frame is not None else (map_frame, None):
         try:
@@ -199,6 +184,9 @@ def path_in(
             )
             break
         except NoDataError as error:
+            is_unknown = topic is None and error.reason is NoDataReason.TOPIC_NOT_RECORDED
+            if is_unknown and (other := path_without_poses(asked.view, asked.window, None, frame)):
+                return other
             detail = error.detail.replace(GIVE_TOPIC, "give --topic").replace(
                 "; give topic", "; give --topic"
             )
