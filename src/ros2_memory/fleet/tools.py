@@ -20,7 +20,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_rounded_up
-from ros2_memory.fleet.fan_out import FanOut
+from ros2_memory.fleet.fan_out import AT_ONCE, FanOut
 from ros2_memory.fleet.merging import (
     ANSWER_FOR_ALL,
     MATCHES,
@@ -29,8 +29,9 @@ from ros2_memory.fleet.merging import (
     RobotReply,
     merged,
 )
+from ros2_memory.fleet.page import Page
 from ros2_memory.fleet.robots import Robot, StoppedClock
-from ros2_memory.results import OfFleet, OfRobot
+from ros2_memory.results import OfFleet, OfRobot, Sightings
 from ros2_memory.tools.replies import as_json
 from ros2_memory.tools.reply_json import ROBOT_NAME
 
@@ -51,12 +52,15 @@ _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
 """Tools whose reply says itself that a bag directory is missing."""
 
 
-def fleet_tools(tools: Sequence[Tool], fleet: Fleet, max_chars: int) -> tuple[Tool, ...]:
+def fleet_tools(
+    tools: Sequence[Tool], fleet: Fleet, max_chars: int, at_once: int = AT_ONCE
+) -> tuple[Tool, ...]:
     """Returns the tools of a fleet, without those that write.
 
     `max_chars` is how long a reply may be: rows for many robots are given shortly before that.
+    `at_once`: how many robots are asked at once.
     """
-    fan_out = FanOut()
+    fan_out = FanOut(at_once)
     return tuple(
         replace(
             tool,
@@ -139,24 +143,27 @@ class _FleetQuestions:
             )
         robots.sort(key=Robot.latest_known, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
-        found = self.fan_out.ask(robots, partial(self._reply, question, now), call)
+        limit, oldest_first = self._limit(given.get("limit")), given.get("oldest_first") is True
+        page = Page(limit, oldest_first=oldest_first)
+        found = self.fan_out.ask(robots, partial(self._reply, question, now, page), call)
         replies = [each for each in found.values() if isinstance(each, RobotReply)]
         errors = {name: each for name, each in found.items() if isinstance(each, EpisodicError)}
         if not replies:
             raise _shared_error(errors)
-        limit, oldest_first = given.get("limit"), given.get("oldest_first")
         return OfFleet(
             merged(
                 self.tool.name,
                 replies,
                 {name: _reason(each) for name, each in errors.items()},
-                limit=self._limit(limit),
-                oldest_first=oldest_first is True,
+                limit=limit,
+                oldest_first=oldest_first,
                 max_chars=self.max_chars,
             )
         )
 
-    def _reply(self, question: Question, now: StoppedClock, robot: Robot, call: Call) -> RobotReply:
+    def _reply(
+        self, question: Question, now: StoppedClock, page: Page, robot: Robot, call: Call
+    ) -> RobotReply:
         """Returns a robot's reply; runs in a thread of its own.
 
         Raises:
@@ -167,10 +174,14 @@ class _FleetQuestions:
         if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
             # "Never" would be a claim about bags that were not searched.
             raise RefusedError(snapshot.problem)
-        answer = question(replace(memory, clock=now), call)
-        value = as_json(_single(answer), robot.bag_dir)
         latest = snapshot.latest
         is_ahead = latest is not None and latest > now.at + _AHEAD_NS
+        # Rows of those whose clock is ahead come last, whenever they are.
+        call.rows_in = None if is_ahead else page.window()
+        answer = _single(question(replace(memory, clock=now), call))
+        if isinstance(answer, Sightings) and not is_ahead:
+            page.add(each.last for each in answer.sightings)
+        value = as_json(answer, robot.bag_dir)
         return RobotReply(robot.name, value, latest, is_ahead)
 
     def _limit(self, given: object) -> int | None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.text import Reason
     from ros2_memory.core.timebase import Clock, Ns
@@ -178,6 +178,8 @@ class Call:
         used_active: whether the answer is partly from a bag that is still being written.
         stores_joined: whether what is joined of many bags is stored for other processes.
         robots: those of a fleet that it may ask about; None for all.
+        rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
+            count all the same. None for all.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
@@ -185,6 +187,11 @@ class Call:
     used_active: bool = False
     stores_joined: bool = False
     robots: frozenset[str] | None = None
+    rows_in: TimeWindow | None = None
+
+    def wants(self, row_end: Ns) -> bool:
+        """Returns whether a row that ends then may not be left out."""
+        return self.rows_in is None or self.rows_in.contains(row_end)
 
 
 @dataclass(frozen=True, slots=True)

@@ -128,12 +128,14 @@ def find_matches(
         searched = TimeWindow(collected.selected[-1].first, window.stop)
     view.notes.retract_before(searched.start)
     elapsed = elapsed_in(view, searched)
+    # To say where the robot was takes longest.
+    wanted = [each for each in collected.selected if call.wants(each.newest.time)]
     found = tuple(
         replace(
             _sighting(view, condition, matches, frame_id),
             skipped=elapsed.skipped_between(matches.first, matches.newest.time),
         )
-        for matches in collected.selected
+        for matches in wanted
     )
     total = None if collected.cut else collected.count
     if goals is not None:
@@ -144,11 +146,13 @@ def find_matches(
                 skipped=elapsed.skipped_between(each.first, each.last),
             )
             for each in (goals[::-1] if oldest_first else goals)[:limit]
+            if call.wants(each.last)
         )
     elif fields:
-        found = _with_fields(view, found, collected.selected, fields)
-    note_unread(view, searched, nothing=not found, search=True)
-    if not found:
+        found = _with_fields(view, found, wanted, fields)
+    is_nothing = not (collected.selected or goals)
+    note_unread(view, searched, nothing=is_nothing, search=True)
+    if is_nothing:
         topics = matching_topics(view, topic)
         silences = describe_silences(view, topics, searched)
         for sentence in (*silences, *notes_on_never(view, topics, condition, min_score)):

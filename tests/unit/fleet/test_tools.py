@@ -80,7 +80,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def reply(fleet: Fleet, name: str, given: dict[str, object], **call: Any) -> Any:
     """The JSON of a fleet's reply, be it an error."""
     replies = Replies(Path("nowhere"), MOST_CHARS)
-    tools = fleet_tools(build_tools(QuerySettings(), writing=True), fleet, MOST_CHARS)
+    # One after another: what the first answer decides what the others need not.
+    tools = fleet_tools(build_tools(QuerySettings(), writing=True), fleet, MOST_CHARS, at_once=1)
     (tool,) = (each for each in tools if each.name == name)
     try:
         # The memory is that of no robot.
@@ -148,6 +149,25 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
     for row in found[rows]:
         own = {key: value for key, value in row.items() if key not in {"robot_name", "frame_id"}}
         assert own in each[row["robot_name"]][rows]
+
+
+@pytest.mark.parametrize("oldest_first", [False, True])
+@pytest.mark.parametrize("limit", [1, 2, 3])
+def test_rows_that_have_no_place_are_left_out_but_count(
+    folder: Path, limit: int, oldest_first: bool
+) -> None:
+    undocked = {"topic": "/is_docked", "condition_type": "equals", "value": False}
+    given = {**undocked, "oldest_first": oldest_first}
+    found = reply(fleet_over(folder, NAMES), "find_matches", {**given, "limit": limit})
+    each = {robot: alone(folder, robot, "find_matches", {**given, "limit": 9}) for robot in NAMES}
+    every = [{"robot_name": name, **row} for name in NAMES for row in each[name]["sightings"]]
+    every.sort(key=lambda row: row["last_seen"], reverse=not oldest_first)
+    assert len(every) == 6
+    assert found["sightings"] == every[:limit]
+    assert found["more"]
+    if oldest_first:
+        assert found["total"] == sum(one["total"] for one in each.values())
+    assert "notes" not in found
 
 
 @pytest.mark.parametrize("name", ["compare", "recap", "memory_status", "data_time_range"])
