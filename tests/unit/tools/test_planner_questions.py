@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import copy
 import json
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,21 +14,19 @@ from mcp.types import TextContent
 
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
-from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.demo.answer_checks import CallContext, WrongAnswerError
-from ros2_memory.demo.published_topics import MessageSchedule
-from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.demo.answer_checks import WrongAnswerError
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of, recalling
-from tests.support.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
 from tests.support.planner_questions import QUESTIONS, Planned
+from tests.support.planner_world import recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.demo.answer_checks import CallContext
+    from tests.support.planner_world import World
 
 BY_WORDS = {question.words: question for question in QUESTIONS}
 MOST_CALLS_FOR_FORTY = 45
@@ -96,14 +93,6 @@ THAT_COUNT = {
 
 
 @dataclass(frozen=True)
-class World:
-    """The bags of a robot that is heard still, and what is known of it."""
-
-    folder: Path
-    asked: CallContext
-
-
-@dataclass(frozen=True)
 class Asking:
     """What the planner was answered to each question, and what it had to read before any."""
 
@@ -114,17 +103,8 @@ class Asking:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """Three laps of which the last split is open: the robot stands on its dock again."""
-    folder = tmp_path_factory.mktemp("bags")
-    start = ns_from_unix(STARTED_S)
-    now = ns_from_unix(ASKED_AT_S)
-    timeline = MessageSchedule(start, start + ns_from_unix(HEARD_AFTER_S))
-    recorder = DemoRecorder(folder / "flat", timeline, split_duration_s=10.0, clock=FixedClock(now))
-    recorder.write_until(now)
-    for path in folder.rglob("*.mcap"):
-        os.utime(path, ns=(now, now))  # however long it took to write them
-    yield World(folder, CallContext(timeline, now, now, recorder.closed_ends(now, now)))
-    recorder.stop()
+    with recorded(tmp_path_factory.mktemp("bags")) as world:
+        yield world
 
 
 @pytest.fixture(scope="module", params=["plain", "catalogue"])
