@@ -1,0 +1,113 @@
+"""Which robot last saw something is asked of the catalogues: no bag is opened to rule it out."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.bootstrap import build_backfill, build_memory, shared_parts
+from ros2_memory.bootstrap_fleet import robot_settings
+from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.config import load_settings
+from ros2_memory.core.timebase import WallClock
+from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.fleet.tools import fleet_tools
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.spec_tools import build_tools
+from tests.support.fleets import LENGTH_S, seeded, write_robot
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import Channel, Record
+
+NAMES = ("r1", "r2", "r3")
+
+
+class Noting(McapReader):
+    """Notes the bags of which it is asked anything."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.opened: set[str] = set()
+
+    def _note(self, path: Path) -> None:
+        self.opened.add("/".join(path.parts[-3:]))
+
+    def summarize(self, path: Path) -> BagSummary:
+        self._note(path)
+        return super().summarize(path)
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self._note(path)
+        return super().records(path, topics, window, newest_first=newest_first)
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        self._note(path)
+        return super().newest(path, topic, window)
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        self._note(path)
+        return super().log_times(path, topic, window)
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        self._note(path)
+        return super().channels(path)
+
+
+@pytest.mark.parametrize("label", ["mug", "elephant"])
+def test_only_the_bag_of_the_newest_sight_is_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, label: str
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "robots"
+    for name in NAMES:
+        write_robot(seeded(name), folder / name)
+    settings = load_settings([f"fleet.robots={folder}/*"], {"MEMORY_DEPLOYMENT": "fleet"})
+    shared = shared_parts(settings)
+    for name in NAMES:
+        own = robot_settings(settings, name)
+        memory = build_memory(own, shared)
+        memory.index.refresh()
+        fill_catalogue(build_backfill(own, memory))
+        assert memory.recall is not None
+        memory.recall.catalogue.close()
+    reader = Noting()
+    noted = shared._replace(reader=reader)
+    fleet = Fleet(
+        [
+            Robot(name, folder / name, partial(build_memory, robot_settings(settings, name), noted))
+            for name in NAMES
+        ],
+        WallClock(),
+    )
+    declared = fleet_tools(build_tools(QuerySettings()), fleet, 10**6)
+    [tool] = [each for each in declared if each.name == "find_last_match"]
+    # The memory is that of no robot.
+    none: Any = None
+    given = {"topic": "/vision/*", "condition_type": "contains", "value": label}
+    answer = tool.question(given)(none, Call())
+    found = json.loads(Replies(folder, 10**6).answer(answer).text)
+    expected = set()
+    for robot in map(seeded, NAMES):
+        times = [at - robot.start_s for at, what in robot.seen if what == label]
+        if times:
+            expected.add(f"{robot.name}/rec/rec_{times[-1] // (LENGTH_S // 2)}.mcap")
+    assert len(found["matches"]) == len(expected)
+    assert reader.opened == expected
