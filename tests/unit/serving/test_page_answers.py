@@ -32,7 +32,13 @@ from ros2_memory.serving.page import span
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import moment_request, page_routes, span_request
-from ros2_memory.serving.page.span import MOST_POINTS, cut, span_shown, thinned
+from ros2_memory.serving.page.span import (
+    MOST_POINTS,
+    cut,
+    driven_cells,
+    span_shown,
+    thinned,
+)
 from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
@@ -445,3 +451,23 @@ async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes
         assert "remember_moment writes" in refused["detail"]
         for arguments in ("[]", "{", "[" * 100):
             assert (await asked("data_time_range", arguments)).status_code == 400
+
+
+@given(seed=st.integers(0, 2**32), size=st.sampled_from([1.0, 50.0, 5_000.0]))
+def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: float) -> None:
+    """Every point between two poses of a piece is within a cell of one."""
+    draw = np.random.default_rng(seed)
+    count = 60
+    begins = draw.random(count) < 0.1
+    begins[0] = True
+    x, y = draw.random((2, count)) * size
+    times = BEGIN + np.arange(count, dtype=np.int64) * S
+    found: Any = driven_cells(RobotTrack(times, x, y, np.zeros(count), begins, 0.0))
+    side = found["size"]
+    cells = (np.array([found["x"], found["y"]]).T + 0.5) * side
+    share = np.linspace(0, 1, 40)[:, None, None]
+    ends = np.stack([x, y], axis=1)
+    driven = (ends[:-1] + (ends[1:] - ends[:-1]) * share)[:, ~begins[1:]].reshape(-1, 2)
+    away = np.abs(driven[:, None] - cells[None]).max(axis=2)
+    assert away.min(axis=1).max(initial=0) <= 1.51 * side
+    assert len(cells) <= 8_000

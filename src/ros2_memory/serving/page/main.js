@@ -154,7 +154,7 @@ function continued(view, reply) {
     const from = first < 0 ? older : Math.min(first, older);
     const column = (name) => [...view.path[name].slice(from, older), ...path[name]];
     const isNew = older === from || !path.continues;
-    next.path = { ...path, t: column("t"), x: column("x"), y: column("y"), yaw: column("yaw"),
+    next.path = { ...path, cells: view.path.cells, t: column("t"), x: column("x"), y: column("y"), yaw: column("yaw"),
       begins: [...new Set([0, ...view.path.begins.filter((each) => each > from && each < older)
         .map((each) => each - from),
       ...path.begins.slice(isNew ? 0 : 1).map((each) => each + older - from)])] };
@@ -226,7 +226,7 @@ function showRecordings(view) {
   const hidden = (view.recordings_total || 0) - rows.length;
   const named = (each) => `${each.name}${each.holds ? ` (${counted(each.holds, "recording")})` : ""}, `
     + `${clock(each.start)}, ${lasting(each.end - each.start)}`;
-  const all = `all${hidden > 0 ? ` (the newest ${rows.length} are listed)` : ""}`;
+  const all = hidden > 0 ? `all; newest ${rows.length} listed` : "all";
   const options = [["", all], ...rows.map((each) => [each.name, named(each)])];
   if (!options.some(([value]) => value === state.recording)) {
     options.splice(1, 0, [state.recording, state.recording]);
@@ -318,7 +318,10 @@ function pointed(t, isChosen) {
   }
   head("At this time", clock(shown), state.t !== null);
   restLater = setTimeout(() => ask({ t: shown.toFixed(3) },
-    (answer) => showMoment(at("moment"), answer, map.at(shown), (label) => chooseLabel(label))),
+    (answer) => {
+      map.correct(answer);
+      showMoment(at("moment"), answer, map.at(shown), (label) => chooseLabel(label));
+    }),
   isChosen ? 0 : REST_MS);
 }
 function head(title, text, isChosen = false) {

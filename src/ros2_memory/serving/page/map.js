@@ -87,6 +87,13 @@ class RobotMap {
     this.moments = t === null || !this.isApart ? [] : this.paths.map((each) => this.at(t, each));
     this.draw();
   }
+  /* Puts it where an answer has it: between points of a long path it is not known. */
+  correct(answer) {
+    const [path] = this.paths;
+    if (!answer.robot || this.isApart || !path || !path.cells || answer.frame !== path.frame) return;
+    this.moment = { x: answer.robot.x, y: answer.robot.y, yaw: answer.robot.yaw_deg };
+    this.draw();
+  }
   choose(thing) {
     this.chosen = thing;
     this.draw();
@@ -143,7 +150,7 @@ class RobotMap {
     let best = { t: null };
     let least = NEAR_PX;
     for (const path of this.paths) for (let n = 0; n < path.t.length; n++) {
-      const last = n + 1 === path.t.length || path.starts.has(n + 1);
+      const last = n + 1 === path.t.length || path.starts.has(n + 1) || path.cells;
       const to = last ? n : n + 1;
       const [ax, ay] = [this.px(path.x[n]), this.py(path.y[n])];
       const [dx, dy] = [this.px(path.x[to]) - ax, this.py(path.y[to]) - ay];
@@ -294,13 +301,23 @@ class RobotMap {
       c.strokeStyle = colour(ofPath(index));
       c.lineWidth = 2;
       c.beginPath();
-      for (let n = 0; n < path.t.length; n++) {
+      this.drawCells(c, path.cells, colour(ofPath(index)));
+      const first = path.cells ? lastBefore(path.t, path.cells.until) : 0;
+      for (let n = first; n < path.t.length; n++) {
         const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
-        if (path.starts.has(n)) c.moveTo(x, y);
+        if (path.starts.has(n) || n === first) c.moveTo(x, y);
         else c.lineTo(x, y);
       }
       c.stroke();
     });
+  }
+  /* Of a long time, where the path was: lines between some of its points would cut corners. */
+  drawCells(c, cells, fill) {
+    if (!cells) return;
+    const wide = Math.max(cells.size * this.scale + 0.5, 2);
+    c.fillStyle = fill;
+    cells.x.forEach((x, n) => c.fillRect(this.px(x * cells.size),
+      this.py(cells.y[n] * cells.size) - wide, wide, wide));
   }
   drawStops(c) {
     c.fillStyle = colour("stood");

@@ -27,7 +27,7 @@ function seenRows(seen, choose) {
 }
 
 function showMoment(host, answer, robot, choose) {
-  const extra = [];
+  const extra = answer.frame ? [entry("Frame", bdi(answer.frame))] : [];
   for (const each of answer.seen) delete each.end;  // only what is around the moment was looked at
   if (answer.speed !== null) extra.push(entry("Speed", `${answer.speed.toFixed(2)} m/s`));
   for (const [name, value] of Object.entries(answer.state)) {

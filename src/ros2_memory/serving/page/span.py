@@ -61,6 +61,8 @@ _QUICK_S: Final = 0.8
 _PART_S: Final = 8.0
 """How long each part of an answer may take; of a patient one the latter. The page shows what there
 is, and asks again for the rest."""
+_CELLS_ACROSS: Final = 400
+_MOST_CELLS: Final = 8_000
 _NEWEST_BAGS: Final = 3
 _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
@@ -269,7 +271,9 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
 
 def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
     kept = thinned(track.x, track.y, track.times)
+    cells: JsonObject = {"cells": driven_cells(track)} if len(kept) < len(track.times) else {}
     return {
+        **cells,
         "frame": frame_id,
         "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
         "x": np.round(track.x[kept], 2).tolist(),
@@ -326,6 +330,32 @@ def thinned(
         order = np.lexsort((values, part))
         kept.append(order[starts])
     return np.unique(np.concatenate(kept))
+
+
+def driven_cells(track: RobotTrack) -> JsonObject:
+    """Returns the cells of a grid that a long track passes: a line between far times cuts corners.
+
+    `size` is in metres; a cell `x`, `y` begins there times the size. `until`: Unix seconds.
+    """
+    dx, dy = np.diff(track.x), np.diff(track.y)
+    lengths = np.where(track.begins[1:], 0.0, np.hypot(dx, dy))
+    size = max(float(np.ptp(track.x)), float(np.ptp(track.y)), 1.0) / _CELLS_ACROSS
+    while True:
+        counts = np.ceil(lengths / size).astype(np.int64)
+        part = np.repeat(np.arange(len(counts)), counts)
+        nth = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
+        share = nth / counts[part]
+        at = np.stack([track.x[part] + dx[part] * share, track.y[part] + dy[part] * share])
+        cells = np.unique(np.floor(at / size).astype(np.int64), axis=1)
+        if cells.shape[1] <= _MOST_CELLS:
+            break
+        size *= 1.5
+    return {
+        "size": size,
+        "x": cells[0].tolist(),
+        "y": cells[1].tolist(),
+        "until": _s(int(track.times[-1])),
+    }
 
 
 def _begins(track: RobotTrack, kept: NDArray[np.intp]) -> list[JsonValue]:

@@ -256,6 +256,11 @@ class Timeline {
     c.fillStyle = colour("grid");
     c.fillRect(GUTTER, middle - 0.5, this.wide, 1);
     const isSeen = lane === "seen";
+    const { counts = {} } = this.view;
+    if (isSeen && !this.lanes.seen.length && counts["sights of things"]) {
+      c.fillStyle = colour("soft");
+      c.fillText(`${counts["sights of things"]} sights of things: zoom in to see when`, GUTTER + 6, middle + 4);
+    }
     for (const each of this.lanes[lane]) {
       const left = this.x(each.t);
       const wide = Math.max(this.x(each.end === undefined ? each.t : each.end) - left, 0);
