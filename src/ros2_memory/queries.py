@@ -599,7 +599,7 @@ def _topics_of(bag: BagFile) -> frozenset[str]:
 
 
 def _note_odd_bags(view: View) -> None:
-    """Notes what is odd about the newest odd bags, but for crashes and wrong clocks."""
+    """Notes what is wrong with the newest faulty bags, except crashes and wrong clocks."""
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(view.snapshot)]
     for sentence in by_remark(odd, _MAX_ODD_BAGS):
         view.notes.add(sentence)

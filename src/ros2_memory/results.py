@@ -451,7 +451,7 @@ class Status(AnswerWithNotes):
         latest: the newest one.
         recorder: its state; None where no recorder has written here.
         live: whether it is running.
-        restarts: how often it had to restart `ros2 bag record`; 0 where there is none.
+        restarts: how often it restarted `ros2 bag record`; 0 without a recorder.
         missing: topics that it should record by name, and that no publisher offers.
         never_heard: topics it subscribed to that brought no message.
         lost: how many messages of each topic are known to be missing of the recorder's last hour.

@@ -1,4 +1,4 @@
-"""Folds the digests of a topic segment by segment, so that a week need not be joined anew.
+"""Folds the digests of a topic segment by segment, so that a week is not joined again each time.
 
 What is joined from the bags of a whole segment is kept for as long as the segment is in use. Bags
 that have no digest are read, the newest first, for a few seconds: what is older is left out then,

@@ -246,7 +246,7 @@ class BagAccess:
                 self._note_unreadable(bag, error, since)
                 if error.lost is None:
                     return
-                # Only a part of the bag is lost: the reader goes on behind it.
+                # Only part of the bag is lost: the reader continues after it.
             else:
                 return
             finally:

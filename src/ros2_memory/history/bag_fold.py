@@ -36,7 +36,7 @@ _CROSSINGS: Final[WeakKeyDictionary[Timeline, _Crossings]] = WeakKeyDictionary()
 _NUMBERS: Final[WeakKeyDictionary[Timeline, int]] = WeakKeyDictionary()
 _COUNTER: Final = count()
 JOINED_VERSION: Final = 1
-"""Of how digests are joined, and of how that is encoded: another one has it joined anew."""
+"""Version of how digests are joined and encoded; when it changes, they are joined again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +185,7 @@ class Fold(Generic[T, R]):
         reduce: joins consecutive digests, at least one, as far as that can be done for whatever
             comes before and after them. It stays in memory, so later questions need not.
         encode: what `reduce` returned as bytes.
-        decode: the bytes as it; ValueError where they are none.
+        decode: reads the value from bytes; ValueError if they are invalid.
         failures: where `add` and `collect` put messages that cannot be decoded; a digest without
             these is not stored.
         name: of what `reduce` depends on besides the kind.

@@ -142,7 +142,7 @@ def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Grou
         recording = each.bag.recording
         before = latest.get(recording)
         if before is not None and len(latest) == 1:
-            # One recording goes on, as nearly everywhere.
+            # One recording continues, as almost always.
             belongs = each.first < before
         else:
             oldest = each.first - COPY_HORIZON_NS
@@ -187,7 +187,7 @@ class DigestKind(Generic[T]):
         name: part of the key under which the catalogue stores one; never changes its meaning.
         look_up: those that the catalogue has of a topic, for some entries of one segment of bags.
         encode: a digest as bytes.
-        decode: the bytes as a digest; ValueError where they are none.
+        decode: reads a digest from bytes; ValueError if they are invalid.
     """
 
     name: str

@@ -68,7 +68,7 @@ def note_unread(
     odd = [
         bag
         for bag in view.snapshot.timeline.faulty(window)
-        # No remark says that a crash left a bag open.
+        # There is no note about bags that a crash left open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
     bag_dir = view.memory.index.bag_dir

@@ -45,7 +45,7 @@ _MOST_TEMPLATES: Final = 16
 """Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
 _MOST_FRAMES: Final = 3
-"""Topics of which the frame is told: each costs a message."""
+"""Topics whose frame is named: each costs one message."""
 _MOST_TRUTHS: Final = 65_536
 """Messages of which it is known whether they met a condition: some 8 MB for each question."""
 

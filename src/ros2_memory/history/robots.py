@@ -152,7 +152,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
 def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
     """Returns sentences where robots are plainly mixed into one history, a minute old at most.
 
-    With a week of bags it takes 0.1 s to look anew, and the page asks every few seconds.
+    With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
     now = memory.clock.now()
     at, known = _DESCRIBED.get(memory.index, (None, ()))
@@ -246,7 +246,7 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
 def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     """Notes the recordings that hold messages of their own on a topic at the same time.
 
-    Nothing is noted of latched topics, which each recording receives anew, and where the time for
+    Adds no note about latched topics, which each recording receives again, or where the time for
     the answer is over before it is known.
     """
     if topic in view.snapshot.timeline.transient_local:

@@ -37,7 +37,7 @@ Session: TypeAlias = frozenset[str]
 """The folders of its recordings, as they were named when they were recorded."""
 
 _AROUND_NS: Final[Ns] = 10 * NS_PER_S
-"""A recording goes on at a moment with a bag so near: the length of tf2's cache."""
+"""A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
 _JOINED: Final[WeakKeyDictionary[Timeline, Mapping[str, Session]]] = WeakKeyDictionary()
 """Caches the chains of a timeline, for which sidecars are read; a new bag makes a new one."""
 

@@ -449,7 +449,7 @@ def _link(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
 
 
 def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
-    """Returns the failure of a lookup by header stamps, wherever in log time they were recorded."""
+    """Returns why a lookup by header stamps failed; the log times may be anywhere."""
     if nothing_near:
         return NoDataError(
             NoDataReason.OUTSIDE_RANGE,

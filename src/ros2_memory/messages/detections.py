@@ -153,7 +153,7 @@ def _is_below(value: dict[str, JsonValue], least: float) -> bool:
 
 
 def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
-    """Returns the detection that an object is; None where it is none."""
+    """Returns an object as a detection; None if it is not one."""
     label = _label(value)
     if label is not None:
         return Detection(label, _position(value), frame_id, _score(value))

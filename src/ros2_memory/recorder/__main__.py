@@ -138,7 +138,7 @@ def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
 def _put_in_order(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) -> None:
     """Repairs what a crash left, completes handovers, and begins to apply the limits.
 
-    A failure is reported, and recording begins all the same.
+    A failure is reported, and recording starts anyway.
     """
     tasks: dict[str, Callable[[], None]] = {
         "repair": housekeeper.repair,

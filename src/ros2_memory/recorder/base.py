@@ -123,7 +123,7 @@ class Housekeeper:
         """Takes up that a recording ended unasked, and another one begins."""
 
     def announce(self, recording: str) -> None:
-        """Takes up that a recording is about to be begun; nothing of it exists yet.
+        """Records that a recording is about to start; no file of it exists yet.
 
         Raises:
             RecorderError: it must not begin, since what is to be excluded of it could be served.

@@ -318,7 +318,7 @@ class Housekeeping(Housekeeper):
             for name in names:
                 if name.endswith(_MCAP) and not left_by_repair(name):
                     self._repair(directory / name)
-            # In case the recording had nothing but empty splits.
+            # In case all splits of the recording were empty.
             remove_emptied(self._bag_dir, directory)
         except OSError as error:
             _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
@@ -453,7 +453,7 @@ class BackgroundHousekeeper(Housekeeper):
         self._housekeeper.note_restart()
 
     def announce(self, recording: str) -> None:
-        """Takes up at once that a recording is about to be begun."""
+        """Records at once that a recording is about to start."""
         self._housekeeper.announce(recording)
 
     def screen(self, live: Collection[str]) -> None:

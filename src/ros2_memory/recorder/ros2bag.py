@@ -204,7 +204,7 @@ class Ros2BagRecorder(Recorder):
             storage_file=storage_file,
             node_name=node_name(name),
             cache_bytes=self._queue_bytes,
-            # Below where recording pauses: it ends by itself only if nobody pauses it.
+            # Below the limit at which recording pauses, so it ends only if it was not paused.
             min_free_bytes=self._min_free_bytes // 2,
             use_sim_time=self._use_sim_time,
             repeat_latched=self._repeat_latched,

@@ -81,7 +81,7 @@ class RecordingSessions:
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None mostly.
         restarts: how often a recording had to be started again.
-        waiting_for: why nothing has come since recording was begun, as a sentence; else None.
+        waiting_for: why no message has arrived since recording started, as a sentence; else None.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class RecordingSessions:
         return closed
 
     def _check_waiting(self, now: ClockReading) -> None:
-        """Finds out whether anything has come since recording was begun.
+        """Checks whether any message has arrived since recording started.
 
         What was heard once is silent later, and not waited for.
         """

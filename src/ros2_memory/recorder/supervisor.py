@@ -50,7 +50,7 @@ SETTLE_S: Final = 5.0
 RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
-"""How often the limits are applied when no split was closed: bags grow old all the same."""
+"""How often the limits are applied when no split was closed: bags still get older."""
 HEARTBEAT_S: Final = 5.0
 TYPES_S: Final = 15.0
 """By then a recording has subscribed to all topics of known types that are offered."""
@@ -144,7 +144,7 @@ class Supervisor:
         """Begins a first recording, unless one is under way or the disk is full.
 
         Raises:
-            RecorderError: it cannot be begun.
+            RecorderError: it cannot start.
         """
         if not self.stopped:
             return

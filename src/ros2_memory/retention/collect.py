@@ -217,7 +217,7 @@ class GarbageCollector:
             }
             carried = self._carrier.carry(snapshot, paths, run.saved)
         except (EpisodicError, OSError) as error:
-            # Bags without latched messages can be deleted all the same, and may make enough room.
+            # Bags without latched messages can still be deleted, and may free enough space.
             reason = f"its latched messages cannot be carried on: {error}"
             for each in to_delete:
                 if each.path in latched:

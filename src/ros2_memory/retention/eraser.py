@@ -1,4 +1,4 @@
-"""Takes messages out of bags by writing these anew, with all that names or repeats them.
+"""Deletes messages by rewriting their bags, and all files that name or repeat them.
 
 What goes is written down first (`bag_dir.state.erasure_file`), so that an interrupted erasure can
 be finished. Then for each bag: its messages leave the sidecar; the bag is written anew beside
@@ -105,7 +105,7 @@ class Eraser:
     Args:
         bag_dir: where the bags lie.
         reader: reads files as they are, also what does not count in answers.
-        writer: writes them anew.
+        writer: rewrites them.
         own: the recordings that may be changed; None: all.
         written: files that are still being written, and what they may hold; None: unknown.
         recorder: why a recorder holds the directory; None where none does, nor can begin to.
@@ -222,10 +222,10 @@ class Eraser:
         Raises:
             OSError: it cannot be written down.
         """
-        told = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
+        known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
         counts = [(each.topic, each.start, each.stop, each.count) for each in erasure.counts]
         losses = [Loss(*each, "forgotten") for each in counts]
-        append_losses(self._bag_dir, [each for each in losses if each not in told])
+        append_losses(self._bag_dir, [each for each in losses if each not in known])
 
     def _files(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
@@ -251,7 +251,7 @@ class Eraser:
             reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
         elif self._reader.closing(path) is Closing.OPEN or not summary.complete:
             reason = "a crash left it open; ros2-memory recover closes it"
-        # Nothing in such a file says that its writer has finished.
+        # Such a file does not show whether its writer has finished.
         elif path.suffix == ".db3" and inode in open_files():
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
@@ -320,10 +320,10 @@ class Eraser:
         left_of: Mapping[str, Counter[str]],
         kept: list[str],
     ) -> None:
-        """Writes one file anew, in place of all its names.
+        """Rewrites one file, under all its names.
 
         Raises:
-            EpisodicError: it cannot be written anew.
+            EpisodicError: it cannot be rewritten.
             OSError: likewise, or it is another file now.
         """
         for path in holder.paths:

@@ -168,7 +168,7 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
     """Plans which bags to delete: all that are too old, then no more than the limits need.
 
     Where deleting everything that may go would not free enough of the disk, nothing is deleted for
-    that: it would cost all history, and recording would have to pause all the same.
+    that: it would cost all history, and recording would still have to pause.
     """
     found, free = _planned(stock, limits)
     if found.fits or free is None or free >= limits.min_free_bytes:

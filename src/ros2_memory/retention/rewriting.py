@@ -1,4 +1,4 @@
-"""Writes a bag anew without some of its messages, in place of the old file, and durably."""
+"""Rewrites a bag without some of its messages: replaces the old file, and syncs it."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def rewritten(
         bag_dir: the bag directory, behind no link in which the file must lie.
         path: the old file.
         before: its status; the file must still be the same at the end.
-        writer: writes it anew.
+        writer: rewrites it.
         takes: whether a message goes, by topic, log time and publish time.
         expected: how many messages go, by topic.
         left_of: what every file of the recording holds afterwards, see `recounted`.
 
     Raises:
-        EpisodicError: it cannot be written anew, and nothing is changed.
+        EpisodicError: it cannot be rewritten; nothing is changed.
         OSError: likewise, or it is another file now.
     """
     with directories.opened(bag_dir, path.parent) as folder:

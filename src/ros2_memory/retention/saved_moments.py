@@ -413,7 +413,7 @@ class MomentKeeper:
         return tuple(missing), linked
 
     def _remove_unbegun(self) -> None:
-        """Removes what a crash left of a moment that had not begun."""
+        """Removes files of a moment that a crash interrupted before it started."""
         with suppress(OSError):
             for folder in moments_of(self._bag_dir).iterdir():
                 if _OWN_FOLDER.fullmatch(folder.name) and not (folder / MOMENT_FILE).exists():

@@ -265,7 +265,7 @@ def _is_address(name: str) -> bool:
 
 
 def api_token(env: Mapping[str, str]) -> SecretStr | None:
-    """Returns the token that clients have to show; None where there is none.
+    """Returns the token that clients must send; None if no token is configured.
 
     It is `MEMORY_API_TOKEN`, the content of the file that `MEMORY_API_TOKEN_FILE` names, or that of
     `memory_api_token` in `CREDENTIALS_DIRECTORY`, which systemd sets. An empty variable counts as

@@ -145,7 +145,7 @@ class EpisodicServer(MCPServer[object]):
             name,
             version=version,
             instructions=instructions,
-            # No list changes while the server runs, and nobody is notified of anything.
+            # Lists do not change while the server runs, so no notifications are sent.
             subscriptions=False,
             cache_hints=dict.fromkeys(_LISTS, LISTS_CACHED),
         )

@@ -289,7 +289,7 @@ class BagWriter(ABC):
     ) -> Counter[str]:
         """Writes a whole file again, of any kind but compressed ones, without some messages.
 
-        All else is unchanged, as by `rewrite`, but for the counts that rosbag2 embeds. The target
+        All else is unchanged, as by `rewrite`, except the counts that rosbag2 embeds. The target
         was read back and compared, and is on the disk, when this returns. There must be no file of
         its name; the source is only read.
 

@@ -230,7 +230,7 @@ class Screening:
             except BagUnreachableError:
                 raise
             except BagError as error:
-                # What it said of a topic is not known: nor is then what holds after it.
+                # Its content is unknown, and so is the state of the condition after it.
                 for heard in screen.heard.values():
                     if heard and not heard[-1].holds:
                         at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
-"""A recorder that has not begun to record after so long is given up."""
+"""A recorder that has not started to record after this time is given up."""
 BOTH_S: Final = 2.0
 STEP_NS: Final[Ns] = 100 * NS_PER_MS
 """A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""

@@ -97,7 +97,7 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
 def burst_of(published: Sequence[Ns]) -> int:
     """Returns the most messages within `HOLD_S`.
 
-    A topic that did not last so long is taken to go on at its rate: it may have begun just now.
+    A shorter topic is assumed to continue at its rate: it may have just started.
     """
     ordered = sorted(published)
     most, first = 0, 0

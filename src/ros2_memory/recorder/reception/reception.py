@@ -103,7 +103,7 @@ class Reception:
             return plan_queues(self._planned_for(), self._queue_bytes).cut_short
 
     def overrides(self, recording: str) -> str:
-        """Returns the QoS overrides for a recording that is about to be begun."""
+        """Returns the QoS overrides for a recording that is about to start."""
         with self._lock:
             plan = plan_queues(self._planned_for(), self._queue_bytes)
             self._recordings[recording] = _Recording(plan, set())
@@ -199,7 +199,7 @@ class Reception:
             return Rotation("queues_deepened", _deeper(shallow), shallow) if shallow else None
 
     def rotation_begun(self, rotation: Rotation, now_s: float) -> None:
-        """Notes that a rotation was begun for this reason."""
+        """Records why a rotation was started."""
         with self._lock:
             if rotation.event == "asking_again":
                 self._asked_s |= dict.fromkeys(rotation.topics, now_s)

@@ -96,7 +96,7 @@ def span_request(given: QueryParams) -> SpanRequest:
     """Returns what a query string asks of `/page/span`.
 
     Raises:
-        InvalidArgumentsError: a number is none, a signal is none, or they are too many.
+        InvalidArgumentsError: a number or a signal is invalid, or there are too many signals.
     """
     signals = given.getlist("signal")
     if len(signals) > MOST_SIGNALS:
@@ -119,7 +119,7 @@ def moment_request(given: QueryParams) -> MomentRequest:
     """Returns what a query string asks of `/page/moment`.
 
     Raises:
-        InvalidArgumentsError: a number is none, or the label is too long.
+        InvalidArgumentsError: a number is invalid, or the label is too long.
     """
     label = _short(given, "label", _LONGEST_LABEL)
     return MomentRequest(

@@ -41,7 +41,7 @@ class Signal(NamedTuple):
         """Returns the signal of `/topic:field`.
 
         Raises:
-            InvalidArgumentsError: it is none.
+            InvalidArgumentsError: it has another form.
         """
         topic, colon, field = text.rpartition(":")
         if not (topic and colon and field):
@@ -60,7 +60,7 @@ def signal_in(
 ) -> JsonObject:
     """Returns a signal in a window, in bins as wide as those of the whole `span`.
 
-    What is wrong with one signal is part of the answer: others are shown all the same.
+    An error in one signal is part of the answer; the others are still shown.
     """
     shown: JsonObject = {"topic": signal.topic, "field": signal.field}
     try:

@@ -125,7 +125,7 @@ def span_shown(
     `progress`: how far the catalogue is filled; `questions`: the latest ones, if these are kept.
 
     Raises:
-        InvalidArgumentsError: the span is none, or a signal is not recorded.
+        InvalidArgumentsError: the span is invalid, or a signal is not recorded.
         QueryTimeoutError: the call's time is over.
     """
     filling = None if progress is None else progress()
@@ -395,16 +395,16 @@ def _place(place: Place) -> JsonObject:
 
 def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
     span = TimeRange(_s(window.start), _s(window.stop - 1) + 0.001)
-    told = recap(memory, call, span, most_events=MOST_EVENTS, with_changes=False)
+    found = recap(memory, call, span, most_events=MOST_EVENTS, with_changes=False)
     shown: JsonObject = {
-        "events": [event_shown(each) for each in told.events],
-        "throughout": [*told.throughout],
-        "distance_m": None if told.distance_m is None else rounded(told.distance_m, 1),
-        "max_speed": None if told.max_speed is None else rounded(told.max_speed, 2),
-        "stood_s": None if told.stood is None else round(unix_from_ns(told.stood), 1),
-        "counts": dict(told.counts),
+        "events": [event_shown(each) for each in found.events],
+        "throughout": [*found.throughout],
+        "distance_m": None if found.distance_m is None else rounded(found.distance_m, 1),
+        "max_speed": None if found.max_speed is None else rounded(found.max_speed, 2),
+        "stood_s": None if found.stood is None else round(unix_from_ns(found.stood), 1),
+        "counts": dict(found.counts),
     }
-    return Shown(shown, told.notes)
+    return Shown(shown, found.notes)
 
 
 def event_shown(event: Event) -> JsonObject:

@@ -192,7 +192,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
     """Returns the index that the summary section gives.
 
     Raises:
-        DoubtError: there is none to rely on; the file must be scanned.
+        DoubtError: the index is missing or unreliable; the file must be scanned.
     """
     try:
         return _index_from_summary(file)

@@ -111,7 +111,7 @@ def read_summary(file: OpenFile) -> Summary:
     """Returns the summary section of a file.
 
     Raises:
-        DoubtError: there is none, or it does not match its checksum.
+        DoubtError: it is missing, or does not match its checksum.
         UnreadableError, struct.error and others: it is damaged.
     """
     start, section = _section(file)

@@ -91,7 +91,7 @@ def file_records(file: OpenFile) -> Iterator[FileRecord]:
         head = block[offset - block_at : offset - block_at + MESSAGE.size]
         opcode, length = RECORD.unpack_from(head)
         end = offset + RECORD.size + length
-        # Opcode 0 is none: blocks of a file that never reached the disk read as zeros.
+        # Opcode 0 is invalid: blocks that never reached the disk read as zeros.
         if opcode in {0, Opcode.FOOTER} or (opcode == Opcode.MESSAGE and length < MESSAGE_FIELDS):
             return
         if end <= file.size or opcode == Opcode.CHUNK:

@@ -1,4 +1,4 @@
-"""Writes MCAP files: closed, indexed, checked, and on the disk; also others anew, without some."""
+"""Writes MCAP files: closed, indexed, checked, synced; also rewrites files without some."""
 
 from __future__ import annotations
 
