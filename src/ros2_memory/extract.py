@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -36,6 +37,7 @@ from ros2_memory.messages.conversions import (
     number,
     quadruple,
     rotation,
+    summaries_of,
     triple,
     unit,
     view,
@@ -47,6 +49,7 @@ from ros2_memory.messages.fields import (
     Route,
     Segments,
     descend,
+    field_table_of_class,
     names_of,
     parse_path,
 )
@@ -62,14 +65,16 @@ MAX_SHOWN_CHARS: Final = 20_000
 """A longer value would fill a reply alone, and is thinned harder."""
 
 _LISTED_NAMES: Final = 40
+_AS_JSON: Final = json.JSONEncoder(separators=(",", ":")).encode
 
 
 @dataclass(frozen=True, slots=True)
 class Extracted:
-    """A value for a reply, and sentences on what was left out of it."""
+    """A value for a reply, sentences on what was left out of it, and its JSON in ASCII."""
 
     value: JsonValue
     notes: tuple[str, ...]
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +143,9 @@ _FRAME: Final = Route("header", "frame_id")
 _CHILD_FRAME: Final = Route("child_frame_id")
 _STAMP: Final = Route("header", "stamp")
 _TRANSFORMS: Final = Route("transforms")
+_STRAIGHT: Final[dict[tuple[type, Segments], Callable[[object], object] | None]] = {}
+_MAX_STRAIGHT: Final = 4096
+"""Getters of `_straight` by class and path."""
 _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
 _POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
@@ -211,9 +219,9 @@ class SchemaExtractor:
                 if nodes
                 else self._whole(rendering, message, type_name)
             )
-            fits = len(json.dumps(value, separators=(",", ":"))) <= self._max_chars
-            if fits or (limit == 1 and squeeze >= MAX_SQUEEZE):
-                return Extracted(value, rendering.notes)
+            text = _AS_JSON(value)
+            if len(text) <= self._max_chars or (limit == 1 and squeeze >= MAX_SQUEEZE):
+                return Extracted(value, rendering.notes, text)
             limit, squeeze = max(limit // 2, 1), squeeze * 2
 
     def pose(self, message: object, type_name: str) -> Pose | None:
@@ -411,8 +419,36 @@ def _converted(name: str, node: object) -> object:
 
 
 def _at(message: object, path: Segments) -> object:
+    key = (type(message), path)
+    if key not in _STRAIGHT:
+        if len(_STRAIGHT) >= _MAX_STRAIGHT:
+            _STRAIGHT.clear()
+        _STRAIGHT[key] = _straight(message, path)
+    straight = _STRAIGHT[key]
+    if straight is not None:
+        return straight(message)
     found = descend(message, path, view)
     return descend(message, path) if found is ABSENT else found
+
+
+def _straight(message: object, path: Segments) -> Callable[[object], object] | None:
+    """Returns a quick getter of a path in messages of this class; None where fields are converted.
+
+    A definition fixes the classes of all fields, so what holds for one message holds for all.
+    """
+    attributes, node = [], message
+    for name in path:
+        cls: type = type(node)
+        table = field_table_of_class(cls)
+        is_plain = table is not None and kind_of(node) is ValueKind.PLAIN
+        if table is None or not is_plain or name in summaries_of(table):
+            return None
+        attribute = table.attributes.get(name)
+        if attribute is None:
+            return None
+        attributes.append(attribute)
+        node = getattr(node, attribute)
+    return attrgetter(".".join(attributes))
 
 
 def _plain(node: object) -> object:

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.storage.base import BagReader
@@ -46,10 +48,14 @@ SCHEMA: Final = pa.schema(
 )
 _GROUP_ROWS: Final = 20_000
 """Rows of a row group: some megabytes."""
+_DAY_NS: Final = 86_400 * NS_PER_S
+_NO_POSE: Final = (None,) * 7
 _MAX_OPEN_FILES: Final = 16
 """Messages come in time order, so few recordings are written at a time."""
 
-Row = dict[str, object]
+_COLUMNS: Final = tuple(SCHEMA.names)
+Row = tuple[object, ...]
+"""The values of a message, in the order of the columns."""
 
 
 class _PartFile:
@@ -65,7 +71,8 @@ class _PartFile:
     def flush(self) -> None:
         """Writes the buffered rows as a row group."""
         if self.rows:
-            self.writer.write_table(pa.Table.from_pylist(self.rows, schema=SCHEMA))
+            columns = dict(zip(_COLUMNS, zip(*self.rows, strict=True), strict=True))
+            self.writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
             self.rows.clear()
 
     def close(self) -> None:
@@ -92,6 +99,7 @@ class Dataset:
         self._extractor = extractor
         self._open: OrderedDict[Path, _PartFile] = OrderedDict()
         self._parts: dict[Path, list[_PartFile]] = {}
+        self._newest: tuple[BagFile, Ns, _PartFile] | None = None
         self._cleanup = ExitStack()
         self.rows = 0
         self.files = 0
@@ -119,7 +127,14 @@ class Dataset:
             part.flush()
 
     def _part_for(self, stored: StoredMessage) -> _PartFile:
-        """Returns the file of a message's partition; closes the one that was unused for longest."""
+        """Returns the file of a message's partition."""
+        day = stored.time // _DAY_NS
+        if self._newest is None or self._newest[0] is not stored.bag or self._newest[1] != day:
+            self._newest = (stored.bag, day, self._part_of(stored))
+        return self._newest[2]
+
+    def _part_of(self, stored: StoredMessage) -> _PartFile:
+        """Opens that file, if need be, and closes the one that was unused for longest."""
         date = datetime.fromtimestamp(stored.time // NS_PER_S, tz=UTC).date()
         name = quote(stored.bag.recording.name, safe=" ")
         folder = self._root / f"recording={name}" / f"date={date}"
@@ -147,27 +162,23 @@ class Dataset:
 
     def _row(self, stored: StoredMessage) -> Row:
         record = stored.record
-        row: Row = {
-            "topic": record.channel.topic,
-            "type": record.channel.type,
-            "log_time": record.log_time,
-            "publish_time": record.publish_time,
-        }
+        topic, type_name = record.channel.topic, record.channel.type
+        row = (topic, type_name, record.log_time, record.publish_time)
         try:
             message = self._reader.decode(record)
         except UndecodableError as error:
-            return {**row, "undecodable": error.reason}
-        value = self._extractor.shown(message, record.channel.type).value
-        row["value"] = _without_surrogates(
-            json.dumps(value, ensure_ascii=False, separators=(",", ":"))
-        )
-        pose = self._extractor.pose(message, record.channel.type)
-        if pose is not None:
-            row["frame_id"] = _without_surrogates(pose.frame_id) or None
-            row.update(zip("xyz", pose.position, strict=True))
-            if pose.orientation is not None:
-                row.update(zip(("qx", "qy", "qz", "qw"), pose.orientation, strict=True))
-        return row
+            return (*row, None, error.reason, None, *_NO_POSE)
+        shown = self._extractor.shown(message, type_name)
+        text = shown.text
+        if "\\" in text:  # such as escaped letters, which UTF-8 holds as they are
+            text = _without_surrogates(
+                json.dumps(shown.value, ensure_ascii=False, separators=(",", ":"))
+            )
+        pose = self._extractor.pose(message, type_name)
+        if pose is None:
+            return (*row, text, None, None, *_NO_POSE)
+        frame = _without_surrogates(pose.frame_id) or None
+        return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))
 
 
 def _without_surrogates(text: str) -> str:

@@ -60,11 +60,12 @@ class ValueKind(Enum):
 def kind_of(node: object) -> ValueKind:
     """Returns how the extracted view shows a node; PLAIN for what is no message."""
     cls: type = type(node)
-    return _kind_of_class(cls)
+    return kind_of_class(cls)
 
 
 @lru_cache(maxsize=4096)
-def _kind_of_class(cls: type) -> ValueKind:
+def kind_of_class(cls: type) -> ValueKind:
+    """Returns how the extracted view shows the nodes of a class."""
     table = field_table_of_class(cls)
     if table is None:
         return ValueKind.PLAIN

@@ -9,6 +9,7 @@ numbers) is a summary there too.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -19,19 +20,19 @@ from ros2_memory.messages.conversions import (
     Metric,
     ValueKind,
     euler,
-    kind_of,
+    kind_of_class,
     nanoseconds,
     summaries_of,
     xyz,
 )
-from ros2_memory.messages.fields import ABSENT, field_table_of
+from ros2_memory.messages.fields import ABSENT, field_table_of, field_table_of_class
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.messages.fields import Array
+    from ros2_memory.messages.fields import Array, FieldTable
 
 MAX_DEPTH: Final = 24
 MAX_NOTES: Final = 20
@@ -96,6 +97,8 @@ def round_integer(number: int) -> JsonValue:
 
 def _whole_or_null(number: float) -> JsonValue:
     """Returns an int where the number is integral (so -0.0 is 0), and null where not finite."""
+    if number % 1.0 > 0.0:  # neither is
+        return float(number)
     if not math.isfinite(number):
         return None
     whole = int(number)
@@ -142,6 +145,25 @@ _ROUNDED: Final = NumberWriter(
 )
 
 
+class _Shape(NamedTuple):
+    """How messages of a class are written: each field's name, attribute, and what summarizes it."""
+
+    kind: ValueKind
+    fields: tuple[tuple[str, str, Callable[[object, object], object] | None], ...]
+
+
+@lru_cache(maxsize=4096)
+def _shape_of(cls: type) -> _Shape | None:
+    table = field_table_of_class(cls)
+    return None if table is None else _shape(kind_of_class(cls), table)
+
+
+def _shape(kind: ValueKind, table: FieldTable) -> _Shape:
+    summaries = summaries_of(table)
+    rows = ((name, each, summaries.get(name)) for name, each in table.attributes.items())
+    return _Shape(kind, tuple(rows))
+
+
 class ExactJson:
     """One walk over one message, which keeps all of it. Never raises because of its content.
 
@@ -178,21 +200,31 @@ class ExactJson:
         return self._write.real(number)
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
-        if isinstance(node, list | tuple):
-            return [self.value(one, path, depth) for one in self._elements(node, path)]
+        cls: type = type(node)
+        shape = _shape_of(cls)
+        if shape is not None:
+            return self._message(node, shape, path, depth)
         if isinstance(node, np.ndarray):
             return self._array(node, path, depth)
         if isinstance(node, np.generic):
             return self._scalar(node, path)
+        if isinstance(node, bytes | bytearray):
+            return self._array(np.frombuffer(node, dtype=np.uint8), path, depth)
+        return self._composed(node, path, depth)
+
+    def _composed(self, node: object, path: str, depth: int) -> JsonValue:
+        if isinstance(node, list | tuple):
+            return [self.value(one, path, depth) for one in self._elements(node, path)]
         if isinstance(node, dict):
             entries = self._entries(node, path)
             return {name: self.value(node, _join(path, name), depth) for name, node in entries}
-        if isinstance(node, bytes | bytearray):
-            return self._array(np.frombuffer(node, dtype=np.uint8), path, depth)
-        return self._message(node, path, depth)
+        table = field_table_of(node)
+        if table is None:
+            return self._text(f"<{type(node).__name__}>", path)
+        return self._message(node, _shape(ValueKind.PLAIN, table), path, depth)
 
-    def _message(self, node: object, path: str, depth: int) -> JsonValue:
-        kind = kind_of(node)
+    def _message(self, node: object, shape: _Shape, path: str, depth: int) -> JsonValue:
+        kind = shape.kind
         if kind is ValueKind.QUATERNION:
             return self._rotation(node, path)
         if kind is ValueKind.TIME:
@@ -203,16 +235,12 @@ class ExactJson:
             x, y, z = vector
             metric = self._write.metric
             return {"x": metric(x), "y": metric(y), "z": metric(z)}
-        table = field_table_of(node)
-        if table is None:
-            return self._text(f"<{type(node).__name__}>", path)
-        summaries = summaries_of(table)
         fields: dict[str, JsonValue] = {}
-        for name, attribute in table.attributes.items():
+        for name, attribute, summarize in shape.fields:
             found: object = getattr(node, attribute, ABSENT)
-            if name in summaries:
-                found = summaries[name](node, found)
-            fields[name] = self.value(found, _join(path, name), depth)
+            if summarize is not None:
+                found = summarize(node, found)
+            fields[name] = self.value(found, f"{path}.{name}" if path else name, depth)
         return fields
 
     def _rotation(self, node: object, path: str) -> JsonValue:
