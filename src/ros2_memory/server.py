@@ -3,11 +3,16 @@
 Parses the command line, loads the configuration, builds the server and serves. Calls are dispatched
 in `serving/dispatch.py`. Over stdio, stdout carries the protocol, so nothing else is ever written
 there; logs go to stderr.
+
+Importing what serves (MCP's SDK above all) takes most of a start, so the functions import what they
+need, and the bags are looked at meanwhile.
 """
+# ruff: noqa: PLC0415 - as the docstring says
 
 from __future__ import annotations
 
 import argparse
+import gc
 import logging
 import os
 import signal
@@ -16,34 +21,12 @@ import threading
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import anyio
-import uvicorn
-
 from ros2_memory import package_version
-from ros2_memory.bootstrap import (
-    build_backfill,
-    build_memory,
-    build_server,
-    build_telemetry,
-)
-from ros2_memory.bootstrap_fleet import build_fleet, robot_settings
-from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.core.logging_setup import configure_logging, get_logger
-from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.core.text import counted
-from ros2_memory.serving.auth import limited_tokens, take_token
-from ros2_memory.serving.backfill import Filler, keep_all_backfilled, keep_backfilled
-from ros2_memory.serving.connection_limits import (
-    ACCEPTED_AT_ONCE,
-    BoundedConnection,
-)
-from ros2_memory.serving.health import FleetHealth, Health, keep_fresh
-from ros2_memory.serving.listen import BACKLOG, CannotListenError, bound, resolved
-from ros2_memory.serving.page.routes import page_routes
-from ros2_memory.serving.web_app import STREAM_PATH, web_app
+from ros2_memory.serving.listen import CannotListenError, resolved
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import Mapping, Sequence
 
     from starlette.routing import Route
@@ -53,9 +36,9 @@ if TYPE_CHECKING:
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
-    from ros2_memory.serving.listen import Address
+    from ros2_memory.serving.health import FleetHealth, Health
     from ros2_memory.serving.mcp_server import EpisodicServer
-    from ros2_memory.serving.web_app import Background, WebApp
+    from ros2_memory.serving.web_app import Background
 
 PROGRAM: Final = "ros2-memory-server"
 CANNOT_LISTEN: Final = 1
@@ -72,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     configuration or the command line is refused, or a token is missing where there must be one.
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
+    gc.disable()  # until the server is built: imports make many objects, and no garbage
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))
     try:
@@ -89,6 +73,10 @@ def _run(overrides: Sequence[str]) -> None:
         CannotListenError: the address cannot be listened on.
         SystemExit: the configuration is refused.
     """
+    from ros2_memory.bootstrap import build_memory, build_telemetry
+    from ros2_memory.bootstrap_fleet import build_fleet
+    from ros2_memory.config import exit_on_config_error, load_settings
+
     with exit_on_config_error(PROGRAM):
         settings = load_settings(overrides)
         configure_logging(
@@ -98,6 +86,8 @@ def _run(overrides: Sequence[str]) -> None:
         address, token = None, None
         limited: dict[str, frozenset[str]] = {}
         if at.transport != "stdio":
+            from ros2_memory.serving.auth import limited_tokens, take_token
+
             # Before anything is built, so that a refusal comes at once.
             address = resolved(at.host, at.port)
             limited = limited_tokens(settings.fleet.tokens)
@@ -107,18 +97,29 @@ def _run(overrides: Sequence[str]) -> None:
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
         fleet = build_fleet(settings)
+    bag_dir = str(settings.recording.bag_dir.absolute())
+    if fleet is not None:
+        bag_dir = f"those of {counted(len(fleet.robots), 'robot')}"
+    log.info("starting", version=package_version(), bag_dir=bag_dir, transport=at.transport)
     if fleet is None:
+        from ros2_memory.serving.health import refresh_logged
+
+        threading.Thread(target=refresh_logged, args=(memory,), name="first scan").start()
         parts = _parts_of_one(settings, memory, telemetry, overrides)
-        bag_dir = str(settings.recording.bag_dir.absolute())
     else:
         parts = _parts_of_fleet(settings, memory, fleet, telemetry, overrides)
-        bag_dir = f"those of {counted(len(fleet.robots), 'robot')}"
     server, health, background = parts.server, parts.health, parts.background
-    log.info("starting", version=package_version(), bag_dir=bag_dir, transport=at.transport)
+    gc.freeze()
+    gc.enable()
     try:
         if address is None:
+            import anyio
+
             anyio.run(_serve_stdio, server, background)
         else:
+            from ros2_memory.serving.http_run import serve_http
+            from ros2_memory.serving.web_app import web_app
+
             app = web_app(
                 server,
                 host=at.host,
@@ -129,7 +130,7 @@ def _run(overrides: Sequence[str]) -> None:
                 page=parts.page,
                 limited=limited,
             )
-            _serve_http(server, app, address)
+            serve_http(server, app, address)
     except SystemExit:
         log.info("stopped")
     finally:
@@ -150,13 +151,21 @@ class _Parts(NamedTuple):
 def _parts_of_one(
     settings: Settings, memory: Memory, telemetry: Telemetry, overrides: Sequence[str]
 ) -> _Parts:
+    from ros2_memory.bootstrap import build_backfill, build_server
+    from ros2_memory.serving.health import Health
+
     backfill = build_backfill(settings, memory)
     server = build_server(settings, memory, telemetry, backfill.progress)
+    page = None
+    if settings.server.transport != "stdio":
+        from ros2_memory.serving.page.routes import page_routes
+
+        page = page_routes(server.dispatcher, backfill.progress)
     return _Parts(
         server,
         Health(memory, package_version(), backfill),
         partial(_in_background, memory, backfill, settings.reader.index_refresh_s, overrides),
-        page_routes(server.dispatcher, backfill.progress),
+        page,
     )
 
 
@@ -168,6 +177,10 @@ def _parts_of_fleet(
     overrides: Sequence[str],
 ) -> _Parts:
     """Returns the parts of a fleet's server, which has no page: that shows one robot."""
+    from ros2_memory.bootstrap import build_backfill, build_server
+    from ros2_memory.bootstrap_fleet import robot_settings
+    from ros2_memory.serving.health import FleetHealth, Health
+
     robots = {
         each: build_backfill(robot_settings(settings, name), each.memory())
         for name, each in fleet.robots.items()
@@ -232,6 +245,11 @@ async def _in_background(
     memory: Memory, backfill: Backfill, every_s: float, overrides: Sequence[str]
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
+    import anyio
+
+    from ros2_memory.serving.backfill import keep_backfilled
+    from ros2_memory.serving.health import keep_fresh
+
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_fresh, memory, every_s)
         tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s)
@@ -244,6 +262,11 @@ async def _fleet_in_background(
 
     A disk that hangs keeps the scans of its own robot waiting alone.
     """
+    import anyio
+
+    from ros2_memory.serving.backfill import Filler, keep_all_backfilled
+    from ros2_memory.serving.health import keep_fresh
+
     limiter = anyio.CapacityLimiter(len(robots))
     fillers = [
         (
@@ -259,52 +282,12 @@ async def _fleet_in_background(
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:
+    import anyio
+
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(background)
         await server.run_stdio_async()
         tasks.cancel_scope.cancel()
-
-
-def _serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
-    config = uvicorn.Config(
-        app,
-        http=BoundedConnection,
-        backlog=ACCEPTED_AT_ONCE,
-        lifespan="on",
-        ws="none",
-        log_config=None,
-        log_level="warning",
-        # It would show whatever a client puts into a query string.
-        access_log=False,
-        timeout_graceful_shutdown=1,
-    )
-    listening = bound(at)
-    anyio.run(_Listener(config, server, app).serve, [listening])
-
-
-class _Listener(uvicorn.Server):
-    """Runs uvicorn, and ends the event streams and the queries when it stops."""
-
-    def __init__(self, config: uvicorn.Config, server: EpisodicServer, app: WebApp) -> None:
-        super().__init__(config)
-        self._server = server
-        self._app = app
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        for each in sockets or []:
-            # More connections may wait than are accepted at once.
-            each.listen(BACKLOG)
-            host, port = each.getsockname()[:2]
-            shown = f"[{host}]" if ":" in host else host
-            log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)
-        notify(READY)
-
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        notify(STOPPING)
-        self._server.dispatcher.stop()
-        self._app.stop()
-        await super().shutdown(sockets)
 
 
 if __name__ == "__main__":

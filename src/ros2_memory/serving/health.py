@@ -48,14 +48,18 @@ async def keep_fresh(
 
     `limiter`: of the threads for it; those for all background work where None.
     """
+    refresh = partial(refresh_logged, memory)
     while True:
-        try:
-            await anyio.to_thread.run_sync(
-                memory.index.refresh, abandon_on_cancel=True, limiter=limiter
-            )
-        except Exception:
-            log.exception("index_refresh_failed")
+        await anyio.to_thread.run_sync(refresh, abandon_on_cancel=True, limiter=limiter)
         await anyio.sleep(every_s)
+
+
+def refresh_logged(memory: Memory) -> None:
+    """Scans the bag directory, and logs what keeps it from being scanned."""
+    try:
+        memory.index.refresh()
+    except Exception:
+        log.exception("index_refresh_failed")
 
 
 class Health:

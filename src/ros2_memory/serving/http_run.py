@@ -1,0 +1,70 @@
+"""Runs a built server over HTTP, until it is stopped."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import anyio
+import uvicorn
+
+from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.sd_notify import READY, STOPPING, notify
+from ros2_memory.serving.connection_limits import ACCEPTED_AT_ONCE, BoundedConnection
+from ros2_memory.serving.listen import BACKLOG, bound
+from ros2_memory.serving.web_app import STREAM_PATH
+
+if TYPE_CHECKING:
+    import socket
+
+    from ros2_memory.serving.listen import Address
+    from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.serving.web_app import WebApp
+
+log = get_logger("ros2_memory.server")
+
+
+def serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
+    """Serves over HTTP until a signal comes.
+
+    Raises:
+        CannotListenError: the address cannot be listened on.
+    """
+    config = uvicorn.Config(
+        app,
+        http=BoundedConnection,
+        backlog=ACCEPTED_AT_ONCE,
+        lifespan="on",
+        ws="none",
+        log_config=None,
+        log_level="warning",
+        # It would show whatever a client puts into a query string.
+        access_log=False,
+        timeout_graceful_shutdown=1,
+    )
+    listening = bound(at)
+    anyio.run(_Listener(config, server, app).serve, [listening])
+
+
+class _Listener(uvicorn.Server):
+    """Runs uvicorn, and ends the event streams and the queries when it stops."""
+
+    def __init__(self, config: uvicorn.Config, server: EpisodicServer, app: WebApp) -> None:
+        super().__init__(config)
+        self._server = server
+        self._app = app
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        for each in sockets or []:
+            # More connections may wait than are accepted at once.
+            each.listen(BACKLOG)
+            host, port = each.getsockname()[:2]
+            shown = f"[{host}]" if ":" in host else host
+            log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)
+        notify(READY)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        notify(STOPPING)
+        self._server.dispatcher.stop()
+        self._app.stop()
+        await super().shutdown(sockets)
