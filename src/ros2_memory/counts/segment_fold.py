@@ -16,6 +16,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Deadline, Ns
 from ros2_memory.history.bag_fold import shares_of
 from ros2_memory.history.bag_groups import DigestKind, Group, StoredDigests
+from ros2_memory.history.context import READING_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 
-READING_S: Final = 4.0
-"""How long bags without a digest are read before the answer is partial."""
 _CUT_NS: Final[Ns] = 300 * NS_PER_S
 
 
@@ -195,5 +194,5 @@ class _Reading:
     def is_over(self) -> bool:
         """Whether no more bags are to be read."""
         if self._deadline is None:
-            self._deadline = Deadline.after(READING_S)
+            self._deadline = self._view.call.partial_after(READING_S)
         return self._deadline.expired() or self._view.call.deadline.expired()

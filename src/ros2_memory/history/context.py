@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
@@ -170,6 +171,10 @@ class Stages:
         return {stage: round(ms_from_ns(spent), 3) for stage, spent in self.spent.items()}
 
 
+READING_S: Final = 4.0
+"""How long a call reads bags without a digest, before its answer is partial."""
+
+
 @dataclass(slots=True)
 class Call:
     """One call: when it must be over, and where its time went.
@@ -192,6 +197,13 @@ class Call:
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""
         return self.rows_in is None or self.rows_in.contains(row_end)
+
+    def partial_after(self, budget_s: float) -> Deadline:
+        """Returns when an answer is given with what was read until then, `budget_s` from now.
+
+        A call that may take as long as it needs (`Deadline.never()`) is answered whole.
+        """
+        return Deadline.after(budget_s) if self.deadline.at_s < math.inf else self.deadline
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ a week costs milliseconds.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.regions import Steps, parts_inside
-from ros2_memory.core.timebase import Deadline, Ns
+from ros2_memory.history.context import READING_S
 from ros2_memory.places.map_digests import MapDigests
 
 if TYPE_CHECKING:
@@ -25,11 +25,9 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Region
+    from ros2_memory.core.timebase import Deadline, Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
-
-_READING_S: Final = 4.0
-"""How long bags are read that have no digest, before the answer is partial."""
 
 
 class Inside(NamedTuple):
@@ -141,7 +139,7 @@ class RobotTracks:
     def _made(self, bag: BagFile) -> MapDigest:
         """Returns the digest of a bag that has none, unless reading has taken too long."""
         if self._reading is None:
-            self._reading = Deadline.after(_READING_S)
+            self._reading = self._view.call.partial_after(READING_S)
         if self._reading.expired():
             raise QueryTimeoutError("reading bags without a digest takes too long")
         made = self._maps.made(bag)

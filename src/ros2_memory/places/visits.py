@@ -305,7 +305,7 @@ class _VisitSearch:
                 self._add_part(visits, part)
                 before = part.start
                 if visits.enough and self._counting is None:
-                    self._counting = Deadline.after(_COUNTING_S)
+                    self._counting = self._view.call.partial_after(_COUNTING_S)
                 self._check_counting()
             visits.end()
         except QueryTimeoutError:

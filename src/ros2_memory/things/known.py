@@ -22,7 +22,7 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagState
-from ros2_memory.core.timebase import Deadline, Ns
+from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.places.map_digests import MapDigests
@@ -34,12 +34,11 @@ if TYPE_CHECKING:
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Deadline, Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
 
-_READING_S: Final = 4.0
-"""How long bags are read that have no entry, before the answer is partial."""
 _MADE: Final = 1024
 _ESTIMATES: Final = 4
 
@@ -209,7 +208,7 @@ class _Loader:
         if known is not None:
             return known
         if self._reading is None:
-            self._reading = Deadline.after(_READING_S)
+            self._reading = self._view.call.partial_after(READING_S)
         if self._reading.expired():
             return None
         before = self._view.notes.keys()

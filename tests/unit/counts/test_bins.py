@@ -12,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts import segment_fold
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
@@ -306,7 +307,8 @@ def test_bags_that_cannot_have_a_label_are_not_read(
         with monkeypatch.context() as patch:
             patch.setattr(segment_fold, "READING_S", -1.0)
             for _ in range(2):
-                assert count_matches(known, Call(), OBJECTS, "contains", label, by="day") == answer
+                hasty = Call(deadline=Deadline.after(600))
+                assert count_matches(known, hasty, OBJECTS, "contains", label, by="day") == answer
 
 
 @settings(max_examples=examples(20), deadline=None, suppress_health_check=[HealthCheck.too_slow])
