@@ -142,7 +142,7 @@ def _examine(
         if isinstance(recorder, NullRecorderNode):
             yield _ok("recorder", "recorder=none: nothing is recorded here")
         else:
-            yield from check_ros(settings, recorder.setup_files, memory.reader)
+            yield from check_ros(settings, recorder.setup_files, memory.reader, now)
             yield from check_recorder(settings, now)
             yield from check_topics(settings, snapshot, now)
         yield from check_extras(settings)
@@ -397,13 +397,23 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
 
 
 def check_ros(
-    settings: Settings, setup_files: Sequence[Path], reader: BagReader
+    settings: Settings, setup_files: Sequence[Path], reader: BagReader, now: Ns
 ) -> Iterator[Finding]:
-    """Checks that `ros2 bag record` runs in the environment that the recorder gives it."""
+    """Checks that `ros2 bag record` runs in the environment that the recorder gives it.
+
+    A recorder that is running may have its setup files by its own arguments.
+    """
     try:
         build_recorder(settings, reader=reader).check()
     except EpisodicError as error:
         reason, _, do = str(error).partition("; ")
+        heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
+        runs = heartbeat is not None and heartbeat.state is not RecorderState.STOPPED
+        if not setup_files and heartbeat is not None and runs and heartbeat.is_live(now):
+            seen = f"{reason} with these settings, but the running recorder has it by its own"
+            do = "give this command the recorder's settings (its environment and arguments)"
+            yield _warning("ros", seen, do)
+            return
         yield _error("ros", reason, do or "correct recorder.setup_files")
     else:
         files = ", ".join(map(str, setup_files))

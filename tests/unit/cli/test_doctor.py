@@ -274,6 +274,18 @@ def test_a_missing_setup_file_is_named(robot: Path, capsys: Capture) -> None:
     assert "recorder.setup_files" in wrong["ros"][0]["do"]
 
 
+def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(
+    robot: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (robot.parent / "bin" / "ros2").unlink()
+    monkeypatch.setenv("PATH", str(robot.parent / "bin"))
+    code, wrong = examined(capsys)
+    assert (code, wrong["ros"][0]["level"]) == (1, "warning")
+    assert "the running recorder has it by its own" in wrong["ros"][0]["seen"]
+    beat(robot, RecorderState.STOPPED)
+    assert examined(capsys)[1]["ros"][0]["level"] == "error"
+
+
 def test_a_topic_that_is_listed_and_not_recorded_is_reported_with_what_is_like_it(
     robot: Path, capsys: Capture
 ) -> None:
