@@ -12,6 +12,7 @@
     |   `-- BagUnreachableError   bag_unreadable     the disk or the machine fails, not the file
     |-- UndecodableError          undecodable        a message that cannot be decoded
     |-- RefusedError              refused            a request that is refused, and why
+    |   `-- NotShippedError       refused            messages that a lake does not hold
     `-- RecorderError             recorder           recording cannot start or go on
 
 Adapters translate every foreign exception into this tree; only `tools.replies` turns it into JSON.
@@ -136,6 +137,10 @@ class RefusedError(EpisodicError):
     """A request is refused; the sentence gives the reason, and what to do instead."""
 
     code = "refused"
+
+
+class NotShippedError(RefusedError):
+    """The answer needs messages that the lake does not hold; the robot's own memory may."""
 
 
 class RecorderError(EpisodicError):

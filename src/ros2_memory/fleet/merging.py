@@ -113,6 +113,9 @@ SHORT_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
 ANSWER_FOR_ALL: Final = frozenset({*MERGED_ROWS, *SHORT_KEYS})
 """The tools that answer for all robots."""
 
+TABLE_FOR_ALL: Final = frozenset({"trajectory_summary", "recent_trajectory_summary"})
+"""The tools that answer for all robots where they count (the argument `by`)."""
+
 
 def merged(
     tool: str,

@@ -25,6 +25,7 @@ from ros2_memory.fleet.merging import (
     ANSWER_FOR_ALL,
     MATCHES,
     MERGED_ROWS,
+    TABLE_FOR_ALL,
     TOPICS,
     RobotReply,
     merged,
@@ -66,7 +67,7 @@ def fleet_tools(
             tool,
             describe=partial(_described, tool),
             # One robot that is slow must not keep a quick tool's thread.
-            blocking=tool.blocking or tool.name in ANSWER_FOR_ALL,
+            blocking=tool.blocking or tool.name in ANSWER_FOR_ALL | TABLE_FOR_ALL,
             question=_FleetQuestions(tool, fleet, fan_out, max_chars),
         )
         for tool in tools
@@ -77,6 +78,8 @@ def fleet_tools(
 def _described(tool: Tool) -> tuple[str, JsonObject]:
     text, schema = tool.description, tool.schema
     needs = "Its name; without it, all." if tool.name in ANSWER_FOR_ALL else "Its name."
+    if tool.name in TABLE_FOR_ALL:
+        needs = "Its name; without it, by of all."
     properties = schema.get("properties")
     known = properties if isinstance(properties, dict) else {}
     argument: JsonObject = {"type": "string", "description": needs}
@@ -111,7 +114,8 @@ class _FleetQuestions:
         name = given.get(ROBOT)
         if name is not None:
             return lambda _, call: self._of_one(self.fleet.named(name, call), question, call)
-        if self.tool.name not in ANSWER_FOR_ALL:
+        is_table = self.tool.name in TABLE_FOR_ALL and given.get("by") is not None
+        if self.tool.name not in ANSWER_FOR_ALL and not is_table:
             return lambda _, call: self._of_one(
                 self.fleet.the_one(self.tool.name, call), question, call
             )

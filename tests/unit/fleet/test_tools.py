@@ -77,6 +77,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_metres_by_day_are_one_table_of_all_robots(folder: Path) -> None:
+    given: dict[str, object] = {"start": START_S, "end": START_S + 600, "by": "day"}
+    fleet = fleet_over(folder, NAMES)
+    table = reply(fleet, "trajectory_summary", given)
+    at = table["columns"].index("metres")
+    alone = {
+        name: reply(fleet, "trajectory_summary", {**given, "robot": name})["rows"][0][at - 1]
+        for name in NAMES
+    }
+    assert {row[0]: row[at] for row in table["rows"]} == alone
+
+
 def reply(fleet: Fleet, name: str, given: dict[str, object], **call: Any) -> Any:
     """The JSON of a fleet's reply, be it an error."""
     replies = Replies(Path("nowhere"), MOST_CHARS)

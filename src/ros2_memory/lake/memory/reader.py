@@ -1,0 +1,191 @@
+"""Reads what a lake has of the messages of one robot's bags."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import NotShippedError, UndecodableError
+from ros2_memory.lake.memory.rows_as_messages import Tracks, channel, detections, message
+from ros2_memory.lake.tables import topic_key
+from ros2_memory.storage.base import BagReader, Closing
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.lake.files import Lake
+    from ros2_memory.lake.memory.index import LakeBag, LakeIndex
+    from ros2_memory.storage.base import Channel, Record
+
+_MOST_READ: Final = 256
+"""Topics of a bag that stay in memory."""
+_SIGHTINGS: Final = (
+    "SELECT time_ns, message, label, score, frame_id, x, y, z FROM sightings"
+    " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns, message"
+)
+_MESSAGES: Final = (
+    "SELECT type, time_ns, publish_ns, value FROM messages"
+    " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns, message"
+)
+_POSES: Final = (
+    "SELECT time_ns, frame_id, x, y, heading, begins FROM poses"
+    " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns"
+)
+
+
+class LakeReader(BagReader):
+    """Makes messages of rows: of detections, of the chosen topics, and of the robot's track.
+
+    A detection has its label, score and place alone. A message without detections has no row: where
+    some are left out between two, one stands for them.
+
+    Args:
+        lake: the lake.
+        robot: its name there.
+        index: its bags.
+        map_frame: the frame of the map.
+        tf_topics: those of transforms.
+    """
+
+    def __init__(
+        self,
+        lake: Lake,
+        robot: str,
+        index: LakeIndex,
+        *,
+        map_frame: str | None,
+        tf_topics: Sequence[str],
+    ) -> None:
+        self._lake = lake
+        self._robot = robot
+        self._index = index
+        self._map_frame = map_frame
+        self._tf_topics = tf_topics
+        self._served = threading.local()
+        self._lock = threading.Lock()
+        self._known: OrderedDict[tuple[str, str], Sequence[Record]] = OrderedDict()
+
+    def reads(self, path: Path) -> bool:
+        """Returns True: all files of the index are of the lake."""
+        del path
+        return True
+
+    def closing(self, path: Path) -> Closing:
+        """Returns that the bag is closed: others are not shipped."""
+        del path
+        return Closing.CLOSED
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Returns the summary of a bag of the index."""
+        return self._index.file(path).summary
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        """Yields what rows have of the messages.
+
+        Raises:
+            NotShippedError: the lake has no rows of a topic that the bag holds.
+        """
+        bag = self._index.file(path)
+        found = [
+            record
+            for topic in sorted(topics)
+            if bag.summary.schema.positions.get(topic)
+            for record in self._of_topic(bag, topic)
+            if window.contains(record.log_time)
+        ]
+        found.sort(key=lambda each: each.log_time)
+        yield from reversed(found) if newest_first else found
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        """Returns the log times of what rows have of the messages.
+
+        Raises:
+            NotShippedError: the lake has no rows of the topic.
+        """
+        return [each.log_time for each in self.records(path, [topic], window)]
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns None: rows are of messages that could be decoded."""
+        del channel
+        return None
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns the channels of the topics that the bag holds."""
+        return [channel(*each[:2]) for each in self._index.file(path).summary.schema.topics]
+
+    def decode(self, record: Record) -> object:
+        """Returns what a row has of a message.
+
+        Raises:
+            UndecodableError: the message could not be decoded when it was shipped.
+        """
+        if not record.payload:
+            here = record.channel
+            raise UndecodableError(here.topic, here.type, "when it was shipped")
+        return json.loads(record.payload)
+
+    def take_thinned(self) -> bool:
+        """Returns whether this thread was given vertices of the track since it asked last."""
+        thinned = getattr(self._served, "thinned", False)
+        self._served.thinned = False
+        return bool(thinned)
+
+    def _of_topic(self, bag: BagFile, topic: str) -> Sequence[Record]:
+        if topic == self._index.pose_topic:
+            self._served.thinned = True
+        here = self._index.bag(self._index.number(bag))
+        key = here.bag_id, topic
+        with self._lock:
+            known = self._known.get(key)
+            if known is not None:
+                self._known.move_to_end(key)
+                return known
+        known = self._read(bag, here, topic)
+        with self._lock:
+            self._known[key] = known
+            if len(self._known) > _MOST_READ:
+                self._known.popitem(last=False)
+        return known
+
+    def _read(self, bag: BagFile, here: LakeBag, topic: str) -> Sequence[Record]:
+        if self._index.has_messages(topic):
+            whole = [message(topic, row) for row in self._rows(_MESSAGES, "messages", here, topic)]
+            if whole:
+                return whole
+        if self._index.is_detector(topic):
+            return detections(bag, topic, self._rows(_SIGHTINGS, "sightings", here, topic))
+        if topic == self._index.pose_topic:
+            return self._tracks(bag, here).poses(topic)
+        if topic in self._tf_topics:
+            return self._tracks(bag, here).transforms(topic)
+        raise NotShippedError(
+            f"the lake has no messages of {topic}: name it in lake.messages of ros2-memory ship, "
+            "or ask the robot's own memory"
+        )
+
+    def _tracks(self, bag: BagFile, here: LakeBag) -> Tracks:
+        topic = self._index.pose_topic
+        return Tracks(bag, topic, self._rows(_POSES, "poses", here, topic), self._map_frame)
+
+    def _rows(
+        self, sql: str, table: str, bag: LakeBag, topic: str
+    ) -> Sequence[Mapping[str, JsonValue]]:
+        asked = {"key": topic_key(topic), "topic": topic, "bag": bag.bag_id}
+        days = (bag.day, bag.day)
+        rows: Sequence[Mapping[str, JsonValue]] = self._lake.select(
+            sql, [table], asked, robots=[self._robot], days=days
+        ).to_pylist()
+        return rows

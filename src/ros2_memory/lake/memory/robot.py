@@ -1,0 +1,77 @@
+"""One robot of a lake: its memory, and what answers from it are to be told with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from ros2_memory.catalogue.lookup import DigestCache
+from ros2_memory.core.timebase import iso_local
+from ros2_memory.extract import SchemaExtractor
+from ros2_memory.history.context import Memory
+from ros2_memory.lake.memory.catalogue import LakeCatalogue
+from ros2_memory.lake.memory.index import LakeIndex
+from ros2_memory.lake.memory.reader import LakeReader
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.core.timebase import Clock
+    from ros2_memory.history.context import QuerySettings
+    from ros2_memory.lake.files import Lake
+
+
+class LakeRobot:
+    """A robot's memory over its rows.
+
+    Args:
+        lake: the lake.
+        name: of the robot there.
+        clock: the wall clock.
+        limits: the settings of queries.
+        most: the most elements of an array in a value that is shown.
+        refresh_s: how old (s) the index may be.
+        days: how many days with data answer: the newest.
+
+    Attributes:
+        memory: what queries are asked of.
+    """
+
+    def __init__(
+        self,
+        lake: Lake,
+        name: str,
+        clock: Clock,
+        limits: QuerySettings,
+        most: int,
+        *,
+        refresh_s: float = 60.0,
+        days: int = 31,
+    ) -> None:
+        self._index = LakeIndex(
+            lake, name, clock, pose_topic=limits.pose_topic, refresh_s=refresh_s, days=days
+        )
+        self._reader = LakeReader(
+            lake,
+            name,
+            self._index,
+            map_frame=limits.map_frame,
+            tf_topics=limits.tf_topics,
+        )
+        catalogue = LakeCatalogue(lake, name, self._index, limits.tf_static_topics)
+        recall = DigestCache(catalogue, self._index.bag_dir)
+        # Nothing is recorded here, and nothing deleted.
+        own = replace(limits, kept=None, recording="", screened=False)
+        # Rows hold values that were extracted already.
+        extractor = SchemaExtractor({}, most)
+        self.memory = Memory(self._index, self._reader, extractor, clock, own, recall)
+
+    def notes(self) -> Iterator[str]:
+        """Yields what the answer that this thread has just computed is to be told with."""
+        latest = None if self._index.published is None else self._index.published.latest
+        if latest is not None:
+            yield f"from the lake, which has what was shipped: up to {iso_local(latest)}"
+        if self._index.since is not None:
+            yield f"older days than {self._index.since} are in the lake, and were not looked at"
+        if self._reader.take_thinned():
+            yield "where a time cuts a bag, the robot's thinned track was used, not every pose"

@@ -1,0 +1,176 @@
+"""Rows of a lake as messages: detections, whole messages, and the robot's track as poses."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.storage.base import Channel, Record, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.core.model import BagFile, JsonValue
+    from ros2_memory.core.timebase import Ns
+
+    Row = Mapping[str, JsonValue]
+
+
+def channel(topic: str, type_name: str) -> Channel:
+    """Returns the channel of messages that are made of rows."""
+    return Channel(topic, "json", Schema(type_name))
+
+
+def record(topic: str, type_name: str, time: Ns, value: JsonValue, published: Ns = 0) -> Record:
+    """Returns a message of a value."""
+    payload = json.dumps(value).encode()
+    return Record(channel(topic, type_name), time, published or time, payload)
+
+
+def message(topic: str, row: Row) -> Record:
+    """Returns a message of a row of `messages`; without a payload where it was undecodable."""
+    text = row["value"]
+    value: JsonValue = json.loads(text) if isinstance(text, str) else None
+    found = record(topic, str(row["type"]), _ns(row["time_ns"]), value, _ns(row["publish_ns"]))
+    return found if isinstance(text, str) else found._replace(payload=b"")
+
+
+def detections(bag: BagFile, topic: str, rows: Sequence[Row]) -> Sequence[Record]:
+    """Returns the messages with detections, and one for those without between any two.
+
+    That one has no time of its own: it ends sightings, and is nothing that is shown.
+    """
+    [summary, *_] = bag.summary.of(topic)
+    messages: dict[int, tuple[Ns, list[JsonValue]]] = {}
+    for row in rows:
+        entry = messages.setdefault(_ns(row["message"]), (_ns(row["time_ns"]), []))
+        entry[1].append(_detection(row))
+    records: list[Record] = []
+    before, reached = -1, summary.first
+    for nth, (time, detections) in sorted(messages.items()):
+        if nth > before + 1:
+            at = summary.first if before < 0 else min(reached + 1, time)
+            records.append(record(topic, summary.type, at, {"detections": []}))
+        records.append(record(topic, summary.type, time, {"detections": detections}))
+        before, reached = nth, time
+    if before < summary.count - 1:
+        records.append(record(topic, summary.type, summary.last, {"detections": []}))
+    return records
+
+
+def _detection(row: Row) -> JsonValue:
+    found: dict[str, JsonValue] = {"label": row["label"]}
+    if row["score"] is not None:
+        found["score"] = row["score"]
+    if row["frame_id"]:
+        found["frame_id"] = row["frame_id"]
+    if row["x"] is not None:
+        found["position"] = {axis: row[axis] for axis in "xyz"}
+    return found
+
+
+class Tracks:
+    """The robot's track in one bag: in the poses' own frame, and in the map where that is another.
+
+    A vertex is there only where the track bends. So poses are as many, and as far apart, as the
+    bag's messages were on average, each on the line between two vertices.
+
+    Args:
+        bag: the bag.
+        topic: of the poses.
+        rows: the vertices in order of time.
+        map_frame: the frame of the map.
+    """
+
+    def __init__(
+        self, bag: BagFile, topic: str, rows: Sequence[Row], map_frame: str | None
+    ) -> None:
+        [summary, *_] = bag.summary.of(topic)
+        self._type = summary.type
+        self._times = np.linspace(summary.first, summary.last, summary.count).astype(np.int64)
+        by_frame: dict[str, list[Row]] = {}
+        for row in rows:
+            by_frame.setdefault(str(row["frame_id"]), []).append(row)
+        self._map = by_frame.get(map_frame or "")
+        self._map_frame = map_frame or ""
+        self._own_frame = min(by_frame, key=lambda each: each == map_frame, default="")
+        self._own = by_frame.get(self._own_frame, [])
+
+    def poses(self, topic: str) -> Sequence[Record]:
+        """Returns poses in the poses' own frame."""
+        return [
+            record(topic, self._type, time, _posed(self._own_frame, x, y, heading))
+            for time, x, y, heading in self._at(self._own)
+        ]
+
+    def transforms(self, topic: str) -> Sequence[Record]:
+        """Returns the transforms from the poses' own frame to the map."""
+        if self._map is None or self._own_frame == self._map_frame:
+            return ()
+        own = {time: (x, y, heading) for time, x, y, heading in self._at(self._own)}
+        found: list[Record] = []
+        for time, x, y, heading in self._at(self._map):
+            if time not in own or math.isnan(heading) or math.isnan(own[time][2]):
+                continue
+            from_x, from_y, from_heading = own[time]
+            turn = heading - from_heading
+            cos, sin = math.cos(turn), math.sin(turn)
+            shift = x - (cos * from_x - sin * from_y), y - (sin * from_x + cos * from_y)
+            edge = _edge(self._map_frame, self._own_frame, time, shift, turn)
+            found.append(record(topic, "tf2_msgs/msg/TFMessage", time, {"transforms": [edge]}))
+        return found
+
+    def _at(self, rows: Sequence[Row]) -> Sequence[tuple[Ns, float, float, float]]:
+        """Returns times, x, y (m) and headings (rad) where a track has no gap."""
+        if not rows:
+            return ()
+        vertices = np.array([_ns(row["time_ns"]) for row in rows], np.int64)
+        begins = np.array([bool(row["begins"]) for row in rows])
+        after = np.searchsorted(vertices, self._times, side="left")
+        inside = (after < len(vertices)) & (self._times >= vertices[0])
+        exact = np.zeros(len(self._times), np.bool_)
+        exact[inside] = vertices[after[inside]] == self._times[inside]
+        inside[inside] &= exact[inside] | ~begins[after[inside]]
+        times = self._times[inside]
+        since = (times - vertices[0]).astype(np.float64)
+        known = (vertices - vertices[0]).astype(np.float64)
+        x, y = (np.interp(since, known, _column(rows, name)) for name in ("x", "y"))
+        headings = np.interp(since, known, np.unwrap(_column(rows, "heading")))
+        return [*zip(times.tolist(), x.tolist(), y.tolist(), headings.tolist(), strict=True)]
+
+
+def _column(rows: Sequence[Row], name: str) -> NDArray[np.float64]:
+    values = (row[name] for row in rows)
+    return np.array([each if isinstance(each, int | float) else math.nan for each in values])
+
+
+def _posed(frame: str, x: float, y: float, heading: float) -> JsonValue:
+    pose: dict[str, JsonValue] = {"position": {"x": x, "y": y, "z": 0.0}}
+    if not math.isnan(heading):
+        pose["orientation"] = _turned(heading)
+    return {"header": {"frame_id": frame}, "pose": {"pose": pose, **pose}}
+
+
+def _turned(heading: float) -> JsonValue:
+    return {"x": 0.0, "y": 0.0, "z": math.sin(heading / 2), "w": math.cos(heading / 2)}
+
+
+def _edge(parent: str, child: str, time: Ns, shift: tuple[float, float], turn: float) -> JsonValue:
+    seconds, nanoseconds = divmod(time, 10**9)
+    return {
+        "header": {"frame_id": parent, "stamp": {"sec": seconds, "nanosec": nanoseconds}},
+        "child_frame_id": child,
+        "transform": {
+            "translation": {"x": shift[0], "y": shift[1], "z": 0.0},
+            "rotation": _turned(turn),
+        },
+    }
+
+
+def _ns(value: JsonValue) -> Ns:
+    return value if isinstance(value, int) else 0

@@ -1,0 +1,67 @@
+"""A lake filled with the rows of robots' bags, and the fleet that it answers for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import date
+from functools import partial
+from pathlib import Path
+
+from pyiceberg.catalog.sql import SqlCatalog
+
+from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.files import Lake
+from ros2_memory.lake.memory.robot import LakeRobot
+from ros2_memory.lake.rows import BagContent, bag_id_of, rows_of
+from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables, to_arrow
+from tests.support.clocks import FixedClock
+from tests.support.fleets import NOW
+
+
+def lake_in(folder: Path) -> SqlCatalog:
+    """An Iceberg catalogue in a folder."""
+    uri = f"sqlite:///{folder}/lake.sqlite"
+    return SqlCatalog("lake", uri=uri, warehouse=folder.as_uri())
+
+
+def fill(catalog: SqlCatalog, robots: Mapping[str, Memory], messages: Sequence[str] = ()) -> None:
+    """Writes the rows of all bags of robots' memories, which have digests."""
+    tables = open_tables(catalog, TABLES)
+    for name, memory in robots.items():
+        found: dict[tuple[str, date], dict[str, list[Row]]] = {}
+        for bag in memory.index.snapshot().bags:
+            content = BagContent(bag, bag_id_of(name, bag, bag.start), "0" * 64, "made")
+            for table, rows in rows_of(memory, content, messages).items():
+                found.setdefault((table, day_of(bag.start)), {})[content.bag_id] = rows
+        for (table, day), of_bags in found.items():
+            part = to_arrow(TABLES[table], name, day, of_bags)
+            if part.num_rows:
+                tables[table].append(part)
+
+
+def lake_robots(
+    catalog: SqlCatalog,
+    engine: LakeEngine,
+    names: Sequence[str],
+    limits: QuerySettings | None = None,
+) -> dict[str, LakeRobot]:
+    """The robots of a lake, asked at `NOW`."""
+    lake, clock = Lake(catalog, engine), FixedClock(NOW)
+    return {
+        name: LakeRobot(lake, name, clock, limits or QuerySettings(), 50, refresh_s=0)
+        for name in names
+    }
+
+
+def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False) -> Fleet:
+    """The fleet of some memories, asked at `NOW`."""
+    robots = [
+        Robot(name, Path("/") / name, partial(_same, memory)) for name, memory in memories.items()
+    ]
+    return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
+
+
+def _same(memory: Memory) -> Memory:
+    return memory
