@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows = [asdict(each) for each in tallies]
             given.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
 
-    campaign(names, given.mutants, given.seed, first=given.first, tell=tell)
+    campaign(dict.fromkeys(names, given.mutants), given.seed, first=given.first, tell=tell)
     _say(_row(_total(tallies)))
     for tally in tallies:
         for verdict in tally.found[: given.show]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from tests.fuzz.classes import Job
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
 HANG_S: Final = 60.0
 """After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""
@@ -167,20 +167,23 @@ def _folder(root: str, number: int) -> Path:
 
 
 def campaign(
-    names: Sequence[str],
-    mutants: int,
+    mutants: Mapping[str, int],
     seed: int,
     *,
     first: int = 0,
     tell: Callable[[Tally], None] = lambda _tally: None,
 ) -> list[Tally]:
     """Tries so many mutants of each class; `tell` hears of each class when it is done."""
-    jobs = (Job(name, number, seed) for name in names for number in range(first, first + mutants))
+    jobs = (
+        Job(name, number, seed)
+        for name, count in mutants.items()
+        for number in range(first, first + count)
+    )
     tallies: list[Tally] = []
     for verdict in run(jobs):
         if not tallies or tallies[-1].name != verdict["name"]:
             tallies.append(Tally(verdict["name"]))
         tallies[-1].add(verdict)
-        if tallies[-1].mutants == mutants:
+        if tallies[-1].mutants == mutants[verdict["name"]]:
             tell(tallies[-1])
     return tallies
