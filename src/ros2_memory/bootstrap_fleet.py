@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bootstrap import build_memory, places_of, shared_parts
 from ros2_memory.config import NullRecorderNode
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from ros2_memory.config import Settings
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory
+
+ROBOTS_SETTING: Final = "fleet.robots"
+"""The setting that names the bags of robots."""
 
 
 def build_fleet(settings: Settings) -> Fleet | None:
@@ -62,7 +65,7 @@ def robot_settings(settings: Settings, name: str) -> Settings:
 
 
 def _memory_of(own: Settings, shared: SharedParts, *, has_places: bool) -> Memory:
-    memory = build_memory(own, shared, setting="fleet.robots")
+    memory = build_memory(own, shared, setting=ROBOTS_SETTING)
     if has_places:
         return memory
     # `data.places_file` is about some other map.

@@ -14,7 +14,9 @@ import anyio
 import httpx2
 import pytest
 from mcp import Client
+from mcp.client.sse import sse_client
 from mcp.client.streamable_http import streamable_http_client
+from mcp.types import ResourceTemplateReference
 
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.bootstrap_fleet import build_fleet
@@ -165,8 +167,26 @@ async def test_a_token_decides_about_whom_is_answered(robots: Robots, tmp_path: 
                 assert ("error" in refused) is (token == site)
                 health = json.loads((await shown.get(served.url("/health"))).text)
                 assert ("robots" in health) is (token == office)
-                other = await shown.get(served.url("/page/span"))
-                assert other.status_code == (403 if token == site else 404)
+                for path in ("/page/span", "/metrics", "/"):
+                    other = await shown.get(served.url(path))
+                    assert other.status_code == (403 if token == site else 404)
+                listed = [
+                    await client.list_tools(),
+                    await client.list_resources(),
+                    await client.list_resource_templates(),
+                    await client.list_prompts(),
+                    await client.get_prompt("use_memory"),
+                    await client.complete(
+                        ResourceTemplateReference(uri="episodic://schema/{type}"),
+                        {"name": "type", "value": ""},
+                    ),
+                ]
+                assert "r2" not in str(listed)
+            async with Client(sse_client(served.url("/sse"), headers=headers)) as client:
+                found = await ask(client, "data_time_range", {})
+                assert {row["robot_name"] for row in found[0]["robots"]} == names
+                refused, _ = await ask(client, "list_frames", {"robot": "r2"})
+                assert ("error" in refused) is (token == site)
         assert served.get("/mcp")[0] == 401
     output = log.read_text(encoding="utf-8")
     assert site not in output

@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from enum import IntEnum
 from functools import partial
@@ -26,6 +26,7 @@ from rich.text import Text
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bootstrap import build_recorder, query_settings_of
+from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.listing.info import assumed_active
 from ros2_memory.cli.options import (
     AsJson,
@@ -126,11 +127,18 @@ def _examine(
     """Yields all findings; one alone where the configuration is refused."""
     try:
         settings = load_to_look(bag_dir, words, recording)
-        memory = open_memory(settings, verbose=verbose)
+        robots = settings.fleet.robots
+        memory = None if robots else open_memory(settings, verbose=verbose)
     except ConfigError as error:
         yield _error("config", str(error), "correct the key that it names")
         return
     yield _ok("config", f"composed from {config_dir(os.environ)}")
+    if memory is None:
+        for name in robots:
+            yield from _of_robot(name, robot_settings(settings, name), verbose=verbose)
+        yield from check_extras(settings)
+        yield from check_server(settings)
+        return
     now, snapshot = memory.clock.now(), memory.index.snapshot()
     with spinner("asking the disk, ros2, the recorder and the server"):
         foreign = memory.foreign(snapshot)
@@ -147,6 +155,29 @@ def _examine(
             yield from check_topics(settings, snapshot, now)
         yield from check_extras(settings)
         yield from check_server(settings)
+
+
+def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
+    """Yields what is wrong with the bags of a robot of a fleet; else how many there are."""
+    memory = open_memory(own, verbose=verbose, setting=ROBOTS_SETTING)
+    now, snapshot = memory.clock.now(), memory.index.snapshot()
+    if snapshot.problem:
+        do = "is the disk mounted? The other robots are answered for meanwhile"
+        yield _warning("robot", f"{name}: {own.recording.bag_dir}: {snapshot.problem}", do)
+        return
+    if not (snapshot.bags or snapshot.active):
+        do = f"{ROBOTS_SETTING} names another directory for it"
+        yield _warning("robot", f"{name}: {own.recording.bag_dir}: {nothing_here(snapshot)}", do)
+        return
+    found = [
+        *check_bag_dir(own),
+        *check_clock(snapshot, now),
+        *check_bags(own, memory),
+        *check_recordings(memory, snapshot),
+    ]
+    for each in found:
+        if each.level is not Level.OK or each.about == "bags":
+            yield replace(each, about="robot", seen=f"{name}: {each.seen}")
 
 
 def _print(console: Console, findings: Sequence[Finding]) -> None:

@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from datetime import datetime, time, timedelta
 from difflib import get_close_matches
 from pathlib import Path
@@ -120,11 +121,16 @@ def load_with_sources(
 ) -> tuple[Settings, Sources]:
     """Loads the configuration as the server does, and who set each key; `--bag-dir` wins.
 
+    It is about one robot, so there is no fleet then.
+
     Raises:
         ConfigError: the configuration is refused.
     """
     chosen = [] if bag_dir is None else [f"recording.bag_dir={quoted(str(bag_dir.absolute()))}"]
-    return load_explained([*(overrides or ()), *chosen])
+    settings, sources = load_explained([*(overrides or ()), *chosen])
+    if bag_dir is not None:
+        settings = replace(settings, fleet=replace(settings.fleet, robots={}, tokens={}))
+    return settings, sources
 
 
 def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
@@ -241,23 +247,38 @@ def require_recorder(settings: Settings) -> None:
         )
 
 
-def open_memory(settings: Settings, *, verbose: bool = False, scans: bool = True) -> "Memory":
+def open_memory(
+    settings: Settings,
+    *,
+    verbose: bool = False,
+    scans: bool = True,
+    setting: str | None = None,
+) -> "Memory":
     """Returns the memory of the configured bags, with an index of the directory as it is now.
 
-    Without an index where it `scans` not, because others are asked.
+    Without an index where it `scans` not, because the robots of a fleet are asked.
+    `setting` is the one that names the bags, where it is another than `recording.bag_dir`.
     `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
     prints the count when the command ends.
 
     Raises:
         ConfigError: an adapter cannot be built.
+        InvalidArgumentsError: the configuration is that of a fleet, or lacks `data.recording`.
     """
+    robots = settings.fleet.robots
+    if robots and scans:
+        name, folder = next(iter(robots.items()))
+        raise InvalidArgumentsError(
+            f"this looks at the bags of one robot: name them, e.g. --bag-dir {folder} for {name}; "
+            f"the robots are {listed([*robots])} (fleet.robots); `ros2-memory ask` asks all of them"
+        )
     # Imported here: `adopt`, `recover` and `config show` do without the libraries that answer.
     from ros2_memory.bootstrap import build_memory  # noqa: PLC0415
 
     configure_logging(settings.logging.level if verbose else "warning", settings.logging.format)
     if not verbose:
         withhold_warnings()
-    memory = build_memory(settings)
+    memory = build_memory(settings, setting=setting)
     if not scans:
         return memory
     with spinner(f"looking through {settings.recording.bag_dir}"):

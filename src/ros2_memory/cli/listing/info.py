@@ -4,12 +4,13 @@ import json
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import typer
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bootstrap import build_dispatcher
+from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.ask import call_tools, is_error
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
@@ -25,6 +26,7 @@ from ros2_memory.cli.options import (
     stdout_console,
 )
 from ros2_memory.cli.output import format_value, print_reply
+from ros2_memory.config import Settings
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
@@ -143,7 +145,66 @@ def info(
 ) -> None:
     """Show what is recorded: time range, gaps, damaged files, the budget and how long it lasts."""
     settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY, "server.tools=all"], recording)
-    memory = open_memory(settings, verbose=verbose)
+    robots = settings.fleet.robots
+    if not robots:
+        told = _told(settings, verbose=verbose)
+        if as_json:
+            print_line(json.dumps(told.as_json()))
+        else:
+            told.show()
+        are_bags = told.are_bags
+    else:
+        every = {
+            name: _told(robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING)
+            for name in robots
+        }
+        if as_json:
+            print_line(json.dumps({name: each.as_json() for name, each in every.items()}))
+        else:
+            for name, each in every.items():
+                stdout_console().rule(name, align="left")
+                each.show()
+        are_bags = any(each.are_bags for each in every.values())
+    if not are_bags:
+        raise typer.Exit(EXIT_NEGATIVE)
+
+
+class _Told(NamedTuple):
+    """What is told of one bag directory.
+
+    Attributes:
+        empty: the sentence where it has no files.
+        are_bags: whether some bag answers.
+        held: how much is recorded.
+        replies: those of the tools, by name.
+        lists: what may confuse; each may be empty.
+    """
+
+    empty: str | None
+    are_bags: bool
+    held: dict[str, JsonValue]
+    replies: dict[str, JsonValue]
+    lists: dict[str, list[JsonValue]]
+
+    def as_json(self) -> dict[str, JsonValue]:
+        """Returns all of it."""
+        return {**self.replies, "held": self.held, **self.lists}
+
+    def show(self) -> None:
+        """Prints it for people."""
+        if self.empty is not None:
+            print_line(self.empty)
+            return
+        console = stdout_console()
+        parts = map(_for_people, self.replies.values())
+        print_reply(console, {**self.held, **dict(chain.from_iterable(map(dict.items, parts)))})
+        for name, rows in self.lists.items():
+            if rows:
+                print_reply(console, {name: rows})
+
+
+def _told(settings: Settings, *, verbose: bool, setting: str | None = None) -> _Told:
+    memory = open_memory(settings, verbose=verbose, setting=setting)
     dispatcher = build_dispatcher(settings, memory)
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
     replies: list[JsonValue] = [json.loads(answer.text) for answer in call_tools(dispatcher, tools)]
@@ -168,20 +229,11 @@ def info(
             for path, until in assumed_active(memory, snapshot)
         ],
     }
-    held = _held(snapshot)
-    if as_json:
-        print_line(json.dumps(dict(zip(tools, replies, strict=True)) | {"held": held} | lists))
-    elif not _has_files(snapshot):
-        print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
-    else:
-        console = stdout_console()
-        status, covered = map(_for_people, replies)
-        print_reply(console, {**held, **status, **covered})
-        for name, rows in lists.items():
-            if rows:
-                print_reply(console, {name: rows})
-    if not snapshot.bags:
-        raise typer.Exit(EXIT_NEGATIVE)
+    empty = None
+    if not _has_files(snapshot):
+        empty = f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}"
+    by_tool = dict(zip(tools, replies, strict=True))
+    return _Told(empty, bool(snapshot.bags), _held(snapshot), by_tool, lists)
 
 
 def _held(snapshot: Snapshot) -> dict[str, JsonValue]:

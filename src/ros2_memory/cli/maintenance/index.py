@@ -17,7 +17,7 @@ from typing import Annotated, Final
 import typer
 
 from ros2_memory.bootstrap import build_backfill, build_memory
-from ros2_memory.bootstrap_fleet import robot_settings
+from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
     AsJson,
@@ -60,7 +60,7 @@ def index(
     settings = load_for(bag_dir, overrides)
     if for_server is not None:
         _fill_for_server(settings, for_server)
-    elif settings.fleet.robots and bag_dir is None:
+    elif settings.fleet.robots:
         _fill_fleet(settings, as_json=as_json, verbose=verbose)
     else:
         progress = _fill_for_people(settings, verbose=verbose)
@@ -76,7 +76,9 @@ def _fill_fleet(settings: Settings, *, as_json: bool, verbose: bool) -> None:
     problems: list[str] = []
     for name in settings.fleet.robots:
         try:
-            progress = _fill_for_people(robot_settings(settings, name), verbose=verbose)
+            progress = _fill_for_people(
+                robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING
+            )
         except RecorderError as error:
             problems.append(f"{name}: {error}")
             continue
@@ -89,8 +91,8 @@ def _fill_fleet(settings: Settings, *, as_json: bool, verbose: bool) -> None:
         raise RecorderError("; ".join(problems))
 
 
-def _fill_for_people(settings: Settings, *, verbose: bool) -> Progress:
-    memory = open_memory(settings, verbose=verbose)
+def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None = None) -> Progress:
+    memory = open_memory(settings, verbose=verbose, setting=setting)
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)
