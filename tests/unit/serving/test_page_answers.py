@@ -43,15 +43,18 @@ from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools
-from tests.support.bags import detections, odom, write_mcap
+from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of, recalling
+from tests.unit.test_positions import fix
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ros2_memory.history.context import Memory
+    from tests.support.bags import Msg
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -471,3 +474,21 @@ def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: floa
     away = np.abs(driven[:, None] - cells[None]).max(axis=2)
     assert away.min(axis=1).max(initial=0) <= 1.51 * side
     assert len(cells) <= 8_000
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (lambda at: odom(at, 0.0, 0.0, topic="/base"), "set data.pose_topic=/base"),
+        (lambda at: fix(at, 0.0, 0.0), "latitude and longitude are on /fix"),
+        (lambda at: tf(at, transform(at, "odom", "base", (0.0, 0.0, 0.0))), "get_transform_at"),
+    ],
+    ids=["poses elsewhere", "a satellite receiver", "transforms"],
+)
+def test_without_a_path_it_says_what_gives_one(
+    tmp_path: Path, message: Callable[[int], Msg], why: str
+) -> None:
+    write_mcap(tmp_path / "bag.mcap", [message(BEGIN)])
+    found = shown(memory_of(tmp_path))
+    assert found["path"] is None
+    assert why in found["no_path"]

@@ -268,9 +268,10 @@ function showKey() {
   ...(view.isWhole ? [one("stood", `stops, ${map.stops.length}`)] : []),
   one("seen", `things, ${map.things.length}${more}`),
   ...((view.places || []).length ? [one("place", "places")] : []),
-  ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame))] : []),
+  ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame || "without a name"))] : []),
   ...(map.paths.some((each) => !each.whole)
-    ? [el("span", { class: "warn" }, "older path is being read")] : []));
+    ? [el("span", { class: "warn" }, "older path is being read")] : []),
+  ...(view.no_path ? [el("span", { class: "warn" }, `${view.no_path}.`)] : []));
 }
 function pathKey(view, one) {
   return [one("path", view.distance_m === null || view.distance_m === undefined

@@ -59,7 +59,7 @@ class RobotMap {
     this.things = view.things.filter((each) => path && each.frame === path.frame);
     this.stops = view.events.filter((each) => each.kind === "stop" && each.x !== undefined);
     const driven = this.isApart ? `paths of ${this.paths.map((each) => plain(each.name)).join(", ")}`
-      : path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame)}` : "no path";
+      : path ? `${far(view.distance_m || 0)} driven in ${plain(path.frame || "a frame without a name")}` : "no path";
     this.canvas.setAttribute("aria-label", `Map: ${driven}, ${counted(this.stops.length, "stop")}, `
       + `${counted(this.things.length, "thing")}. Arrow keys move it, plus and minus zoom.`);
     this.draw();

@@ -68,7 +68,7 @@ function showSightings(host, answer, point) {
 function showNow(host, view, choose) {
   const { robot, path, range } = view;
   const newest = view.things.filter((each) => range.latest - each.last <= 5);
-  const frame = path ? [entry("Frame", bdi(path.frame))] : [];
+  const frame = path && path.frame ? [entry("Frame", bdi(path.frame))] : [];
   const seen = newest.map((each) => pair(link(each.label, () => choose(each)), metres(each)));
   host.replaceChildren(
     ...(robot ? [el("dl", {}, ...robotRows(robot, frame))] : [soft("Where the robot is, is not known.")]),

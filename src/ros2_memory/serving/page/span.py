@@ -23,6 +23,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Polygon, Rectangle
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.history.no_data import GIVE_TOPIC, resolve_pose_topic
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.saved_moments import list_moments
@@ -238,7 +239,8 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     view = View(memory, call, window.stop)
     places = robot_places(view, window)
     if places is None:
-        return Shown({"path": None, "robot": None}, ("no topic with poses is recorded",))
+        why = _without_poses(view)
+        return Shown({"path": None, "robot": None, "no_path": why}, (why,))
     tracks = RobotTracks(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
     found = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
@@ -253,6 +255,15 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     if found.since is not None:
         notes.append("the path is not complete yet: older bags are still being read")
     return Shown(shown, tuple(notes))
+
+
+def _without_poses(view: View) -> str:
+    """Returns why there is no path, and which setting or tool gives one."""
+    try:
+        topic = resolve_pose_topic(view)
+    except NoDataError as error:
+        return error.detail.replace(f", or {GIVE_TOPIC}", "")
+    return f"{topic} has no poses"
 
 
 def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
