@@ -851,11 +851,15 @@ OneAnswer: TypeAlias = (
 
 @dataclass(frozen=True, slots=True)
 class OfRobot:
-    """What one robot of a fleet answers; its files are named relative to `bag_dir`."""
+    """What one robot of a fleet answers; its files are named relative to `bag_dir`.
+
+    `notes` are on where the answer was found.
+    """
 
     name: str
     bag_dir: Path
     answer: OneAnswer
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

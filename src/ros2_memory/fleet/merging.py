@@ -16,6 +16,7 @@ from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import listed
+from ros2_memory.core.timebase import iso_local
 from ros2_memory.tools.reply_json import ROBOT_NAME
 from ros2_memory.tools.reply_size import to_json_text
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.fleet.robots import FromLake
     from ros2_memory.tools.reply_size import JsonObject
 
 _MOST_NAMED: Final = 8
@@ -41,12 +43,14 @@ class RobotReply:
         value: its reply, as a server of this robot alone would send it, before it is shortened.
         latest: the log time of its newest data; None where there is none.
         is_ahead: whether that lies in the future, so that its times say little beside others'.
+        lake: what to tell where the answer is from a lake.
     """
 
     name: str
     value: JsonValue
     latest: Ns | None = None
     is_ahead: bool = False
+    lake: FromLake | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,12 +338,33 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, str]) -> lis
         f"no answer of {listed(names, at_most=_MOST_NAMED)}: {reason}"
         for reason, names in by_reason.items()
     ]
+    by_reason = {}
+    for each in replies:
+        for note in () if each.lake is None else each.lake.notes:
+            by_reason.setdefault(note, []).append(each.name)
+    notes += [f"{listed(names, at_most=_MOST_NAMED)}: {note}" for note, names in by_reason.items()]
+    notes += shipped_to({each.name: each.lake.latest for each in replies if each.lake is not None})
     if ahead := [each.name for each in replies if each.is_ahead]:
         notes.append(
             f"{listed(ahead, at_most=_MOST_NAMED)}: dated in the future by a clock that ran ahead, "
             "so listed last: their times cannot be compared with others'"
         )
     return notes
+
+
+def shipped_to(latest: Mapping[str, Ns | None]) -> list[str]:
+    """Returns the note on answers from a lake: up to when each robot's bags were shipped."""
+    if not latest:
+        return []
+    order = sorted(latest, key=lambda name: latest[name] or 0)
+    parts = [f"{name} up to {_moment(latest[name])}" for name in order[:_MOST_NAMED]]
+    if order[_MOST_NAMED:]:
+        parts.append(f"{len(order) - _MOST_NAMED} others up to later")
+    return [f"from the lake, which has what was shipped: {', '.join(parts)}"]
+
+
+def _moment(time: Ns | None) -> str:
+    return "no time" if time is None else iso_local(time) or str(time)
 
 
 def _with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:

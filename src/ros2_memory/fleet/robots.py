@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
-from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError, NotShippedError
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS, Clock
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
+
+T = TypeVar("T")
 
 _MOST_NAMED = 50
 
@@ -31,18 +33,63 @@ class StoppedClock(Clock):
         return self.at
 
 
+class FromLake(NamedTuple):
+    """What an answer from a lake is to be told with.
+
+    Attributes:
+        latest: the log time of the newest message that was shipped; None where there is none.
+        notes: what else was not looked at, or is not exact.
+    """
+
+    latest: Ns | None
+    notes: tuple[str, ...] = ()
+
+
+class LakeSource(Protocol):
+    """What a lake has of one robot."""
+
+    @property
+    def memory(self) -> Memory:
+        """The robot's memory over its rows, always the same one."""
+
+    @property
+    def latest(self) -> Ns | None:
+        """The log time of the newest message that was shipped; None where there is none."""
+
+    def notes(self) -> Iterable[str]:
+        """Returns what the answer that this thread has just computed is to be told with."""
+
+
 class Robot:
     """One robot of a fleet. Its memory is built when it is first needed; no bag is read for that.
 
-    Attributes:
+    Args:
         name: as replies and arguments have it; never a path.
         bag_dir: the bag directory, which need not exist.
+        build: what builds its memory.
+        lake: what a lake has of it, which is asked first.
+        is_mounted: whether there is a memory besides that of the lake.
+
+    Attributes:
+        name: see above.
+        bag_dir: see above.
+        is_mounted: see above.
     """
 
-    def __init__(self, name: str, bag_dir: Path, build: Callable[[], Memory]) -> None:
+    def __init__(
+        self,
+        name: str,
+        bag_dir: Path,
+        build: Callable[[], Memory],
+        *,
+        lake: LakeSource | None = None,
+        is_mounted: bool = True,
+    ) -> None:
         self.name = name
         self.bag_dir = bag_dir
+        self.is_mounted = is_mounted
         self._build = build
+        self._lake_source = lake
         self._lock = threading.Lock()
         self._memory: Memory | None = None
 
@@ -52,6 +99,25 @@ class Robot:
             if self._memory is None:
                 self._memory = self._build()
             return self._memory
+
+    def asked(self, ask: Callable[[Memory], T], *, lake: bool) -> tuple[T, FromLake | None]:
+        """Returns what `ask` finds in a memory, and what to tell with it where that is a lake's.
+
+        With `lake` that is the memory of the lake, where there is one; the mounted one answers what
+        needs messages that the lake does not hold.
+
+        Raises:
+            NotShippedError: it needs those, and no other memory is mounted.
+        """
+        source = self._lake_source
+        if source is not None and (lake or not self.is_mounted):
+            try:
+                found = ask(source.memory)
+                return found, FromLake(source.latest, (*source.notes(),))
+            except NotShippedError:
+                if not self.is_mounted:
+                    raise
+        return ask(self.memory()), None
 
     def latest_known(self) -> Ns:
         """Returns the log time of its newest data as of the last scan; the least before the first.

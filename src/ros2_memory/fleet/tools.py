@@ -29,6 +29,7 @@ from ros2_memory.fleet.merging import (
     TOPICS,
     RobotReply,
     merged,
+    shipped_to,
 )
 from ros2_memory.fleet.page import Page
 from ros2_memory.fleet.robots import Robot, StoppedClock
@@ -39,8 +40,8 @@ from ros2_memory.tools.reply_json import ROBOT_NAME
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from ros2_memory.fleet.robots import Fleet
-    from ros2_memory.history.context import Call
+    from ros2_memory.fleet.robots import Fleet, FromLake
+    from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Answer, OneAnswer
     from ros2_memory.tools.declaration import Question, Tool
     from ros2_memory.tools.reply_size import JsonObject
@@ -49,6 +50,18 @@ ROBOT: Final = "robot"
 """The argument that names a robot."""
 _AHEAD_NS: Final[Ns] = 60 * NS_PER_S
 """Data that is newer than now by more was dated by a clock that runs ahead."""
+OF_LAKE: Final = frozenset(
+    {
+        "find_last_match",
+        "find_matches",
+        "find_things",
+        "visits",
+        "recap",
+        "trajectory_summary",
+        "recent_trajectory_summary",
+    }
+)
+"""The tools that ask a lake first, where there is one."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
 """Tools whose reply says itself that a bag directory is missing."""
 
@@ -128,13 +141,19 @@ class _FleetQuestions:
             EpisodicError: it has none.
         """
 
-        def ask(_: Robot, own: Call) -> OneAnswer:
-            return _single(question(robot.memory(), own))
+        def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None]:
+            return robot.asked(lambda memory: _single(question(memory, own)), lake=self._is_of_lake)
 
-        answer = self.fan_out.ask([robot], ask, call)[robot.name]
-        if isinstance(answer, EpisodicError):
-            raise answer
-        return OfRobot(robot.name, robot.bag_dir, answer)
+        found = self.fan_out.ask([robot], ask, call)[robot.name]
+        if isinstance(found, EpisodicError):
+            raise found
+        answer, told = found
+        notes = () if told is None else (*shipped_to({robot.name: told.latest}), *told.notes)
+        return OfRobot(robot.name, robot.bag_dir, answer, notes)
+
+    @property
+    def _is_of_lake(self) -> bool:
+        return self.tool.name in OF_LAKE
 
     def _of_all(self, question: Question, given: Mapping[str, object], call: Call) -> OfFleet:
         robots = self.fleet.allowed(call)
@@ -173,19 +192,28 @@ class _FleetQuestions:
         Raises:
             EpisodicError: it has none.
         """
-        memory = robot.memory()
+
+        def ask(memory: Memory) -> RobotReply:
+            return self._replied(question, replace(memory, clock=now), page, robot, call)
+
+        reply, told = robot.asked(ask, lake=self._is_of_lake)
+        return replace(reply, lake=told)
+
+    def _replied(
+        self, question: Question, memory: Memory, page: Page, robot: Robot, call: Call
+    ) -> RobotReply:
         snapshot = memory.index.snapshot()
         if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
             # "Never" would be a claim about bags that were not searched.
             raise RefusedError(snapshot.problem)
         latest = snapshot.latest
-        is_ahead = latest is not None and latest > now.at + _AHEAD_NS
+        is_ahead = latest is not None and latest > memory.clock.now() + _AHEAD_NS
         # Rows of those whose clock is ahead come last, whenever they are.
         call.rows_in = None if is_ahead else page.window()
-        answer = _single(question(replace(memory, clock=now), call))
+        answer = _single(question(memory, call))
         if isinstance(answer, Sightings) and not is_ahead:
             page.add(each.last for each in answer.sightings)
-        value = as_json(answer, robot.bag_dir)
+        value = as_json(answer, memory.index.bag_dir)
         return RobotReply(robot.name, value, latest, is_ahead)
 
     def _limit(self, given: object) -> int | None:

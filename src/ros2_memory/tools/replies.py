@@ -71,9 +71,11 @@ class Replies:
         `from_active`: whether messages of a split that is still being written were read, which a
         reply that is an object shows.
         """
-        name = None
+        name: str | None = None
+        notes: tuple[str, ...] = ()
         if isinstance(answer, results.OfRobot):
-            name, bag_dir, answer = answer.name, answer.bag_dir, answer.answer
+            name, bag_dir, notes = answer.name, answer.bag_dir, answer.notes
+            answer = answer.answer
         else:
             bag_dir = self.bag_dir
         if isinstance(answer, tuple):
@@ -83,6 +85,9 @@ class Replies:
             value = named(name, value)
         if not isinstance(value, dict):
             return Reply(to_json_text(value))
+        if notes:
+            known = value.get("notes")
+            value = {**value, "notes": [*(known if isinstance(known, list) else ()), *notes]}
         if from_active:
             value = {**value, "from_active": True}
         return Reply(fit_reply(value, self.max_chars))

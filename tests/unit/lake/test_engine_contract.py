@@ -39,6 +39,7 @@ def duckdb_engine() -> Iterator[LakeEngine]:
 
 def ray_engine() -> Iterator[LakeEngine]:
     """On two nodes, each with one processor."""
+    import ray  # noqa: PLC0415 - not installed everywhere
     from ray.cluster_utils import Cluster  # noqa: PLC0415 - not installed everywhere
 
     from ros2_memory.lake.engines.ray_engine import RayEngine  # noqa: PLC0415
@@ -46,6 +47,7 @@ def ray_engine() -> Iterator[LakeEngine]:
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     cluster.add_node(num_cpus=1)
     yield RayEngine(cluster.address)
+    ray.shutdown()
     cluster.shutdown()
 
 
@@ -103,7 +105,7 @@ def test_it_filters_groups_and_orders(lake: Lake) -> None:
 
 
 def test_a_text_is_never_sql(lake: Lake) -> None:
-    sql = "SELECT DISTINCT label FROM sightings WHERE label IN $labels ORDER BY label"
+    sql = "SELECT label FROM sightings WHERE label IN $labels GROUP BY label ORDER BY label"
     found = lake.select(sql, ["sightings"], {"labels": ODD})
     assert found["label"].to_pylist() == sorted(ODD)
     one_by_one = "SELECT count(*) AS n FROM sightings WHERE label = $label AND robot = $robot"
@@ -118,7 +120,7 @@ def test_nothing_is_in_no_values(lake: Lake) -> None:
 
 
 def test_only_files_of_these_robots_and_days_are_read(lake: Lake) -> None:
-    sql = "SELECT DISTINCT robot, day FROM sightings ORDER BY robot, day"
+    sql = "SELECT robot, day FROM sightings GROUP BY robot, day ORDER BY robot, day"
     one = lake.select(sql, ["sightings"], robots=["hall", "it's"], days=(DAY, DAY))
     assert one.to_pylist() == [{"robot": "hall", "day": DAY}, {"robot": "it's", "day": DAY}]
     assert lake.select(sql, ["sightings"], robots=[]).num_rows == 0

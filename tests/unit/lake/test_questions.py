@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from ros2_memory.core.errors import EpisodicError, NotShippedError
-from ros2_memory.fleet.robots import Fleet
+from ros2_memory.core.timebase import NS_PER_S, iso_local
+from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
@@ -129,8 +130,6 @@ def test_metres_of_a_time_that_cuts_bags_are_those_of_the_track(robots: Robots) 
     given: dict[str, object] = {**CUT, "robot": "hall", "max_waypoints": 0}
     expected, found = (reply(each, "trajectory_summary", given) for each in robots[:2])
     assert found["distance_m"] == pytest.approx(expected["distance_m"], rel=0.03)
-    notes = [*robots.of_lake["hall"].notes()]
-    assert len(notes) >= 1
 
 
 def test_what_the_lake_does_not_hold_is_refused_with_the_remedy(robots: Robots) -> None:
@@ -165,6 +164,42 @@ def test_chosen_messages_answer_as_those_of_the_bags(
         assert "error" not in expected
         assert rounded(found) == rounded(expected), tool
     engine.close()
+
+
+def mixed(robots: Robots, *, is_mounted: bool) -> Fleet:
+    """The fleet of a server with a lake, and with or without the robots' own memories."""
+    mounted = robots.mounted.robots
+    both = [
+        Robot(name, Path("/") / name, mounted[name].memory, lake=source, is_mounted=is_mounted)
+        for name, source in robots.of_lake.items()
+    ]
+    return Fleet(both, robots.mounted.clock, shared_map=True)
+
+
+def test_answers_say_up_to_when_each_robot_was_shipped(robots: Robots) -> None:
+    fleet = mixed(robots, is_mounted=True)
+    asked = {**MUG, "value": "elephant"}
+    *_, note = reply(fleet, "find_last_match", asked)["notes"]
+    ends = sorted((seeded(name).end_s, name) for name in NAMES)
+    times = [f"{name} up to {iso_local(end * NS_PER_S)}" for end, name in ends]
+    assert note == f"from the lake, which has what was shipped: {', '.join(times)}"
+    alone = reply(fleet, "recap", {**ALL, "robot": "hall"})["notes"]
+    end = iso_local(seeded("hall").end_s * NS_PER_S)
+    assert f"from the lake, which has what was shipped: hall up to {end}" in alone
+    cut = reply(fleet, "trajectory_summary", {**CUT, "robot": "hall"})["notes"]
+    assert any("not every pose" in each for each in cut)
+
+
+def test_a_mounted_memory_answers_what_the_lake_cannot(robots: Robots) -> None:
+    docked = {"topic": "/is_docked", "condition_type": "equals", "value": True}
+    expected = reply(robots.mounted, "find_last_match", docked)
+    assert len(expected["matches"]) == 3
+    assert reply(mixed(robots, is_mounted=True), "find_last_match", docked) == expected
+    refused = reply(mixed(robots, is_mounted=False), "find_last_match", docked)
+    assert (refused["error"], "lake.messages" in refused["detail"]) == ("refused", True)
+    # What a robot does now is not in a lake.
+    mounted = reply(robots.mounted, "memory_status", {})
+    assert reply(mixed(robots, is_mounted=True), "memory_status", {}) == mounted
 
 
 def rounded(value: object) -> object:

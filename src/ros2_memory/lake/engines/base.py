@@ -51,11 +51,12 @@ class LakeEngine(ABC):
         """Returns the rows of one select.
 
         Its subset is what DuckDB and Daft both take: no `WITH` and no `UNION`; joins, `IN`,
-        `GROUP BY` with count, sum, min and max, `ORDER BY`, `LIMIT`. The tables it names are those
-        given; a column that a file lacks is null there, and a table may have no file at all.
-        `$name` is the parameter of that name, whose text is never SQL; of a list it is all values
-        in parentheses, for `IN $name`. Integers come back as integers of any width, sums of them
-        only where they are cast to BIGINT. Without `ORDER BY` the rows are in no order.
+        `GROUP BY` with count, sum, min and max, `LIMIT`, `ORDER BY`, or `DISTINCT` without it. The
+        tables it names are those given; a column that a file lacks is null there, and a table may
+        have no file at all. `$name` is the parameter of that name, whose text is never SQL; of a
+        list it is all values in parentheses, for `IN $name`. Integers come back as integers of any
+        width, sums of them only where they are cast to BIGINT. Without `ORDER BY` the rows are in
+        no order.
 
         Raises:
             RefusedError: a file cannot be read, or the engine cannot be reached; the log has why.

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.core.timebase import iso_local
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.memory.catalogue import LakeCatalogue
@@ -16,7 +15,7 @@ from ros2_memory.lake.memory.reader import LakeReader
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.core.timebase import Clock
+    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.lake.files import Lake
 
@@ -66,12 +65,15 @@ class LakeRobot:
         extractor = SchemaExtractor({}, most)
         self.memory = Memory(self._index, self._reader, extractor, clock, own, recall)
 
+    @property
+    def latest(self) -> Ns | None:
+        """The log time of the newest message that was shipped; None where there is none."""
+        known = self._index.published
+        return None if known is None else known.latest
+
     def notes(self) -> Iterator[str]:
         """Yields what the answer that this thread has just computed is to be told with."""
-        latest = None if self._index.published is None else self._index.published.latest
-        if latest is not None:
-            yield f"from the lake, which has what was shipped: up to {iso_local(latest)}"
         if self._index.since is not None:
-            yield f"older days than {self._index.since} are in the lake, and were not looked at"
+            yield f"the lake has days before {self._index.since}, which were not looked at"
         if self._reader.take_thinned():
-            yield "where a time cuts a bag, the robot's thinned track was used, not every pose"
+            yield "for parts of bags the track was used that the lake has, not every pose"
