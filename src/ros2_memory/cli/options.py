@@ -110,9 +110,26 @@ Start = Annotated[
 End = Annotated[
     str | None, typer.Option(metavar="TIME", help="End time, inclusive, in the same formats.")
 ]
+
+
+def _seconds(text: str) -> float:
+    """Returns the seconds of a number or a duration; an error of usage where it is neither."""
+    try:
+        return float(text)
+    except ValueError:
+        length = parse_duration(text)
+    if length is None:
+        raise typer.BadParameter(f"{text!r} is neither seconds nor a duration such as 90s, 10m, 2h")
+    return length
+
+
 Last = Annotated[
     float | None,
-    typer.Option(metavar="S", help="The last S seconds, instead of --start and --end."),
+    typer.Option(
+        metavar="S",
+        parser=_seconds,
+        help="The last S seconds, or 10m, 2h, 3d; instead of --start and --end.",
+    ),
 ]
 
 
