@@ -556,6 +556,15 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
     assert chromium.complaints() == []
 
 
+def test_a_heading_is_that_of_a_compass_after_many_turns(chromium: Browser, scratch: Path) -> None:
+    messages = [odom(T0 + n * NS_PER_S // 10, 0.0, 0.0, yaw=0.1 * n) for n in range(201)]
+    write_mcap(scratch / "turning" / "rec" / "rec_0.mcap", messages)
+    given = ("storage=mcap", "recorder=none", "data.now=latest")
+    with serving(scratch / "turning", scratch / "log_turning", *given) as server:
+        show(chromium, server)
+        assert "Heading\n66\u00b0" in chromium.text("#moment")  # 20 rad, 3 turns less
+
+
 def drive(bag_dir: Path, name: str, begin: int, seconds: int, x: float = 0.0) -> None:
     """A bag of a robot that drives 1 m/s, in place at once as a closed one."""
     at_s = [n / 10 for n in range(seconds * 10 + 1)]

@@ -11,7 +11,10 @@ function robotRows(robot, extra = []) {
   if (robot) rows.push(entry("Robot", metres(robot)));
   if (robot && robot.in) rows.push(entry("In", bdi(robot.in)));
   const yaw = robot ? robot.yaw_deg ?? robot.yaw : null;
-  if (yaw !== null && yaw !== undefined) rows.push(entry("Heading", `${Math.round(yaw)}\u00b0`));
+  // That of a path goes on over 180, so that it can be interpolated.
+  if (yaw !== null && yaw !== undefined) {
+    rows.push(entry("Heading", `${Math.round(yaw - 360 * Math.round(yaw / 360))}\u00b0`));
+  }
   return [...rows, ...extra];
 }
 function notesOf(notes) {
