@@ -3,7 +3,8 @@
 Each robot has six hours of a home robot's day, one of a few that are told apart by their seed, as
 hard links; and a catalogue of its own that knows all of them. The map moves, things are moved, and
 people come in. The questions are asked in a process that has looked through all directories: the
-first time, and then again, of which the fastest counts.
+first time, and then again, of which the fastest counts. The aim is one of processor time, which
+hardly depends on what the machine does besides.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
 
 MOST_S: Final = 1.0
+"""Of one core, for a question that was asked before."""
 MOST_MB: Final = 1000.0
 _AGAIN: Final = 3
 _SEEDS: Final = 3
@@ -223,7 +225,8 @@ def _printed(found: Found, what: str) -> int:
     missed = found.resident_mb > MOST_MB
     for words, row in found.took.items():
         each = Took(*row)
-        is_late = each.again_s > MOST_S
+        # Python runs one thread at a time: on a machine that does nothing else, no more passes.
+        is_late = each.again_cpu_s > MOST_S
         missed |= is_late or bool(each.trouble)
         verdict = f"MISSED {each.trouble}" if is_late or each.trouble else "ok"
         print(

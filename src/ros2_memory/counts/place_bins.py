@@ -17,6 +17,7 @@ from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.where import PLACES_SETTING
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,7 +45,7 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
     places = places_in(view, view.memory.limits.places, frame_id)
     if not places:
         raise InvalidArgumentsError(
-            f"by place needs named places in {frame_id}, and data.places_file has none"
+            f"by place needs named places in {frame_id}, and there is none in {PLACES_SETTING}"
         )
     track = track_in(view, frame_id, window)
     inside = [

@@ -43,7 +43,7 @@ from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, region_visits, visit_of
-from ros2_memory.places.where import Where, parse_where
+from ros2_memory.places.where import PLACES_SETTING, Where, parse_where
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
@@ -181,7 +181,9 @@ def asked_place(
     if x is not None or y is not None:
         raise InvalidArgumentsError("x and y must both be given, or neither")
     if not limits.places:
-        raise InvalidArgumentsError("no place is named in data.places_file: give x and y, or where")
+        raise InvalidArgumentsError(
+            f"no place is named in {PLACES_SETTING}: give x and y, or where"
+        )
     return None
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.places.robot_tracks import Inside
 
+PLACES_SETTING: Final = "data.places_file (of the robots of a fleet: fleet.places)"
+"""Where places are named, for sentences."""
 _EXPECTED: Final = (
     "give the name of a place, "
     '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m)'
@@ -79,7 +81,7 @@ def _named(places: Sequence[Place], name: str) -> Where:
         if " ".join(place.name.split()).casefold() == asked:
             return Where(place.region, place.frame_id, place.name)
     known = ", ".join(sorted(each.name for each in places))
-    listed = f"there are: {known}" if known else "none are named in data.places_file"
+    listed = f"there are: {known}" if known else f"none are named in {PLACES_SETTING}"
     raise InvalidArgumentsError(f"where: no place is named {abbreviate(name)}; {listed}")
 
 
