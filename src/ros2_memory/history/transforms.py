@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
+    from ros2_memory.storage.base import Schema
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read; the last is the length of tf2's cache."""
@@ -196,9 +197,25 @@ def _clock(view: View, moving: Sequence[StampedTransform]) -> TfClock:
 
 
 def static_transforms(view: View, among: Session) -> list[StampedTransform]:
-    """Returns every static transform of a session, in log-time order."""
+    """Returns every static transform of a session, in log-time order.
+
+    Where each split has the same messages again, they are decoded once.
+    """
     topics = view.memory.limits.tf_static_topics
-    return list(_transforms(view, topics, TimeWindow.everything(), among))
+    decoded: dict[tuple[Schema, str, bytes], tuple[StampedTransform, ...]] = {}
+    found: list[StampedTransform] = []
+    for each in _messages(view, topics, TimeWindow.everything(), among):
+        channel, at = each.record.channel, each.time
+        key = (channel.schema, channel.encoding, each.record.payload)
+        if key not in decoded:
+            decoded[key] = _decoded(view, each)
+        found += (
+            StampedTransform(
+                edge.parent, edge.child, edge.stamp, at, edge.transform, static=edge.static
+            )
+            for edge in decoded[key]
+        )
+    return found
 
 
 def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
@@ -508,21 +525,25 @@ def _transforms(
     view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
 ) -> Iterator[StampedTransform]:
     """Yields the transforms in a window, in order; with duplicates, where it is of one session."""
+    for each in _messages(view, topics, window, among):
+        yield from _decoded(view, each)
+
+
+def _messages(
+    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
+) -> Iterator[StoredMessage]:
     recorded = _recorded(view, topics)
     if not recorded:
-        return
+        return iter(())
     if among is None:
-        found = view.stream.messages(recorded, window)
-    else:
-        # A message that was relatched belongs to the recording that received it, too.
-        bags = _bags_of(view, recorded, window, among)
-        sessions = sessions_of(view)
-        merged = view.stream.merged(bags, recorded, window, newest_first=False)
-        several = any(sessions.is_carried(span.bag) for span in bags)
-        tracked = view.bags.track_sources(merged)
-        found = (each for each in tracked if not several or sessions.has(among, each))
-    for each in found:
-        yield from _decoded(view, each)
+        return view.stream.messages(recorded, window)
+    # A message that was relatched belongs to the recording that received it, too.
+    bags = _bags_of(view, recorded, window, among)
+    sessions = sessions_of(view)
+    merged = view.stream.merged(bags, recorded, window, newest_first=False)
+    several = any(sessions.is_carried(span.bag) for span in bags)
+    tracked = view.bags.track_sources(merged)
+    return (each for each in tracked if not several or sessions.has(among, each))
 
 
 def _bags_of(
