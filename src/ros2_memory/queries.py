@@ -52,7 +52,12 @@ from ros2_memory.history.no_data import (
     seconds,
     with_notes,
 )
-from ros2_memory.history.reverse_search import ReverseSearch, condition_of, notes_on_never
+from ros2_memory.history.reverse_search import (
+    ReverseSearch,
+    compared_frames,
+    condition_of,
+    unasked_limit,
+)
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.view import (
     AtTime,
@@ -84,6 +89,7 @@ from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
@@ -258,10 +264,7 @@ def find_last_match(
     search = ReverseSearch(view, topic, condition)
     found = search.newest(until)
     if found is None:
-        notes = (
-            *_never(view, search, until),
-            *notes_on_never(view, search.topics, condition, min_score),
-        )
+        notes = _notes_on_never(view, search, until, condition, min_score)
         return results.Match(None, notes=notes)
     note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
@@ -298,10 +301,7 @@ def value_when(
     search = ReverseSearch(view, condition_topic, condition)
     found = search.newest(until)
     if found is None:
-        notes = (
-            *_never(view, search, until),
-            *notes_on_never(view, search.topics, condition, min_score),
-        )
+        notes = _notes_on_never(view, search, until, condition, min_score)
         return results.ValueWhen(None, notes=notes)
     note_unread(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)
@@ -467,6 +467,14 @@ def _never(view: View, search: ReverseSearch, until: Ns) -> tuple[str, ...]:
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
     )
+
+
+def _notes_on_never(
+    view: View, search: ReverseSearch, until: Ns, condition: Condition, min_score: float | None
+) -> tuple[str, ...]:
+    """Returns the notes on a search that found nothing; without any the reply is a plain null."""
+    notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+    return (*notes, *compared_frames(view, search.topics, condition)) if notes else ()
 
 
 def _before(before_s: float | None) -> Ns:

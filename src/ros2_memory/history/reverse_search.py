@@ -66,18 +66,23 @@ def condition_of(
     return parse_condition(condition_type, value, settings.position_tolerance_m, field, least)
 
 
-def notes_on_never(
-    view: View, topics: Sequence[str], condition: Condition, min_score: float | None
-) -> Iterator[str]:
-    """Yields what a question that found nothing did not ask for: scores, and another frame."""
-    if min_score is None and condition.min_score:
-        least = f"{condition.min_score:g}"
-        yield f"detections with a score below {least} do not count here, unless min_score is given"
-    if isinstance(condition.test, NearPosition):
-        frames = [(topic, _frames_of(view, topic)) for topic in topics[:_MOST_FRAMES]]
-        named = [f"{', '.join(each)} ({topic})" for topic, each in frames if each]
-        if named:
-            yield f"near_position compared x and y in the frame of each message: {listed(named)}"
+def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
+    """Returns the note on a limit of scores that the question does not have, for "never"."""
+    if min_score is not None or not condition.min_score:
+        return ()
+    least = f"{condition.min_score:g}"
+    return (f"detections with a score below {least} do not count here, unless min_score is given",)
+
+
+def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+    """Returns the note on the frames in which `near_position` compared, where it found nothing."""
+    if not isinstance(condition.test, NearPosition):
+        return ()
+    frames = [(topic, _frames_of(view, topic)) for topic in topics[:_MOST_FRAMES]]
+    named = [f"{', '.join(each)} ({topic})" for topic, each in frames if each]
+    if not named:
+        return ()
+    return (f"near_position compared x and y in the frame of each message: {listed(named)}",)
 
 
 def _frames_of(view: View, topic: str) -> list[str]:

@@ -29,7 +29,12 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics
-from ros2_memory.history.reverse_search import ReverseSearch, condition_of, notes_on_never
+from ros2_memory.history.reverse_search import (
+    ReverseSearch,
+    compared_frames,
+    condition_of,
+    unasked_limit,
+)
 from ros2_memory.history.transforms import newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
@@ -155,7 +160,8 @@ def find_matches(
     if is_nothing:
         topics = matching_topics(view, topic)
         silences = describe_silences(view, topics, searched)
-        for sentence in (*silences, *notes_on_never(view, topics, condition, min_score)):
+        frames = compared_frames(view, topics, condition)
+        for sentence in (*silences, *unasked_limit(condition, min_score), *frames):
             view.notes.add(sentence)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
