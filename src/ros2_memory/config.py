@@ -38,7 +38,12 @@ from pydantic.dataclasses import dataclass
 from pydantic.types import PathType
 from pydantic_core import to_jsonable_python
 
-from ros2_memory.config_errors import foreign_errors_as_config_error, line_of, validated
+from ros2_memory.config_errors import (
+    OpenSecretError,
+    foreign_errors_as_config_error,
+    line_of,
+    validated,
+)
 from ros2_memory.config_sources import (
     INTERFACES_VARIABLE,
     Sources,
@@ -59,6 +64,8 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 EXIT_CODE: Final = 2
+_SECRET_WORDS: Final = ("secret", "password", "token", "credential", "access-key", "key-id", "auth")
+"""Settings of pyiceberg with one of these in their name are not shown, so not given openly."""
 _FEWEST_CORNERS: Final = 3
 
 
@@ -124,6 +131,20 @@ def _robots_found(value: object) -> object:
     if not folders:
         raise ValueError("must match the folders of robots, and matches none")
     return {each[len(before) : len(each) - len(after)]: each for each in folders}
+
+
+def _without_password(uri: str) -> str:
+    if "@" in uri.partition("://")[2].partition("/")[0]:
+        raise OpenSecretError("must name no user or password, which belong into lake.secrets_file")
+    return uri
+
+
+def _without_secrets(properties: dict[str, str]) -> dict[str, str]:
+    for name, value in properties.items():
+        if any(each in name.lower() for each in _SECRET_WORDS):
+            raise OpenSecretError(f"must not contain {name}: put it into lake.secrets_file")
+        _without_password(value)
+    return properties
 
 
 def _one_star(pattern: str) -> str:
@@ -298,6 +319,28 @@ class FleetSettings:
                 raise ValueError(
                     f"must have in tokens, under {file}, robots of the fleet, not {unknown[0]}"
                 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class LakeSettings:
+    """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
+
+    Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
+    """
+
+    warehouse: Annotated[Text, AfterValidator(_without_password)] | None
+    catalog: Literal["sql", "rest"]
+    uri: Annotated[Text, AfterValidator(_without_password)] | None
+    state_dir: AnyPath | None
+    properties: Annotated[dict[Text, Text], AfterValidator(_without_secrets)]
+    secrets_file: AnyPath | None
+    messages: tuple[Text, ...]
+    commit_interval_s: Tolerance
+
+    def __post_init__(self) -> None:
+        """Refuses a REST catalogue without an address."""
+        if self.catalog == "rest" and self.uri is None:
+            raise ValueError("must have in uri the address of the catalogue, with catalog=rest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -504,6 +547,7 @@ class Settings:
     retention: RetentionSettings
     server: ServerSettings
     fleet: FleetSettings
+    lake: LakeSettings
     logging: LoggingSettings
     storage: Annotated[McapNode | Rosbag2Node, Field(discriminator="target")]
     recorder: Annotated[Ros2BagNode | NullRecorderNode, Field(discriminator="target")]

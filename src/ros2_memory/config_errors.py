@@ -37,6 +37,10 @@ _RULES: Final = {
 }
 
 
+class OpenSecretError(ValueError):
+    """A value that seems to hold a secret, so that no error shows it."""
+
+
 def validated(
     model: type[_T],
     data: object,
@@ -150,6 +154,8 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
         return f"{key}: {_shown(refused)} is not allowed; use one of: {allowed}"
     rule = _RULES.get(kind) or re.sub(r"^(Input|String|Value) should ", "must ", fault["msg"])
     rule = rule.removeprefix("Value error, ")
+    if isinstance(context.get("error"), OpenSecretError):
+        return f"{key}: its value is not allowed, and not shown; {rule}"
     return f"{key}: {_shown(fault['input'])} is not allowed; {rule}"
 
 

@@ -20,7 +20,8 @@ from tests.support.bags import odom, write_db3
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RECORDER = DEPLOY / "ros2-memory-recorder.service"
 SERVER = DEPLOY / "ros2-memory-server.service"
-BOTH = pytest.mark.parametrize("unit", [RECORDER, SERVER], ids=lambda unit: unit.stem)
+SHIP = DEPLOY / "ros2-memory-ship.service"
+BOTH = pytest.mark.parametrize("unit", [RECORDER, SERVER, SHIP], ids=lambda unit: unit.stem)
 
 
 def settings_of(unit: Path) -> dict[str, list[str]]:
@@ -53,7 +54,7 @@ needs_sysusers = pytest.mark.skipif(
 
 
 @needs_analyze
-@pytest.mark.parametrize(("unit", "limit"), [(RECORDER, 3.0), (SERVER, 2.0)])
+@pytest.mark.parametrize(("unit", "limit"), [(RECORDER, 3.0), (SERVER, 2.0), (SHIP, 2.0)])
 def test_a_unit_is_exposed_by_less_than_its_limit(unit: Path, limit: float) -> None:
     assert exposure(unit) < limit
 

@@ -85,6 +85,16 @@ class TestDefaults:
                 "traces": False,
             },
             "fleet": {"robots": {}, "places": None, "shared_map": False, "tokens": {}},
+            "lake": {
+                "warehouse": None,
+                "catalog": "sql",
+                "uri": None,
+                "state_dir": None,
+                "properties": {},
+                "secrets_file": None,
+                "messages": (),
+                "commit_interval_s": 60.0,
+            },
             "logging": {"level": "info", "format": "json", "arguments": True},
             "storage": {
                 "target": MCAP,
@@ -290,6 +300,26 @@ class TestFleet:
             fleet_of("{r1: /a}", "fleet.tokens={/run/site: [r3]}")
 
 
+class TestLake:
+    def test_takes_no_secret_openly(self) -> None:
+        for each in (
+            '+lake.properties={s3.secret-access-key: "abc"}',
+            '+lake.properties={s3.endpoint: "http://me:abc@nas"}',
+            'lake.warehouse="s3://me:abc@bucket/lake"',
+        ):
+            with pytest.raises(ConfigError, match="secrets_file") as refused:
+                load_settings([each], {})
+            assert "abc" not in str(refused.value)
+
+    def test_takes_settings_of_the_store(self) -> None:
+        settings = load_settings(['+lake.properties={s3.endpoint: "http://nas:9000"}'], {})
+        assert settings.lake.properties == {"s3.endpoint": "http://nas:9000"}
+
+    def test_needs_the_address_of_a_rest_catalogue(self) -> None:
+        with pytest.raises(ConfigError, match="address of the catalogue"):
+            load_settings(["lake.catalog=rest"], {})
+
+
 def fleet_of(robots: str, *more: str) -> Settings:
     return load_settings([f"fleet.robots={robots}", *more], {"MEMORY_DEPLOYMENT": "fleet"})
 
@@ -303,13 +333,14 @@ class TestPresets:
             ("query_only", ROSBAG2, NONE, "stdio", "wall"),
             ("replay", ROSBAG2, NONE, "stdio", "latest"),
             ("fleet", ROSBAG2, NONE, "stdio", "wall"),
+            ("lake", ROSBAG2, NONE, "stdio", "wall"),
             ("local", MCAP, NONE, "stdio", "wall"),
         ],
     )
     def test_set_adapters_and_keys(
         self, preset: str, storage: str, recorder: str, transport: str, now: str
     ) -> None:
-        robots = ["fleet.robots={r1: /data/r1/bags}"] if preset == "fleet" else []
+        robots = ["fleet.robots={r1: /data/r1/bags}"] if preset in {"fleet", "lake"} else []
         settings = load_settings(robots, {"MEMORY_DEPLOYMENT": preset})
         assert (settings.storage.target, settings.recorder.target) == (storage, recorder)
         assert (settings.server.transport, settings.data.now) == (transport, now)
@@ -322,6 +353,7 @@ class TestPresets:
             "query_only",
             "replay",
             "fleet",
+            "lake",
             "local",
         }
 

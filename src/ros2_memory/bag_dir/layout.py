@@ -22,6 +22,7 @@
       .episodic/triggers.json      what rules found so far (see `trigger_file`)
       .episodic/erasing.json       messages that are being taken out of bags (see `erasure_file`)
       .episodic/screened.json      what `recording.exclude_when` holds back (see `screened_file`)
+      .episodic/shipped.jsonl      which bags are in a lake (see `shipped_file`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
@@ -62,6 +63,7 @@ LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
 ERASING_FILE: Final = f"{OWN_FOLDER}/erasing.json"
 TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
 SCREENED_FILE: Final = f"{OWN_FOLDER}/screened.json"
+SHIPPED_FILE: Final = f"{OWN_FOLDER}/shipped.jsonl"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""

@@ -118,6 +118,14 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "index every bag now, so that answers take milliseconds",
         {0: "every bag that can be indexed is indexed"},
     ),
+    "ship": CommandEntry(
+        "maintenance.ship.ship",
+        "ship the bags of many robots into a lake of Iceberg tables",
+        {
+            0: "with --once: every closed bag is in the lake",
+            1: "with --once: some bags are not, or could not be confirmed (stderr names them)",
+        },
+    ),
     "recover": CommandEntry(
         "maintenance.recover.recover",
         "repair unfinished MCAP files",

@@ -13,6 +13,7 @@
     |-- UndecodableError          undecodable        a message that cannot be decoded
     |-- RefusedError              refused            a request that is refused, and why
     |   `-- NotShippedError       refused            messages that a lake does not hold
+    |-- LakeError                 lake               a lake cannot be opened or written
     `-- RecorderError             recorder           recording cannot start or go on
 
 Adapters translate every foreign exception into this tree; only `tools.replies` turns it into JSON.
@@ -141,6 +142,12 @@ class RefusedError(EpisodicError):
 
 class NotShippedError(RefusedError):
     """The answer needs messages that the lake does not hold; the robot's own memory may."""
+
+
+class LakeError(EpisodicError):
+    """A lake cannot be opened or written; nothing is lost, and what was left out is tried again."""
+
+    code = "lake"
 
 
 class RecorderError(EpisodicError):

@@ -21,7 +21,7 @@ from ros2_memory.catalogue.codec import encode_poses, encode_standstills, encode
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.map_digest import encode_map_track
-from ros2_memory.catalogue.store import BagKey
+from ros2_memory.catalogue.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
@@ -73,10 +73,12 @@ def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
     So it is the same wherever the bag is copied to, also into a saved moment, and another one for
     another bag of the same name. Its size is no part of it: a bag of which messages were deleted
     by request is the same bag with less in it. `first` is the log time of the first message in the
-    file, whether it counts there or in another recording.
+    file, whether it counts there or in another recording. The id begins with it, so that the files
+    of a table that can hold a bag are few: ids of one time lie side by side.
     """
     name = json.dumps([robot, bag.recording.name, bag.path.name, first])
-    return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:32]
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()
+    return f"{max(first, 0):016x}{digest[:16]}"
 
 
 def sha256_of(path: Path) -> str:
@@ -182,7 +184,7 @@ class _BagRows:
         self._rows["bags"].append(
             (
                 bag.recording.name,
-                bag.path.name,
+                relative(bag.file, str(self._memory.index.bag_dir)),
                 bag.size,
                 content.sha256,
                 bag.mtime_ns,

@@ -1,0 +1,136 @@
+"""The composition root of a lake: where it is, and the robots whose bags are shipped into it."""
+# ruff: noqa: PLC0415 - the lake is an extra, and loads what nothing else needs
+
+from __future__ import annotations
+
+import json
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import yaml
+
+from ros2_memory.bootstrap import build_backfill, build_memory, digest_config, shared_parts
+from ros2_memory.bootstrap_fleet import robot_settings
+from ros2_memory.core.errors import BagError, ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from ros2_memory.bootstrap import SharedParts
+    from ros2_memory.config import Settings
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.lake.shipper import RobotBags
+    from ros2_memory.lake.warehouse import LakeLocation
+    from ros2_memory.serving.backfill import Backfill
+
+
+def require_extra() -> None:
+    """Checks that the extra `lake` is installed.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    for name in ("pyarrow", "pyiceberg"):
+        if find_spec(name) is None:
+            raise ConfigError(
+                f"a lake needs the optional part of this package (no {name}): "
+                "pip install 'ros2-memory[lake]'"
+            )
+
+
+def lake_location(settings: Settings) -> LakeLocation:
+    """Returns where the lake is.
+
+    Raises:
+        ConfigError: no warehouse is given, its secrets cannot be read, or the extra is missing.
+    """
+    require_extra()
+    from ros2_memory.lake.warehouse import LakeLocation, location_of
+
+    lake = settings.lake
+    if lake.warehouse is None:
+        raise ConfigError(
+            "lake.warehouse: must name where the lake is, such as lake.warehouse=/srv/lake or "
+            "lake.warehouse=s3://bucket/lake"
+        )
+    try:
+        warehouse, state_dir = location_of(lake.warehouse, lake.state_dir)
+    except ValueError as error:
+        raise ConfigError(f"lake.warehouse: {error}") from error
+    secrets = {} if lake.secrets_file is None else _secrets_of(lake.secrets_file)
+    return LakeLocation(
+        warehouse, state_dir, lake.catalog, lake.uri, dict(lake.properties), secrets
+    )
+
+
+def _secrets_of(path: Path) -> dict[str, str]:
+    """Returns the settings in a file of secrets; no error shows any of it.
+
+    Raises:
+        ConfigError: it cannot be read, or has something else.
+    """
+    try:
+        found: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"lake.secrets_file: {path}: {error.strerror}") from None
+    except (ValueError, yaml.YAMLError):
+        found = None
+    if not isinstance(found, dict) or not all(
+        isinstance(each, str) for pair in found.items() for each in pair
+    ):
+        raise ConfigError(
+            f'lake.secrets_file: {path} must have lines like s3.access-key-id: "...", names and '
+            "texts alone"
+        )
+    return {str(name): str(value) for name, value in found.items()}
+
+
+def build_robots(settings: Settings) -> list[RobotBags]:
+    """Returns the robots of `fleet.robots`, whose bags are only read.
+
+    Raises:
+        ConfigError: there are none, or their settings are refused.
+    """
+    require_extra()
+    if not settings.fleet.robots:
+        raise ConfigError(
+            "fleet.robots: must name the robots whose bags are shipped: choose "
+            "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
+        )
+    shared = shared_parts(settings)
+    return [_robot(settings, name, shared) for name in settings.fleet.robots]
+
+
+def _robot(settings: Settings, name: str, shared: SharedParts) -> RobotBags:
+    from ros2_memory.lake.shipper import RobotBags
+
+    own = robot_settings(settings, name)
+    memory = build_memory(own, shared)
+    config = digest_config(own, shared.schemas)
+    entries = json.dumps([config.base, dict(config.entries)], sort_keys=True)
+
+    def first_in(path: Path) -> Ns:
+        summary = shared.reader.summarize(path)
+        if summary.empty:
+            raise BagError(str(path), "it holds no message")
+        return summary.start
+
+    return RobotBags(name, memory, _Digests(build_backfill(own, memory)), first_in, entries)
+
+
+class _Digests:
+    """Fills a memory's catalogue, as the query server does."""
+
+    def __init__(self, backfill: Backfill) -> None:
+        self._backfill = backfill
+
+    def waiting(self) -> Sequence[BagFile]:
+        """Returns the closed bags without a valid digest."""
+        self._backfill.look_after()
+        return self._backfill.renew(self._backfill.waiting())
+
+    def digest(self, bag: BagFile) -> bool:
+        """Digests a bag; False where it must wait, has changed, or is refused."""
+        return self._backfill.digest(bag)

@@ -1,0 +1,380 @@
+"""Ships closed bags into a lake, each exactly once.
+
+A bag is in the lake once it has a row in `bags`. For each batch, each table is overwritten where
+its rows are of the batch's bags, in one transaction: what an earlier attempt left there is replaced
+by the same rows. `bags` is committed last, then come the receipts. So a process that is killed
+anywhere, and one that runs again, leave every row once; only the lake is asked what is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+import pyarrow as pa
+
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, has_recorded, is_carried
+from ros2_memory.bag_dir.state.shipped_file import (
+    Receipt,
+    append_receipts,
+    is_shipped,
+    read_receipts,
+)
+from ros2_memory.catalogue.store import relative
+from ros2_memory.core.errors import BagError, LakeError
+from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.model import BagState
+from ros2_memory.lake.conditions import equal, of_bags
+from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of, sha256_of
+from ros2_memory.lake.tables import TABLES, day_of, to_arrow
+from ros2_memory.lake.warehouse import quiet_deletes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from datetime import date
+    from pathlib import Path
+
+    from pyiceberg.expressions import BooleanExpression
+    from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.history.context import Memory
+    from ros2_memory.lake.tables import Row
+    from ros2_memory.lake.warehouse import LakeLocation
+
+log = get_logger(__name__)
+
+MOST_BAGS: Final = 2_000
+MOST_ROWS: Final = 200_000
+"""Of one batch: they are in memory until it is committed."""
+_KNOWN: Final = (
+    "bag_id",
+    "file",
+    "size",
+    "sha256",
+    "mtime_ns",
+    "made_of",
+    "start_ns",
+    "end_ns",
+    "day",
+)
+
+
+class Digests(Protocol):
+    """What fills the catalogue of one robot's memory."""
+
+    def waiting(self) -> Sequence[BagFile]:
+        """Returns the closed bags without a valid digest."""
+
+    def digest(self, bag: BagFile) -> bool:
+        """Digests a bag; False where it must wait, has changed, or is refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotBags:
+    """One robot whose bags are shipped.
+
+    Attributes:
+        name: the robot.
+        memory: over its bag directory.
+        digests: fills the memory's catalogue.
+        first_in: returns the log time of the first message in a file, whether it counts or not.
+        config: names the settings that digests depend on.
+    """
+
+    name: str
+    memory: Memory
+    digests: Digests
+    first_in: Callable[[Path], Ns]
+    config: str
+
+    @property
+    def bag_dir(self) -> Path:
+        """The bag directory."""
+        return self.memory.index.bag_dir
+
+
+@dataclass(slots=True)
+class Shipped:
+    """What a pass did: bags that were committed, that wait, and what went wrong."""
+
+    bags: int = 0
+    rows: int = 0
+    waiting: int = 0
+    problems: list[str] = field(default_factory=list)
+
+
+class _Known(NamedTuple):
+    """A bag that has a row in `bags`."""
+
+    bag_id: str
+    file: str
+    size: int
+    sha256: str
+    mtime_ns: Ns
+    made_of: str
+    start: Ns
+    end: Ns
+    day: date
+
+
+@dataclass(frozen=True, slots=True)
+class _Ready:
+    """A bag of a batch, its rows, and the days and ids under which older ones of it may lie."""
+
+    robot: RobotBags
+    known: _Known
+    rows: Mapping[str, Sequence[Row]]
+    replaced: tuple[_Known, ...]
+
+
+class Shipper:
+    """Ships the bags of several robots into one lake, whose lock the caller holds.
+
+    Args:
+        location: the lake.
+        tables: its tables, all of `TABLES`.
+        robots: whose bags are shipped.
+        clock: dates receipts.
+        messages: topics whose messages are shipped whole.
+        pause: called before each commit; waits until another one is allowed.
+        alive: called for each bag.
+        most_bags: of one commit.
+    """
+
+    def __init__(
+        self,
+        location: LakeLocation,
+        tables: Mapping[str, IcebergTable],
+        robots: Sequence[RobotBags],
+        clock: Clock,
+        *,
+        messages: Sequence[str] = (),
+        pause: Callable[[], object] = lambda: None,
+        alive: Callable[[], object] = lambda: None,
+        most_bags: int = MOST_BAGS,
+    ) -> None:
+        self._location = location
+        self._tables = tables
+        self._robots = robots
+        self._clock = clock
+        self._messages = messages
+        self._pause = pause
+        self._alive = alive
+        self._most_bags = most_bags
+        self._known: dict[str, dict[str, _Known]] = {}
+        self._ids: dict[str, tuple[tuple[int, Ns], str]] = {}
+        self._receipts: dict[str, dict[str, Receipt]] = {}
+        self._refused: set[str] = set()
+
+    @property
+    def lake_id(self) -> str:
+        """The id of the lake: another one where its tables were made anew."""
+        return str(self._tables["bags"].metadata.table_uuid)
+
+    def run(self) -> Shipped:
+        """Ships what is new: one pass over all robots.
+
+        Raises:
+            LakeError: the lake cannot be read or written; what is not committed is tried again.
+        """
+        done = Shipped()
+        batch: list[_Ready] = []
+        rows = 0
+        for robot in self._robots:
+            for ready in self._ready(robot, done):
+                batch.append(ready)
+                rows += sum(map(len, ready.rows.values()))
+                if len(batch) >= self._most_bags or rows >= MOST_ROWS:
+                    self._commit(batch, done)
+                    batch, rows = [], 0
+        if batch:
+            self._commit(batch, done)
+        return done
+
+    def _ready(self, robot: RobotBags, done: Shipped) -> Iterator[_Ready]:
+        """Yields the bags of a robot that are to be shipped, the oldest first, with their rows."""
+        snapshot = robot.memory.index.refresh()
+        if snapshot.problem is not None:
+            done.problems.append(f"{robot.name}: {snapshot.problem}")
+            return
+        known = self._known_of(robot.name)
+        by_file = {each.file: each for each in known.values()}
+        stale = {bag.file for bag in robot.digests.waiting()}
+        seen: set[str] = set()
+        receipts: list[_Known] = []
+        bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
+        # A saved moment's copy of a bag counts where the bag itself is gone.
+        for bag in sorted(bags, key=lambda each: (self._is_moment(robot, each), each.start)):
+            self._alive()
+            if is_carried(bag.path):
+                continue
+            try:
+                if bag.file in stale and not robot.digests.digest(bag):
+                    done.waiting += 1
+                    continue
+                bag_id = self._id_of(robot, bag)
+                if bag_id in seen:
+                    continue
+                seen.add(bag_id)
+                before = known.get(bag_id)
+                if before is not None and self._is_moment(robot, bag):
+                    continue
+                now = self._described(robot, bag, bag_id, before)
+                if now is None:
+                    done.waiting += 1
+                elif before is not None and _is_same(before, now):
+                    known[bag_id] = now
+                    receipts.append(now)
+                else:
+                    content = BagContent(bag, bag_id, now.sha256, now.made_of)
+                    rows = rows_of(robot.memory, content, self._messages)
+                    other = by_file.get(now.file)
+                    replaced = [each for each in (before, other) if each is not None]
+                    older = tuple(each for each in replaced if each is before or _holds(each, now))
+                    yield _Ready(robot, now, rows, older)
+            except (BagError, OSError, ValueError) as error:
+                done.problems.append(f"{robot.name}: {error}")
+        self._confirm(robot, receipts, done)
+
+    @staticmethod
+    def _is_moment(robot: RobotBags, bag: BagFile) -> bool:
+        return relative(bag.file, str(robot.bag_dir)).startswith(f"{MOMENTS_FOLDER}/")
+
+    def _id_of(self, robot: RobotBags, bag: BagFile) -> str:
+        stat = (bag.size, bag.mtime_ns)
+        found = self._ids.get(bag.file)
+        if found is None or found[0] != stat:
+            found = stat, bag_id_of(robot.name, bag, robot.first_in(bag.path))
+            self._ids[bag.file] = found
+        return found[1]
+
+    def _described(
+        self, robot: RobotBags, bag: BagFile, bag_id: str, before: _Known | None
+    ) -> _Known | None:
+        """Returns what a bag would be known as; None while it has no digest."""
+        made = made_of(robot.memory, bag, robot.config, self._messages)
+        if made is None:
+            return None
+        same = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
+        sha256 = before.sha256 if before is not None and same else sha256_of(bag.path)
+        file = relative(bag.file, str(robot.bag_dir))
+        day = day_of(bag.start)
+        return _Known(bag_id, file, bag.size, sha256, bag.mtime_ns, made, bag.start, bag.end, day)
+
+    def _known_of(self, robot: str) -> dict[str, _Known]:
+        """Returns the bags of a robot that are in the lake; it is asked once."""
+        if robot not in self._known:
+            with self._location.translated("reading the lake's bags"):
+                found = (
+                    self._tables["bags"]
+                    .refresh()
+                    .scan(row_filter=equal("robot", robot), selected_fields=_KNOWN)
+                    .to_arrow()
+                    .select(_KNOWN)
+                )
+                columns = [found[name].to_pylist() for name in _KNOWN]
+            rows = [_Known(*row) for row in zip(*columns, strict=True)]
+            self._known[robot] = {each.bag_id: each for each in rows}
+        return self._known[robot]
+
+    def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
+        """Commits a batch.
+
+        Raises:
+            LakeError: the lake cannot be written; it is not known how far that came.
+        """
+        self._pause()
+        condition = _rows_of(batch)
+        parts: dict[tuple[str, date], list[_Ready]] = {}
+        for each in batch:
+            parts.setdefault((each.robot.name, each.known.day), []).append(each)
+        rows = 0
+        try:
+            # `bags` last: a bag with a row there is whole.
+            for name in sorted(TABLES, key=lambda each: each == "bags"):
+                table = pa.concat_tables(
+                    to_arrow(
+                        TABLES[name], robot, day, {one.known.bag_id: one.rows[name] for one in part}
+                    )
+                    for (robot, day), part in parts.items()
+                )
+                rows += table.num_rows
+                self._overwrite(name, table, condition)
+        except LakeError:
+            self._known.clear()
+            raise
+        for each in batch:
+            known = self._known_of(each.robot.name)
+            for old in each.replaced:
+                known.pop(old.bag_id, None)
+            known[each.known.bag_id] = each.known
+        done.bags += len(batch)
+        done.rows += rows
+        log.info("bags_shipped", bags=len(batch), rows=rows)
+        for robot in self._robots:
+            self._confirm(robot, [each.known for each in batch if each.robot is robot], done)
+
+    def _overwrite(self, name: str, rows: pa.Table, condition: BooleanExpression) -> None:
+        """Replaces the rows of some bags in one table, in one transaction.
+
+        Raises:
+            LakeError: the lake cannot be written.
+        """
+        with self._location.translated(f"writing the lake's {name}"), quiet_deletes():
+            self._tables[name].refresh().overwrite(rows, overwrite_filter=condition)
+
+    def _confirm(self, robot: RobotBags, bags: Iterable[_Known], done: Shipped) -> None:
+        """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
+        if not has_recorded(robot.bag_dir):
+            return
+        try:
+            if robot.name not in self._receipts:
+                self._receipts[robot.name] = read_receipts(robot.bag_dir)
+            known, lake = self._receipts[robot.name], self.lake_id
+            missing = [
+                Receipt(each.file, each.bag_id, each.size, each.sha256, lake, self._clock.now())
+                for each in bags
+                if not (is_shipped(known, each.file, each.size) and known[each.file].lake == lake)
+            ]
+            if missing:
+                append_receipts(robot.bag_dir, missing)
+                known.update((each.bag, each) for each in missing)
+            self._refused.discard(robot.name)
+        except OSError as error:
+            problem = (
+                f"{robot.name}: no receipts can be written into {robot.bag_dir} "
+                f"({error.strerror or error}): its recorder cannot wait for shipping"
+            )
+            if robot.name not in self._refused:
+                log.warning("receipts_not_written", robot=robot.name, reason=str(error))
+                self._refused.add(robot.name)
+            done.problems.append(problem)
+
+
+def _is_same(before: _Known, now: _Known) -> bool:
+    """Returns whether the rows of a bag would be the same."""
+    return before == _with_times(now, before)
+
+
+def _with_times(now: _Known, before: _Known) -> _Known:
+    """Returns what is known with the path and mtime of before: a copy has others."""
+    return now._replace(mtime_ns=before.mtime_ns, file=before.file)
+
+
+def _holds(old: _Known, new: _Known) -> bool:
+    """Returns whether a bag of the same path is an older state of another one.
+
+    As where its first messages were deleted by request: what is left lies within it.
+    """
+    return old.start <= new.start and new.end <= old.end
+
+
+def _rows_of(batch: Sequence[_Ready]) -> BooleanExpression:
+    """Returns the condition on rows of a batch's bags, so that few files have to be looked at."""
+    ids: dict[tuple[str, date], set[str]] = {}
+    for each in batch:
+        for one in (each.known, *each.replaced):
+            ids.setdefault((each.robot.name, one.day), set()).add(one.bag_id)
+    return of_bags(ids)

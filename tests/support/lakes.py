@@ -1,0 +1,102 @@
+"""A lake in a folder, and robots of a few messages whose bags are shipped into it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from ros2_memory.bag_dir.layout import LIST_FILE
+from ros2_memory.bootstrap import build_digester
+from ros2_memory.core.model import BagFile
+from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.history.context import Memory
+from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
+from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.warehouse import LakeLocation, location_of
+from ros2_memory.serving.backfill import Backfill
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import Msg, detections, text, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.memories import memory_of, recalling
+
+START_S: Final = 1_795_161_600
+LATER: Final = (START_S + 86_400) * NS_PER_S
+
+
+class FilledAtOnce:
+    """Digests of a test's memory, by the code of the server's backfill."""
+
+    def __init__(self, memory: Memory) -> None:
+        self._backfill = Backfill(memory, build_digester(memory), memory.index.bag_dir)
+
+    def waiting(self) -> Sequence[BagFile]:
+        return self._backfill.renew(self._backfill.waiting())
+
+    def digest(self, bag: BagFile) -> bool:
+        return self._backfill.digest(bag)
+
+
+def write_bag(
+    bag_dir: Path, number: int, *, at_s: int | None = None, most: int = 3, recording: str = "rec"
+) -> Path:
+    """A bag with numbered texts, one for each second, and a cup that is seen."""
+    first = START_S + 10 * number if at_s is None else at_s
+    messages: list[Msg] = [detections(first * NS_PER_S, ["cup"])]
+    messages += [text((first + nth) * NS_PER_S, f"n{number * 100 + nth}") for nth in range(most)]
+    own = bag_dir / LIST_FILE
+    own.parent.mkdir(parents=True, exist_ok=True)
+    own.touch()  # a recorder has recorded here
+    return write_mcap(bag_dir / recording / f"{recording}_{number}.mcap", messages)
+
+
+def robot_bags(name: str, bag_dir: Path, clock: Clock | None = None) -> RobotBags:
+    """A robot whose bags are shipped."""
+    bag_dir.mkdir(parents=True, exist_ok=True)
+    memory = recalling(memory_of(bag_dir, clock=clock), bag_dir)
+    reader = McapReader()
+    return RobotBags(
+        name, memory, FilledAtOnce(memory), lambda path: reader.summarize(path).start, "test"
+    )
+
+
+def location(folder: Path) -> LakeLocation:
+    """A lake below a folder."""
+    warehouse, state_dir = location_of(str(folder), None)
+    return LakeLocation(warehouse, state_dir)
+
+
+@contextmanager
+def shipping(
+    folder: Path,
+    robots: Sequence[RobotBags],
+    *,
+    messages: Sequence[str] = ("/chatter",),
+    most_bags: int = 2,
+) -> Iterator[Shipper]:
+    """What ships these robots' bags, two in each batch."""
+    where = location(folder)
+    with where.opened() as catalog:
+        yield Shipper(
+            where,
+            where.tables(catalog, TABLES),
+            robots,
+            FixedClock(LATER),
+            messages=messages,
+            most_bags=most_bags,
+        )
+
+
+def ship(folder: Path, robots: Sequence[RobotBags], *, most_bags: int = 2) -> Shipped:
+    """One pass, as of a process that has just started."""
+    with shipping(folder, robots, most_bags=most_bags) as shipper:
+        return shipper.run()
+
+
+def lake_column(folder: Path, table: str, column: str) -> list[object]:
+    """The values of a column of the lake, sorted by their text."""
+    where = location(folder)
+    with where.opened() as catalog:
+        found = where.tables(catalog, [table])[table].scan(selected_fields=(column,)).to_arrow()
+    return sorted(found[column].to_pylist(), key=str)

@@ -1,0 +1,127 @@
+"""`ros2-memory ship`: one pass, who writes, what is missing, and no secret anywhere."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import bootstrap_lake, cli
+from ros2_memory.config import load_settings
+from ros2_memory.core.errors import LakeError
+from ros2_memory.lake.lease import writing_alone
+from tests.support.fleets import seeded, write_robot
+from tests.support.lakes import lake_column
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Capture = pytest.CaptureFixture[str]
+ROBOTS = ("hall", "kitchen")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("fleet")
+    for name in ROBOTS:
+        write_robot(seeded(name), folder / name)
+    return folder
+
+
+@pytest.fixture
+def ship(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Runs one pass into a lake of its own."""
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def run(*more: str) -> int:
+        robots = f"fleet.robots={fleet}/*"
+        settings = ["lake.commit_interval_s=0", f"lake.warehouse={tmp_path}/lake", *more]
+        return cli.main(["ship", "--once", "--json", robots, *settings])
+
+    return run
+
+
+def test_one_pass_ships_every_closed_bag(
+    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+) -> None:
+    assert ship() == 0
+    done = json.loads(capsys.readouterr().out)
+    assert (done["bags"], done["waiting"], done["problems"]) == (4, 0, [])
+    labels = [label for name in ROBOTS for _, label in seeded(name).seen]
+    assert lake_column(tmp_path / "lake", "sightings", "label") == sorted(labels)
+    assert ship() == 0
+    assert json.loads(capsys.readouterr().out)["bags"] == 0
+
+
+def test_a_second_writer_ends_and_names_the_first(
+    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+) -> None:
+    with writing_alone(tmp_path / "lake" / ".ros2-memory"):
+        assert ship() == 2
+        with (
+            pytest.raises(LakeError, match="one writer"),
+            writing_alone(tmp_path / "lake" / ".ros2-memory"),
+        ):
+            pass
+    assert "process" in capsys.readouterr().err
+    with writing_alone(tmp_path / "lake" / ".ros2-memory"):
+        pass
+
+
+def test_without_the_extra_it_names_the_extra(
+    ship: Callable[..., int], monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        bootstrap_lake, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
+    )
+    assert ship() == 2
+    assert "pip install 'ros2-memory[lake]'" in capsys.readouterr().err
+
+
+def test_without_a_warehouse_it_says_how_to_name_one(
+    ship: Callable[..., int], capsys: Capture
+) -> None:
+    assert ship("lake.warehouse=null") == 2
+    assert "lake.warehouse=/srv/lake" in capsys.readouterr().err
+
+
+def test_a_robot_whose_folder_is_gone_is_named_and_the_others_are_shipped(
+    ship: Callable[..., int], fleet: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    robots = f"fleet.robots={{hall: {fleet}/hall, attic: {tmp_path}/attic}}"
+    assert ship(robots) == 1
+    done = json.loads(capsys.readouterr().out)
+    assert done["bags"] == 2
+    assert "attic" in done["problems"][0]
+
+
+def test_no_secret_is_in_an_error_or_in_the_configuration(
+    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+) -> None:
+    secrets = tmp_path / "secrets.yaml"
+    secrets.write_text('s3.secret-access-key: "hunter2hunter2"\n')
+    given = f"lake.secrets_file={secrets}"
+    location = bootstrap_lake.lake_location(load_settings(["lake.warehouse=/nowhere", given], {}))
+    assert location.secrets == {"s3.secret-access-key": "hunter2hunter2"}
+    assert "hunter2" not in repr(location)
+    with pytest.raises(LakeError) as failed, location.translated("writing"):
+        raise RuntimeError("the store refused hunter2hunter2")
+    assert "hunter2" not in str(failed.value)
+    assert cli.main(["config", "show", "fleet.robots={r1: /r1}", given]) == 0
+    assert "hunter2" not in capsys.readouterr().out
+    secrets.write_text("[hunter2hunter2]")
+    assert ship(given) == 2
+    assert "hunter2" not in capsys.readouterr().err
+
+
+def test_a_lake_that_cannot_be_opened_is_reported(
+    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+) -> None:
+    (tmp_path / "lake").write_text("a file in its place")
+    assert ship() == 2
+    assert str(tmp_path / "lake") in capsys.readouterr().err

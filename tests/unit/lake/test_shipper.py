@@ -1,0 +1,228 @@
+"""Each bag comes into the lake once, whatever happens while it is shipped."""
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pyiceberg.catalog.sql import SqlCatalog
+
+from ros2_memory.bag_dir.state.shipped_file import read_receipts
+from ros2_memory.core.errors import LakeError
+from ros2_memory.lake import shipper as shipper_module
+from ros2_memory.lake.tables import TABLES
+from tests.support.lakes import (
+    START_S,
+    lake_column,
+    location,
+    robot_bags,
+    ship,
+    shipping,
+    write_bag,
+)
+
+ROBOTS = ("hall", "kitchen")
+BAGS = 3
+
+
+class _Killed(BaseException):
+    """In place of SIGKILL: nothing catches it."""
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two robots with three bags each."""
+    folder = tmp_path_factory.mktemp("fleet")
+    for name in ROBOTS:
+        for number in range(BAGS):
+            write_bag(folder / name, number)
+    return folder
+
+
+def values(folder: Path) -> list[object]:
+    return lake_column(folder, "messages", "value")
+
+
+def expected(bags: int = BAGS) -> list[str]:
+    texts = [f"n{bag * 100 + nth}" for _ in ROBOTS for bag in range(bags) for nth in range(3)]
+    return sorted(json.dumps({"value": each}, separators=(",", ":")) for each in texts)
+
+
+def test_every_message_is_in_the_lake_once_and_again_after_a_second_pass(
+    fleet: Path, tmp_path: Path
+) -> None:
+    done = ship(tmp_path, [robot_bags(name, fleet / name) for name in ROBOTS])
+    assert (done.bags, done.waiting, done.problems) == (2 * BAGS, 0, [])
+    assert values(tmp_path) == expected()
+    assert lake_column(tmp_path, "sightings", "label") == ["cup"] * 2 * BAGS
+    snapshots = _snapshots(tmp_path)
+    again = ship(tmp_path, [robot_bags(name, fleet / name) for name in ROBOTS])
+    assert (again.bags, again.waiting, again.problems) == (0, 0, [])
+    assert _snapshots(tmp_path) == snapshots
+    for name in ROBOTS:
+        receipts = read_receipts(fleet / name)
+        assert receipts.keys() == {f"rec/rec_{number}.mcap" for number in range(BAGS)}
+        ids = {each.bag_id for each in receipts.values()}
+        assert ids <= {str(each) for each in lake_column(tmp_path, "bags", "bag_id")}
+
+
+def _snapshots(folder: Path) -> dict[str, int]:
+    where = location(folder)
+    with where.opened() as catalog:
+        return {
+            name: len(table.snapshots()) for name, table in where.tables(catalog, TABLES).items()
+        }
+
+
+def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
+    fleet: Path, tmp_path: Path
+) -> None:
+    ship(tmp_path / "lake", [robot_bags("hall", fleet / "hall")])
+    # Without their times: everything is looked at anew.
+    shutil.copytree(fleet / "hall", tmp_path / "hall", copy_function=shutil.copyfile)
+    for each in (tmp_path / "hall").rglob("*.mcap"):
+        os.utime(each, (START_S, START_S))
+    (tmp_path / "hall" / ".episodic" / "shipped.jsonl").unlink()
+    robots = [robot_bags("hall", tmp_path / "hall"), robot_bags("kitchen", fleet / "kitchen")]
+    assert ship(tmp_path / "lake", robots).bags == BAGS
+    assert values(tmp_path / "lake") == expected()
+    # The copy gets receipts of its own.
+    assert len(read_receipts(tmp_path / "hall")) == BAGS
+
+
+def test_a_bag_of_which_messages_were_deleted_replaces_its_rows(tmp_path: Path) -> None:
+    write_bag(tmp_path / "hall", 0)
+    write_bag(tmp_path / "hall", 1)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    # Its first messages are gone, so that it has another id.
+    write_bag(tmp_path / "hall", 1, at_s=START_S + 11, most=2)
+    write_bag(tmp_path / "hall", 0, most=1)
+    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 2
+    assert values(tmp_path / "lake") == [f'{{"value":"n{each}"}}' for each in (0, 100, 101)]
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 2
+
+
+def test_another_bag_under_the_name_of_a_deleted_one_leaves_its_rows(tmp_path: Path) -> None:
+    write_bag(tmp_path / "hall", 0)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    write_bag(tmp_path / "hall", 0, at_s=START_S + 5_000)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    assert len(values(tmp_path / "lake")) == 6
+
+
+def test_a_saved_copy_of_a_bag_is_shipped_only_where_the_bag_is_not(tmp_path: Path) -> None:
+    write_bag(tmp_path / "hall", 0)
+    moment = tmp_path / "hall" / "moments" / "20261120T043012Z-cup"
+    shutil.copytree(tmp_path / "hall" / "rec", moment / "rec")
+    write_bag(moment, 1)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    assert len(values(tmp_path / "lake")) == 6
+    shutil.rmtree(tmp_path / "hall" / "rec")
+    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 0
+    assert len(values(tmp_path / "lake")) == 6
+
+
+def test_read_only_bags_are_shipped_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag(tmp_path / "hall", 0)
+
+    def refused(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(shipper_module, "append_receipts", refused)
+    done = ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    assert done.bags == 1
+    [problem] = done.problems
+    assert "Read-only file system" in problem
+    assert "hall" in problem
+
+
+def test_nothing_is_written_beside_bags_of_others(tmp_path: Path) -> None:
+    write_bag(tmp_path / "hall", 0)
+    (tmp_path / "hall" / ".episodic" / "recordings.jsonl").unlink()
+    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 1
+    assert not (tmp_path / "hall" / ".episodic" / "shipped.jsonl").exists()
+
+
+def test_a_store_that_fails_loses_nothing(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robots = [robot_bags(name, fleet / name) for name in ROBOTS]
+    commit = SqlCatalog.commit_table
+    calls = 0
+
+    def full(*given: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            raise OSError(28, "No space left on device")
+        return commit(*given)  # type: ignore[arg-type]
+
+    with shipping(tmp_path, robots) as shipper:
+        monkeypatch.setattr(SqlCatalog, "commit_table", full)
+        with pytest.raises(LakeError, match="No space left on device"):
+            shipper.run()
+        assert shipper.run().bags == 2 * BAGS
+    assert values(tmp_path) == expected()
+
+
+def _points(monkeypatch: pytest.MonkeyPatch, reached: Callable[[], None]) -> None:
+    """Has a function called before and after every step that changes something."""
+
+    def around(owner: object, name: str) -> None:
+        real = getattr(owner, name)
+
+        def stepped(*given: object, **named: object) -> object:
+            reached()
+            result = real(*given, **named)
+            reached()
+            return result
+
+        monkeypatch.setattr(owner, name, stepped)
+
+    around(SqlCatalog, "commit_table")
+    around(shipper_module, "append_receipts")
+
+
+KILLS = 100 if os.environ.get("EPISODIC_LONG") else 5
+
+
+@pytest.mark.parametrize("kills", [None, KILLS], ids=["every point", "random points"])
+def test_killed_at_any_point_it_loses_and_doubles_nothing(
+    kills: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot records on while what ships its bags is killed again and again."""
+    chance = random.Random(16)
+    robots = [robot_bags("hall", tmp_path / "hall")]
+    left = killed = bags = 0
+
+    def reached() -> None:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise _Killed
+
+    _points(monkeypatch, reached)
+    while True:
+        write_bag(tmp_path / "hall", bags)
+        bags += 1
+        left = killed + 1 if kills is None else chance.randrange(1, 2 * len(TABLES) + 3)
+        try:
+            # In one batch, so that each run goes on where the one before was killed.
+            ship(tmp_path / "lake", robots, most_bags=200)
+        except _Killed:
+            killed += 1
+        if killed == kills or left > 0:
+            break
+    left = 0
+    ship(tmp_path / "lake", robots)
+    assert killed >= (2 * len(TABLES) + 2 if kills is None else kills)
+    texts = [f'{{"value":"n{bag * 100 + nth}"}}' for bag in range(bags) for nth in range(3)]
+    assert values(tmp_path / "lake") == sorted(texts)
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == bags
+    assert lake_column(tmp_path / "lake", "sightings", "label") == ["cup"] * bags
+    assert len(read_receipts(tmp_path / "hall")) == bags
