@@ -336,6 +336,7 @@ class LakeSettings:
     secrets_file: AnyPath | None
     messages: tuple[Text, ...]
     commit_interval_s: Tolerance
+    grace_h: Tolerance
 
     def __post_init__(self) -> None:
         """Refuses a REST catalogue without an address."""

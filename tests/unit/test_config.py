@@ -94,6 +94,7 @@ class TestDefaults:
                 "secrets_file": None,
                 "messages": (),
                 "commit_interval_s": 60.0,
+                "grace_h": 24.0,
             },
             "logging": {"level": "info", "format": "json", "arguments": True},
             "storage": {

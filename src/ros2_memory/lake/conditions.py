@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, cast
 
-from pyiceberg.expressions import And, EqualTo, GreaterThanOrEqual, In, LessThanOrEqual, Or
+from pyiceberg.expressions import (
+    And,
+    EqualTo,
+    GreaterThanOrEqual,
+    In,
+    IsNull,
+    LessThan,
+    LessThanOrEqual,
+    Or,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -12,12 +21,16 @@ if TYPE_CHECKING:
 
     from pyiceberg.expressions import BooleanExpression
 
+    from ros2_memory.core.timebase import Ns
+
     Predicate = Callable[[str, object], BooleanExpression]
 
 # Their constructors are not those that Pydantic's plugin for mypy takes them to have.
 equal: Final = cast("Predicate", EqualTo)
 _at_least: Final = cast("Predicate", GreaterThanOrEqual)
 _at_most: Final = cast("Predicate", LessThanOrEqual)
+_below: Final = cast("Predicate", LessThan)
+_is_null: Final = cast("Callable[[str], BooleanExpression]", IsNull)
 _one_of: Final = cast("Predicate", In)
 
 
@@ -47,3 +60,18 @@ def of_bags(ids: Mapping[tuple[str, date], Collection[str]]) -> BooleanExpressio
             for (robot, day), of_one in ids.items()
         ]
     )
+
+
+def between(robot: str, column: str, start: Ns, stop: Ns) -> BooleanExpression:
+    """Returns the condition on rows of a robot whose time is in `[start, stop)`."""
+    return And(equal("robot", robot), _at_least(column, start), _below(column, stop))
+
+
+def overlapping(robot: str, columns: tuple[str, str], start: Ns, stop: Ns) -> BooleanExpression:
+    """Returns the condition on rows of a robot whose span reaches into `[start, stop)`.
+
+    `columns` have its first and last time (inclusive); a last time that is null is the first.
+    """
+    first, last = columns
+    ends = Or(_at_least(last, start), And(_is_null(last), _at_least(first, start)))
+    return And(equal("robot", robot), _below(first, stop), ends)

@@ -27,10 +27,11 @@ from ros2_memory.core.model import BagState
 from ros2_memory.lake.conditions import equal, of_bags
 from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of, sha256_of
 from ros2_memory.lake.tables import TABLES, day_of, to_arrow
+from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.warehouse import quiet_deletes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from datetime import date
     from pathlib import Path
 
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
+    from ros2_memory.lake.tombstones import Tombstone
     from ros2_memory.lake.warehouse import LakeLocation
 
 log = get_logger(__name__)
@@ -138,6 +140,7 @@ class Shipper:
         robots: whose bags are shipped.
         clock: dates receipts.
         messages: topics whose messages are shipped whole.
+        tombstones: what was forgotten; a bag with a message of it is not shipped.
         pause: called before each commit; waits until another one is allowed.
         alive: called for each bag.
         most_bags: of one commit.
@@ -151,6 +154,7 @@ class Shipper:
         clock: Clock,
         *,
         messages: Sequence[str] = (),
+        tombstones: Collection[Tombstone] = (),
         pause: Callable[[], object] = lambda: None,
         alive: Callable[[], object] = lambda: None,
         most_bags: int = MOST_BAGS,
@@ -160,6 +164,8 @@ class Shipper:
         self._robots = robots
         self._clock = clock
         self._messages = messages
+        self._tombstones = tombstones
+        self._forbidden: dict[str, bool] = {}
         self._pause = pause
         self._alive = alive
         self._most_bags = most_bags
@@ -193,6 +199,16 @@ class Shipper:
             self._commit(batch, done)
         return done
 
+    def keep_up(self, grace: Ns) -> None:
+        """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
+
+        Raises:
+            LakeError: the lake cannot be read or written.
+        """
+        now = self._clock.now()
+        compact(self._location, self._tables, now, self._alive)
+        expire(self._location, self._tables, now, grace)
+
     def _ready(self, robot: RobotBags, done: Shipped) -> Iterator[_Ready]:
         """Yields the bags of a robot that are to be shipped, the oldest first, with their rows."""
         snapshot = robot.memory.index.refresh()
@@ -215,12 +231,11 @@ class Shipper:
                     done.waiting += 1
                     continue
                 bag_id = self._id_of(robot, bag)
-                if bag_id in seen:
+                before = known.get(bag_id)
+                is_again = before is not None and self._is_moment(robot, bag)
+                if bag_id in seen or is_again or self._is_forgotten(robot, bag, bag_id, done):
                     continue
                 seen.add(bag_id)
-                before = known.get(bag_id)
-                if before is not None and self._is_moment(robot, bag):
-                    continue
                 now = self._described(robot, bag, bag_id, before)
                 if now is None:
                     done.waiting += 1
@@ -228,12 +243,7 @@ class Shipper:
                     known[bag_id] = now
                     receipts.append(now)
                 else:
-                    content = BagContent(bag, bag_id, now.sha256, now.made_of)
-                    rows = rows_of(robot.memory, content, self._messages)
-                    other = by_file.get(now.file)
-                    replaced = [each for each in (before, other) if each is not None]
-                    older = tuple(each for each in replaced if each is before or _holds(each, now))
-                    yield _Ready(robot, now, rows, older)
+                    yield self._made(robot, bag, now, before, by_file.get(now.file))
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{robot.name}: {error}")
         self._confirm(robot, receipts, done)
@@ -249,6 +259,40 @@ class Shipper:
             found = stat, bag_id_of(robot.name, bag, robot.first_in(bag.path))
             self._ids[bag.file] = found
         return found[1]
+
+    def _made(
+        self,
+        robot: RobotBags,
+        bag: BagFile,
+        now: _Known,
+        before: _Known | None,
+        other: _Known | None,
+    ) -> _Ready:
+        """Returns a bag with its rows; `other` was known under its path."""
+        content = BagContent(bag, now.bag_id, now.sha256, now.made_of)
+        rows = rows_of(robot.memory, content, self._messages)
+        older = [] if before is None else [before]
+        if other is not None and other is not before and _holds(other, now):
+            older.append(other)
+        return _Ready(robot, now, rows, tuple(older))
+
+    def _is_forgotten(self, robot: RobotBags, bag: BagFile, bag_id: str, done: Shipped) -> bool:
+        """Returns, and reports, whether a bag has a message that was forgotten.
+
+        Each state of a bag is read once.
+        """
+        key = f"{bag_id} {bag.size} {bag.mtime_ns} {bag.sidecar_ns}"
+        if key not in self._forbidden:
+            reader = robot.memory.reader
+            self._forbidden[key] = any(
+                each.forbids(reader, robot.name, bag) for each in self._tombstones
+            )
+        if self._forbidden[key]:
+            done.problems.append(
+                f"{robot.name}: {bag.file} has messages that were forgotten in the lake; it is "
+                "not shipped: delete it, or the messages, with ros2-memory forget"
+            )
+        return self._forbidden[key]
 
     def _described(
         self, robot: RobotBags, bag: BagFile, bag_id: str, before: _Known | None

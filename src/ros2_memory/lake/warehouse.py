@@ -17,6 +17,7 @@ from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.tables import NAMESPACE, open_tables
+from ros2_memory.lake.written_files import file_properties
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -79,7 +80,12 @@ class LakeLocation:
         Raises:
             LakeError: it cannot be opened.
         """
-        properties = {**self.properties, **self.secrets, "warehouse": self.warehouse}
+        properties = {
+            **self.properties,
+            **self.secrets,
+            **file_properties(self.state_dir),
+            "warehouse": self.warehouse,
+        }
         if self.catalog == "rest":
             with self.translated("opening the lake's catalogue"):
                 rest = RestCatalog("lake", **{**properties, "uri": self.uri or ""})

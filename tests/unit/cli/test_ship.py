@@ -57,6 +57,24 @@ def test_one_pass_ships_every_closed_bag(
     assert json.loads(capsys.readouterr().out)["bags"] == 0
 
 
+def test_a_time_is_forgotten_and_stays_so(
+    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+) -> None:
+    assert ship() == 0
+    hall = seeded("hall")
+    times = ("--start", str(hall.start_s), "--end", str(hall.start_s + 5))
+    capsys.readouterr()
+    assert ship("--forget", "hall", *times) == 0
+    assert json.loads(capsys.readouterr().out)["bags"] == 1
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 3
+    assert ship() == 1
+    [problem] = json.loads(capsys.readouterr().out)["problems"]
+    assert "rec_0.mcap has messages that were forgotten" in problem
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 3
+    assert ship("--forget", "hall") == 2
+    assert "--start" in capsys.readouterr().err
+
+
 def test_a_second_writer_ends_and_names_the_first(
     ship: Callable[..., int], tmp_path: Path, capsys: Capture
 ) -> None:

@@ -13,17 +13,21 @@ from ros2_memory.bootstrap_lake import build_robots, lake_location
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
+    End,
     Overrides,
+    Start,
     Verbose,
     load_for,
+    parse_time,
     print_line,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import LakeError
+from ros2_memory.core.errors import InvalidArgumentsError, LakeError
 from ros2_memory.core.logging_setup import configure_logging, get_logger
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.sd_notify import READY, WATCHDOG, notify
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import WallClock
+from ros2_memory.core.timebase import WallClock, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -34,13 +38,24 @@ if TYPE_CHECKING:
 _STEP_S: Final = 5.0
 """How long it waits at a time: the service manager hears from it in between."""
 _RETRY_S: Final = 60.0
+_UPKEEP_S: Final = 3600.0
+"""How often days are put together, and old files deleted."""
 
 log = get_logger(__name__)
 
 
 def ship(
     overrides: Overrides = None,
+    *,
     once: Annotated[bool, typer.Option("--once", help="Ship what is there, and end.")] = False,
+    forget: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROBOT", help="Forget the time from --start to --end of a robot, and end."
+        ),
+    ] = None,
+    start: Start = None,
+    end: End = None,
     as_json: AsJson = False,
     verbose: Verbose = False,
 ) -> None:
@@ -51,6 +66,7 @@ def ship(
     ros2-memory[lake].
     """
     settings = load_for(None, overrides)
+    window = _window_of(forget, start, end)
     location, robots = lake_location(settings), build_robots(settings)
     # The extra is there: `lake_location` has checked that.
     from ros2_memory.lake.lease import writing_alone  # noqa: PLC0415
@@ -59,10 +75,14 @@ def ship(
     configure_logging(shown, settings.logging.format)
     pace = _Pace(settings.lake.commit_interval_s)
     with writing_alone(location.state_dir):
+        if forget is not None and window is not None:
+            _forget(location, forget, window, as_json=as_json)
+            return
         if not once:
             _ship_on(settings, location, robots, pace)
         with _shipper(settings, location, robots, pace) as shipper:
             done = shipper.run()
+            shipper.keep_up(ns_from_unix(settings.lake.grace_h * 3600))
     if as_json:
         print_line(
             json.dumps(
@@ -81,6 +101,52 @@ def ship(
         for problem in done.problems:
             print(f"note: {problem}", file=sys.stderr)
     if done.waiting or done.problems:
+        raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _window_of(robot: str | None, start: str | None, end: str | None) -> TimeWindow | None:
+    """Returns the time to forget, if any.
+
+    Raises:
+        InvalidArgumentsError: a part of it is missing, or is no time.
+    """
+    if robot is None and start is None and end is None:
+        return None
+    if robot is None or start is None or end is None:
+        raise InvalidArgumentsError("give all of --forget, --start and --end, or none of them")
+    now = time.time()
+    return TimeWindow.from_unix(parse_time(start, now), parse_time(end, now))
+
+
+def _forget(location: "LakeLocation", robot: str, window: TimeWindow, *, as_json: bool) -> None:
+    """Forgets a time of a robot in the lake, and prints what is gone.
+
+    Raises:
+        LakeError: the lake cannot be read or written; the next start finishes it.
+    """
+    from ros2_memory.lake.forgetting import forget_in_lake  # noqa: PLC0415 - as in `ship`
+    from ros2_memory.lake.tables import TABLES  # noqa: PLC0415
+    from ros2_memory.lake.tombstones import Tombstone, append_tombstone  # noqa: PLC0415
+
+    tombstone = Tombstone(robot, window.start, window.stop)
+    with location.opened() as catalog:
+        tables = location.tables(catalog, TABLES)
+        append_tombstone(location.state_dir, tombstone, done=False)
+        gone = forget_in_lake(location, tables, tombstone, WallClock().now())
+    if as_json:
+        kept_by = [*gone.kept_by]
+        print_line(json.dumps({"bags": gone.bags, "files": gone.files, "kept_by": kept_by}))
+    else:
+        bags = counted(gone.bags, "bag")
+        print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
+        for each in gone.kept_by:
+            print(f"note: a branch or tag keeps an older version: {each}", file=sys.stderr)
+    if "://" in location.warehouse and not location.warehouse.startswith("file:"):
+        print(
+            "note: where the bucket keeps versions of deleted objects, those are not erased",
+            file=sys.stderr,
+        )
+    if gone.kept_by:
         raise typer.Exit(EXIT_NEGATIVE)
 
 
@@ -108,16 +174,24 @@ def _wait(seconds: float) -> None:
 def _shipper(
     settings: Settings, location: "LakeLocation", robots: "Sequence[RobotBags]", pace: _Pace
 ) -> "Iterator[Shipper]":
-    from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415 - as in `ship`
+    from ros2_memory.lake.forgetting import forget_in_lake  # noqa: PLC0415 - as in `ship`
+    from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
     from ros2_memory.lake.tables import TABLES  # noqa: PLC0415
+    from ros2_memory.lake.tombstones import read_tombstones  # noqa: PLC0415
 
     with location.opened() as catalog:
+        tables = location.tables(catalog, TABLES)
+        tombstones = read_tombstones(location.state_dir)
+        for each, is_done in tombstones.items():
+            if not is_done:
+                forget_in_lake(location, tables, each, WallClock().now())
         yield Shipper(
             location,
-            location.tables(catalog, TABLES),
+            tables,
             robots,
             WallClock(),
             messages=settings.lake.messages,
+            tombstones=tombstones,
             pause=pace,
             alive=lambda: notify(WATCHDOG),
         )
@@ -130,11 +204,16 @@ def _ship_on(
     notify(READY)
     log.info("shipping", robots=len(robots), warehouse=location.warehouse)
     known: list[str] = []
+    kept_up_s = -math.inf
+    grace = ns_from_unix(settings.lake.grace_h * 3600)
     while True:
         try:
             with _shipper(settings, location, robots, pace) as shipper:
                 while True:
                     problems = shipper.run().problems
+                    if time.monotonic() - kept_up_s >= _UPKEEP_S:
+                        shipper.keep_up(grace)
+                        kept_up_s = time.monotonic()
                     for problem in problems:
                         if problem not in known:
                             log.warning("not_shipped", reason=problem)

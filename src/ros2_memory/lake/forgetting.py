@@ -1,0 +1,101 @@
+"""Forgets a time of a robot in a lake: rows, old versions and files.
+
+Each bag that reaches into the time goes as a whole, since what its digests hold cannot be taken
+apart; where its file is still there without the messages, it is shipped again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.lake.conditions import any_of, between, of_bags, overlapping
+from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.tombstones import append_tombstone
+from ros2_memory.lake.upkeep import expire
+from ros2_memory.lake.warehouse import quiet_deletes
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from datetime import date
+
+    from pyiceberg.expressions import BooleanExpression
+    from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.lake.tombstones import Tombstone
+    from ros2_memory.lake.warehouse import LakeLocation
+
+log = get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Forgotten:
+    """What is gone: how many bags, and files; `kept_by` names tags and branches that keep some."""
+
+    bags: int
+    files: int
+    kept_by: tuple[str, ...] = ()
+
+
+def forget_in_lake(
+    location: LakeLocation, tables: Mapping[str, IcebergTable], tombstone: Tombstone, now: Ns
+) -> Forgotten:
+    """Deletes what a tombstone names, which is written already; killed anywhere, it is done again.
+
+    Raises:
+        LakeError: the lake cannot be read or written.
+    """
+    with location.translated("forgetting in the lake"):
+        found = (
+            tables["bags"]
+            .refresh()
+            .scan(
+                row_filter=_reaching(tombstone, "start_ns", "end_ns"),
+                selected_fields=("bag_id", "day"),
+            )
+            .to_arrow()
+        )
+        ids: dict[tuple[str, date], set[str]] = {}
+        for bag_id, day in zip(found["bag_id"].to_pylist(), found["day"].to_pylist(), strict=True):
+            ids.setdefault((tombstone.robot, day), set()).add(bag_id)
+        # `bags` last: until then it tells which rows are to go.
+        for name in sorted(TABLES, key=lambda each: each == "bags"):
+            conditions = [_in_window(tombstone, name)]
+            if ids:
+                conditions.append(of_bags(ids))
+            table = tables[name]
+            with quiet_deletes():
+                table.refresh().delete(any_of(conditions))
+            # The list of what a version deleted has the bounds of its columns, which are texts of
+            # rows; the next version does not refer to it.
+            table.append(table.schema().as_arrow().empty_table())
+    # The versions before hold what was deleted, so they go whatever their age.
+    files = expire(location, tables, now, 0)
+    kept_by = tuple(
+        f"{name}: {ref}"
+        for name, table in tables.items()
+        for ref, each in table.metadata.refs.items()
+        if each.snapshot_id != table.metadata.current_snapshot_id
+    )
+    append_tombstone(location.state_dir, tombstone, done=True)
+    log.info("forgotten_in_lake", robot=tombstone.robot, bags=found.num_rows, files=files)
+    return Forgotten(found.num_rows, files, kept_by)
+
+
+def _in_window(tombstone: Tombstone, name: str) -> BooleanExpression:
+    """Returns the condition on rows of a table that are of the window by their own times.
+
+    Such as those that a killed process left without a row in `bags`.
+    """
+    columns = TABLES[name].columns
+    if "time_ns" in columns:
+        return between(tombstone.robot, "time_ns", tombstone.start, tombstone.stop)
+    first = "start_ns" if name == "bags" else "first_ns"
+    last = "end_ns" if name == "bags" else "last_ns"
+    return _reaching(tombstone, first, last)
+
+
+def _reaching(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
+    return overlapping(tombstone.robot, (first, last), tombstone.start, tombstone.stop)

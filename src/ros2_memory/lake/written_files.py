@@ -1,0 +1,129 @@
+"""The files that this program wrote into a lake, and which of them nothing refers to any more.
+
+pyiceberg rewrites tables and drops old versions from their metadata, but deletes no file. So each
+file is recorded before it is written, in the state directory, and only recorded ones are deleted:
+those below the table's own location to which no version, branch or tag of the table refers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING, Final
+
+from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
+from pyiceberg.manifest import ManifestEntryStatus
+
+from ros2_memory.bag_dir.durable_write import append_durably, write_durably
+from ros2_memory.core.timebase import Ns, WallClock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from pyiceberg.table import Table as IcebergTable
+
+WRITTEN_FILE: Final = "written.jsonl"
+RECORD: Final = "ros2-memory.written"
+"""The setting of a `RecordingFileIO` that names its record."""
+
+
+class RecordingFileIO(PyArrowFileIO):
+    """Records each file durably before it is written."""
+
+    def new_output(self, location: str) -> PyArrowFile:
+        """Returns a file to be written."""
+        from pathlib import Path  # noqa: PLC0415 - pyiceberg reads this class's annotations
+
+        record = self.properties.get(RECORD)
+        if record:
+            line = json.dumps({"file": location, "at": WallClock().now()})
+            append_durably(Path(record), f"{line}\n")
+        return super().new_output(location)
+
+
+def file_properties(state_dir: Path) -> dict[str, str]:
+    """Returns the settings of a catalogue whose files are recorded."""
+    return {
+        "py-io-impl": f"{RecordingFileIO.__module__}.{RecordingFileIO.__name__}",
+        RECORD: os.fspath(state_dir.absolute() / WRITTEN_FILE),
+    }
+
+
+def recorded_files(state_dir: Path) -> dict[str, Ns]:
+    """Returns the files that were written, with when; a line that a crash cut short is none.
+
+    Raises:
+        OSError: the record cannot be read.
+    """
+    try:
+        lines = (state_dir / WRITTEN_FILE).read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        return {}
+    found: dict[str, Ns] = {}
+    for line in lines:
+        try:
+            fields: object = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(fields, dict):
+            file, at = fields.get("file"), fields.get("at")
+            if isinstance(file, str) and isinstance(at, int):
+                found[file] = at
+    return found
+
+
+def referenced_files(table: IcebergTable) -> set[str]:
+    """Returns the files that some version, branch or tag of a table refers to."""
+    found = {table.metadata_location}
+    found.update(each.statistics_path for each in table.metadata.statistics)
+    for snapshot in table.metadata.snapshots:
+        found.add(snapshot.manifest_list)
+        for manifest in snapshot.manifests(table.io):
+            if manifest.manifest_path in found:
+                continue
+            found.add(manifest.manifest_path)
+            for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=False):
+                if entry.status is not ManifestEntryStatus.DELETED:
+                    found.add(entry.data_file.file_path)
+    return found
+
+
+def delete_unreferenced(state_dir: Path, tables: Iterable[IcebergTable], written_before: Ns) -> int:
+    """Deletes the files to which no table refers, and that were written before a time.
+
+    Returns:
+        How many were deleted.
+
+    Raises:
+        OSError: a file cannot be deleted; those that were deleted before are gone.
+    """
+    recorded = recorded_files(state_dir)
+    gone: set[str] = set()
+    try:
+        for table in tables:
+            below = f"{table.location().rstrip('/')}/"
+            old = {
+                file
+                for file, at in recorded.items()
+                if file.startswith(below) and ".." not in file and at < written_before
+            }
+            for file in sorted(old - referenced_files(table)) if old else ():
+                _delete(table, file)
+                gone.add(file)
+    finally:
+        if gone:
+            _keep(state_dir, {file: at for file, at in recorded.items() if file not in gone})
+    return len(gone)
+
+
+def _delete(table: IcebergTable, file: str) -> None:
+    try:
+        table.io.delete(file)
+    except FileNotFoundError:
+        return  # as after a kill
+
+
+def _keep(state_dir: Path, recorded: Mapping[str, Ns]) -> None:
+    lines = (json.dumps({"file": file, "at": at}) for file, at in recorded.items())
+    write_durably(state_dir / WRITTEN_FILE, "".join(f"{line}\n" for line in lines))

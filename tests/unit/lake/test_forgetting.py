@@ -1,0 +1,227 @@
+"""What is forgotten is gone from every byte of the lake, and no late copy brings it back."""
+
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from pyiceberg.avro.file import AvroFile
+from pyiceberg.catalog.sql import SqlCatalog
+from pyiceberg.io.pyarrow import PyArrowFileIO
+from pyiceberg.typedef import Record
+
+from ros2_memory.core.errors import LakeError
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.lake.forgetting import Forgotten, forget_in_lake
+from ros2_memory.lake.shipper import Shipped, Shipper
+from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.tombstones import (
+    TOMBSTONES_FILE,
+    Tombstone,
+    append_tombstone,
+    read_tombstones,
+)
+from ros2_memory.lake.upkeep import compact, expire
+from ros2_memory.lake.written_files import recorded_files
+from tests.support.bags import detections, text, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.lakes import (
+    LATER,
+    START_S,
+    lake_column,
+    location,
+    robot_bags,
+    ship,
+    write_bag,
+)
+
+MARKER = "zyxwv-9876"
+"""Short enough for the bounds of a column, which are cut after 16 characters."""
+DAY_NS = 86_400 * NS_PER_S
+
+
+def secret_bag(bag_dir: Path, number: int = 7) -> Path:
+    first = (START_S + 10 * number) * NS_PER_S
+    messages = [detections(first, [MARKER]), text(first + NS_PER_S, MARKER)]
+    return write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+
+
+def tombstone(number: int = 7) -> Tombstone:
+    start = (START_S + 10 * number) * NS_PER_S
+    return Tombstone("hall", start, start + 5 * NS_PER_S)
+
+
+def forget(lake: Path, what: Tombstone) -> Forgotten:
+    where = location(lake)
+    append_tombstone(where.state_dir, what, done=False)
+    with where.opened() as catalog:
+        return forget_in_lake(where, where.tables(catalog, TABLES), what, LATER)
+
+
+def ship_with_tombstones(lake: Path, bag_dir: Path) -> Shipped:
+    where = location(lake)
+    with where.opened() as catalog:
+        tables = where.tables(catalog, TABLES)
+        return Shipper(
+            where,
+            tables,
+            [robot_bags("hall", bag_dir)],
+            FixedClock(LATER),
+            messages=("/chatter",),
+            tombstones=read_tombstones(where.state_dir),
+        ).run()
+
+
+def files_with(lake: Path, secret: str) -> list[Path]:
+    """The files that hold a text, compressed or not, as what reads them sees it."""
+    return [path for path in lake.rglob("*") if path.is_file() and secret in _content(path)]
+
+
+def _content(path: Path) -> str:
+    plain = path.read_bytes().decode("latin-1")
+    if path.suffix == ".parquet":
+        return plain + str(pq.read_table(path, partitioning=None).to_pylist())
+    if path.suffix == ".avro" and not path.name.startswith("snap-"):
+        entries: AvroFile[Record]
+        with AvroFile[Record](PyArrowFileIO().new_input(str(path))) as entries:
+            return plain + "".join(repr(each._data) for each in entries)
+    return plain
+
+
+def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy(
+    tmp_path: Path,
+) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    write_bag(bag_dir, 0)
+    kept = secret_bag(bag_dir)
+    late = shutil.copy(kept, tmp_path / "late.mcap")
+    ship(lake, [robot_bags("hall", bag_dir)])
+    suffixes = {path.suffix for path in files_with(lake, MARKER)}
+    assert suffixes == {".parquet", ".avro"}  # so the scan finds it where it is
+    kept.unlink()
+    gone = forget(lake, tombstone())
+    assert (gone.bags, gone.kept_by) == (1, ())
+    assert files_with(lake, MARKER) == []
+    assert len(lake_column(lake, "messages", "value")) == 3
+    shutil.copy(late, kept)
+    done = ship_with_tombstones(lake, bag_dir)
+    assert done.bags == 0
+    assert "forgotten" in done.problems[0]
+    assert files_with(lake, MARKER) == []
+    # Without the messages it comes again.
+    write_mcap(kept, [text((START_S + 76) * NS_PER_S, "after")])
+    assert ship_with_tombstones(lake, bag_dir).bags == 1
+
+
+def test_killed_while_forgetting_it_is_finished_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    secret_bag(bag_dir)
+    write_bag(bag_dir, 0)
+    ship(lake, [robot_bags("hall", bag_dir)])
+    commit, calls = SqlCatalog.commit_table, 0
+
+    def failing(*given: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == 4:
+            raise OSError(28, "No space left on device")
+        return commit(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(SqlCatalog, "commit_table", failing)
+    with pytest.raises(LakeError, match="No space left"):
+        forget(lake, tombstone())
+    where = location(lake)
+    assert read_tombstones(where.state_dir) == {tombstone(): False}
+    assert forget(lake, tombstone()).bags == 1
+    assert read_tombstones(where.state_dir) == {tombstone(): True}
+    assert files_with(lake, MARKER) == []
+
+
+def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    write_bag(bag_dir, 0)
+    ship(lake, [robot_bags("hall", bag_dir)])
+    secret_bag(bag_dir)
+    overwrite = Shipper._overwrite
+
+    def killed(self: Shipper, name: str, *given: object) -> None:
+        if name == "bags":
+            raise LakeError("killed")
+        overwrite(self, name, *given)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Shipper, "_overwrite", killed)
+        with pytest.raises(LakeError):
+            ship(lake, [robot_bags("hall", bag_dir)])
+    assert files_with(lake, MARKER)
+    assert forget(lake, tombstone()).bags == 0
+    assert files_with(lake, MARKER) == []
+
+
+def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    secret_bag(bag_dir)
+    ship(lake, [robot_bags("hall", bag_dir)])
+    where = location(lake)
+    with where.opened() as catalog:
+        table = where.tables(catalog, ["messages"])["messages"]
+        snapshot = table.current_snapshot()
+        assert snapshot is not None
+        table.manage_snapshots().create_tag(snapshot.snapshot_id, "audit").commit()
+    assert forget(lake, tombstone()).kept_by == ("messages: audit",)
+    assert files_with(lake, MARKER)
+
+
+def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    write_bag(bag_dir, 0)
+    ship(lake, [robot_bags("hall", bag_dir)])
+    foreign = next(lake.rglob("messages/data/*/*/*.parquet")).with_name("foreign.parquet")
+    foreign.write_bytes(b"of another program")
+    write_bag(bag_dir, 0, most=2)
+    ship(lake, [robot_bags("hall", bag_dir)])
+    where = location(lake)
+    files = {path for path in lake.rglob("*") if path.is_file()}
+    now = max(recorded_files(where.state_dir).values()) + NS_PER_S
+    with where.opened() as catalog:
+        tables = where.tables(catalog, TABLES)
+        assert expire(where, tables, now, DAY_NS) == 0
+        assert {path for path in lake.rglob("*") if path.is_file()} == files
+        assert expire(where, tables, now + DAY_NS, DAY_NS) > 10
+    assert foreign.exists()
+    assert len(lake_column(lake, "messages", "value")) == 2
+
+
+def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    for number in range(5):
+        write_bag(bag_dir, number)
+    ship(lake, [robot_bags("hall", bag_dir)], most_bags=1)
+    before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
+    values = lake_column(lake, "messages", "value")
+    where = location(lake)
+    with where.opened() as catalog:
+        tables = where.tables(catalog, TABLES)
+        assert compact(where, tables, (START_S + 3600) * NS_PER_S) == 0
+        assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
+        assert len([*tables["messages"].refresh().scan().plan_files()]) == 1
+        assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
+    assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
+    assert lake_column(lake, "messages", "value") == values
+
+
+def test_a_damaged_tombstone_keeps_everything_from_being_shipped(tmp_path: Path) -> None:
+    append_tombstone(tmp_path, tombstone(), done=False)
+    path = tmp_path / TOMBSTONES_FILE
+    # A crash cut the last line short.
+    path.write_text(path.read_text() + '{"robot": "ha')
+    assert read_tombstones(tmp_path) == {tombstone(): False}
+    append_tombstone(tmp_path, tombstone(), done=True)
+    assert read_tombstones(tmp_path) == {tombstone(): True}
+    path.write_text('{"robot": 1}\n' + path.read_text())
+    with pytest.raises(LakeError, match="line 1"):
+        read_tombstones(tmp_path)
