@@ -26,7 +26,7 @@ from benchmarks.home.days import Scale
 from benchmarks.home.world import START_S, VISION
 from benchmarks.home_week import condition
 from benchmarks.report import machine
-from ros2_memory.bootstrap import build_dispatcher, build_memory, query_settings_of
+from ros2_memory.bootstrap import build_dispatcher, build_memory, query_settings_of, shared_parts
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import WallClock
@@ -89,19 +89,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         Scale(seed=seed, days=1, compression=1.0, split_s=given.split_s)
         for seed in range(given.seeds)
     ]
-    worlds = [made(scale, given.worlds) for scale in scales]
     if not (folder / "made").is_file():
-        _make(folder, worlds, names)
-    return asyncio.run(_asked(folder, worlds[0], names))
+        _make(folder, [made(scale, given.worlds) for scale in scales], names)
+    return asyncio.run(_asked(folder, names))
 
 
-def _settings(world: Path) -> Settings:
+def _settings(folder: Path, bag_dir: Path) -> Settings:
     return load_settings(
         [
             "deployment=query_only",
-            f"recording.bag_dir={world / 'bags'}",
-            f"data.places_file={world / 'places.yaml'}",
-            f"data.labels_file={world / 'labels.yaml'}",
+            f"recording.bag_dir={bag_dir}",
+            f"data.places_file={folder / 'places.yaml'}",
+            f"data.labels_file={folder / 'labels.yaml'}",
             "data.now=latest",
             "logging.level=error",
             "server.call_timeout_s=120",
@@ -120,8 +119,10 @@ def _make(folder: Path, worlds: Sequence[Path], names: Sequence[str]) -> None:
     (folder / "lake.sqlite").unlink(missing_ok=True)
     (folder / "files").mkdir(parents=True)
     tables = open_tables(_catalog(folder), TABLES)
+    for file in ("places.yaml", "labels.yaml"):
+        shutil.copyfile(worlds[0] / file, folder / file)
     for number, world in enumerate(worlds):
-        settings = _settings(world)
+        settings = _settings(folder, world / "bags")
         memory = build_memory(settings)
         for _ in range(2):  # a busy machine may leave a bag for later
             made_known(memory, settings)
@@ -154,13 +155,13 @@ def _numbers(memory: Memory, bags: Sequence[BagFile]) -> Sequence[int | None]:
     return memory.recall.catalogue.find([BagKey.of(bag, bag_dir) for bag in bags])
 
 
-async def _asked(folder: Path, world: Path, names: Sequence[str]) -> int:
-    settings = _settings(world)
-    limits, most = query_settings_of(settings), settings.data.max_array_length
+async def _asked(folder: Path, names: Sequence[str]) -> int:
+    settings = _settings(folder, folder / "none")
+    limits, shared = query_settings_of(settings), shared_parts(settings)
     lake = Lake(_catalog(folder), DuckdbEngine())
 
     def memory_of(name: str) -> Memory:
-        return LakeRobot(lake, name, WallClock(), limits, most).memory
+        return LakeRobot(lake, name, WallClock(), limits, shared.extractor).memory
 
     fleet = Fleet(
         [Robot(name, folder, partial(memory_of, name)) for name in names],

@@ -163,6 +163,9 @@ class SchemaExtractor:
             that is shown.
         max_chars: how long one shown value may be, as JSON text, before it is thinned harder.
 
+    Attributes:
+        limit: see `max_array_length`.
+
     Raises:
         ConfigError: a field's name or path is malformed, or a limit is below 1.
     """
@@ -176,7 +179,7 @@ class SchemaExtractor:
     ) -> None:
         if max_array_length < 1:
             raise ConfigError(f"max_array_length is {max_array_length}; it must be at least 1")
-        self._limit = max_array_length
+        self.limit = max_array_length
         self._max_chars = max_chars
         self._plans = {name: _compile(name, fields) for name, fields in schemas.items()}
 
@@ -187,12 +190,12 @@ class SchemaExtractor:
         the limit, and the data of images, point clouds and maps, are summaries here too, and what
         lies deeper than 24 levels (JSON alone can) is null.
         """
-        return self._whole(ExactJson(self._limit), message, type_name)
+        return self._whole(ExactJson(self.limit), message, type_name)
 
     def exact_at(self, message: object, type_name: str, path: str) -> JsonValue:
         """Returns one of the `fields` of `shown`, exactly; null where this message has none."""
         found = self._find(message, type_name, path)
-        return None if found is ABSENT else ExactJson(self._limit).value(found, path)
+        return None if found is ABSENT else ExactJson(self.limit).value(found, path)
 
     def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
         """Returns the value for a reply: strict JSON, thinned and rounded, with notes.
@@ -211,7 +214,7 @@ class SchemaExtractor:
             if node is ABSENT:
                 plan = self._plan(type_name)
                 raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
-        limit, squeeze = self._limit, 1
+        limit, squeeze = self.limit, 1
         while True:
             rendering = ReplyJson(limit, squeeze)
             value: JsonValue = (

@@ -18,6 +18,7 @@ from ros2_memory.lake.rows import BagContent, bag_id_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables, to_arrow
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW
+from tests.support.memories import extractor
 
 
 def lake_in(folder: Path) -> SqlCatalog:
@@ -50,7 +51,7 @@ def lake_robots(
     """The robots of a lake, asked at `NOW`."""
     lake, clock = Lake(catalog, engine), FixedClock(NOW)
     return {
-        name: LakeRobot(lake, name, clock, limits or QuerySettings(), 50, refresh_s=0)
+        name: LakeRobot(lake, name, clock, limits or QuerySettings(), extractor(), refresh_s=0)
         for name in names
     }
 

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import json
 import threading
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NotShippedError, UndecodableError
-from ros2_memory.lake.memory.rows_as_messages import Tracks, channel, detections, message
+from ros2_memory.lake.memory.rows_as_messages import (
+    Tracks,
+    channel,
+    detections,
+    even_times,
+    message,
+)
 from ros2_memory.lake.tables import topic_key
 from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
     from pathlib import Path
+
+    import pyarrow as pa
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
@@ -23,11 +31,15 @@ if TYPE_CHECKING:
     from ros2_memory.lake.memory.index import LakeBag, LakeIndex
     from ros2_memory.storage.base import Channel, Record
 
+    DayOfSightings = tuple[pa.Table, Mapping[str, int], Mapping[str, int]]
+
+_MOST_DAYS: Final = 8
+"""Days of detections of a topic that stay in memory: a search goes through most of their bags."""
 _MOST_READ: Final = 256
 """Topics of a bag that stay in memory."""
 _SIGHTINGS: Final = (
-    "SELECT time_ns, message, label, score, frame_id, x, y, z FROM sightings"
-    " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns, message"
+    "SELECT bag_id, time_ns, message, label, score, frame_id, x, y, z FROM sightings"
+    " WHERE topic_key = $key AND topic = $topic ORDER BY bag_id, time_ns, message"
 )
 _MESSAGES: Final = (
     "SELECT type, time_ns, publish_ns, value FROM messages"
@@ -70,6 +82,7 @@ class LakeReader(BagReader):
         self._served = threading.local()
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[str, str], Sequence[Record]] = OrderedDict()
+        self._days: OrderedDict[tuple[object, ...], DayOfSightings] = OrderedDict()
 
     def reads(self, path: Path) -> bool:
         """Returns True: all files of the index are of the lake."""
@@ -112,10 +125,18 @@ class LakeReader(BagReader):
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """Returns the log times of what rows have of the messages.
 
-        Raises:
-            NotShippedError: the lake has no rows of the topic.
+        Of a topic without rows they are taken to be as far apart as they were on average.
         """
-        return [each.log_time for each in self.records(path, [topic], window)]
+        try:
+            return [each.log_time for each in self.records(path, [topic], window)]
+        except NotShippedError:
+            self._served.even = True
+            times = [
+                time
+                for each in self._index.file(path).summary.of(topic)
+                for time in even_times(each.first, each.last, each.count).tolist()
+            ]
+            return sorted(filter(window.contains, times))
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns None: rows are of messages that could be decoded."""
@@ -137,11 +158,13 @@ class LakeReader(BagReader):
             raise UndecodableError(here.topic, here.type, "when it was shipped")
         return json.loads(record.payload)
 
-    def take_thinned(self) -> bool:
-        """Returns whether this thread was given vertices of the track since it asked last."""
-        thinned = getattr(self._served, "thinned", False)
-        self._served.thinned = False
-        return bool(thinned)
+    def take_notes(self) -> Iterator[str]:
+        """Yields in what this thread was given something else than messages since it asked last."""
+        if getattr(self._served, "thinned", False):
+            yield "for parts of bags the track was used that the lake has, not every pose"
+        if getattr(self._served, "even", False):
+            yield "steps of the clock inside of a bag are not seen in the lake"
+        self._served.thinned = self._served.even = False
 
     def _of_topic(self, bag: BagFile, topic: str) -> Sequence[Record]:
         if topic == self._index.pose_topic:
@@ -166,7 +189,7 @@ class LakeReader(BagReader):
             if whole:
                 return whole
         if self._index.is_detector(topic):
-            return detections(bag, topic, self._rows(_SIGHTINGS, "sightings", here, topic))
+            return detections(bag, topic, self._sightings(here, topic))
         if topic == self._index.pose_topic:
             return self._tracks(bag, here).poses(topic)
         if topic in self._tf_topics:
@@ -175,6 +198,26 @@ class LakeReader(BagReader):
             f"the lake has no messages of {topic}: name it in lake.messages of ros2-memory ship, "
             "or ask the robot's own memory"
         )
+
+    def _sightings(self, bag: LakeBag, topic: str) -> Sequence[Mapping[str, JsonValue]]:
+        key = self._index.version, topic, bag.day
+        with self._lock:
+            known = self._days.get(key)
+        if known is None:
+            asked = {"key": topic_key(topic), "topic": topic}
+            table = self._lake.select(
+                _SIGHTINGS, ["sightings"], asked, robots=[self._robot], days=(bag.day, bag.day)
+            )
+            names = table["bag_id"].to_pylist()
+            begins: Mapping[str, int] = {name: at for at, name in reversed([*enumerate(names)])}
+            known = table, begins, Counter(names)
+            with self._lock:
+                self._days[key] = known
+                if len(self._days) > _MOST_DAYS:
+                    self._days.popitem(last=False)
+        begin, count = known[1].get(bag.bag_id, 0), known[2].get(bag.bag_id, 0)
+        rows: Sequence[Mapping[str, JsonValue]] = known[0].slice(begin, count).to_pylist()
+        return rows
 
     def _tracks(self, bag: BagFile, here: LakeBag) -> Tracks:
         topic = self._index.pose_topic

@@ -20,6 +20,27 @@ if TYPE_CHECKING:
     from ros2_memory.lake.files import Lake
 
 
+class LakeExtractor(SchemaExtractor):
+    """Takes values as they are, since those of rows were extracted when they were shipped.
+
+    Args:
+        shipped: what a type holds, as on the robot.
+    """
+
+    def __init__(self, shipped: SchemaExtractor) -> None:
+        super().__init__({}, shipped.limit)
+        self._shipped = shipped
+
+    def is_mapped(self, type_name: str) -> bool:
+        """Returns True: no message is read to see what its type holds."""
+        del type_name
+        return True
+
+    def kinds_of(self, type_name: str) -> frozenset[str]:
+        """Returns what messages of a mapped type have."""
+        return self._shipped.kinds_of(type_name)
+
+
 class LakeRobot:
     """A robot's memory over its rows.
 
@@ -28,7 +49,7 @@ class LakeRobot:
         name: of the robot there.
         clock: the wall clock.
         limits: the settings of queries.
-        most: the most elements of an array in a value that is shown.
+        extractor: knows the types of messages.
         refresh_s: how old (s) the index may be.
         days: how many days with data answer: the newest.
 
@@ -42,7 +63,7 @@ class LakeRobot:
         name: str,
         clock: Clock,
         limits: QuerySettings,
-        most: int,
+        extractor: SchemaExtractor,
         *,
         refresh_s: float = 60.0,
         days: int = 31,
@@ -61,9 +82,9 @@ class LakeRobot:
         recall = DigestCache(catalogue, self._index.bag_dir)
         # Nothing is recorded here, and nothing deleted.
         own = replace(limits, kept=None, recording="", screened=False)
-        # Rows hold values that were extracted already.
-        extractor = SchemaExtractor({}, most)
-        self.memory = Memory(self._index, self._reader, extractor, clock, own, recall)
+        self.memory = Memory(
+            self._index, self._reader, LakeExtractor(extractor), clock, own, recall
+        )
 
     @property
     def latest(self) -> Ns | None:
@@ -75,5 +96,4 @@ class LakeRobot:
         """Yields what the answer that this thread has just computed is to be told with."""
         if self._index.since is not None:
             yield f"the lake has days before {self._index.since}, which were not looked at"
-        if self._reader.take_thinned():
-            yield "for parts of bags the track was used that the lake has, not every pose"
+        yield from self._reader.take_notes()

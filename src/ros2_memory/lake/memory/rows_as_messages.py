@@ -74,6 +74,11 @@ def _detection(row: Row) -> JsonValue:
     return found
 
 
+def even_times(first: Ns, last: Ns, count: int) -> NDArray[np.int64]:
+    """Returns so many times from a first to a last one, equally far apart."""
+    return first + np.linspace(0, last - first, count).astype(np.int64)
+
+
 class Tracks:
     """The robot's track in one bag: in the poses' own frame, and in the map where that is another.
 
@@ -92,7 +97,7 @@ class Tracks:
     ) -> None:
         [summary, *_] = bag.summary.of(topic)
         self._type = summary.type
-        self._times = np.linspace(summary.first, summary.last, summary.count).astype(np.int64)
+        self._times = even_times(summary.first, summary.last, summary.count)
         by_frame: dict[str, list[Row]] = {}
         for row in rows:
             by_frame.setdefault(str(row["frame_id"]), []).append(row)
