@@ -6,6 +6,7 @@ becomes a `LakeError`, in whose sentence no secret is.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -80,6 +81,8 @@ class LakeLocation:
         Raises:
             LakeError: it cannot be opened.
         """
+        # It logs each file that it opens, at the level of our own events.
+        logging.getLogger("pyiceberg").setLevel(logging.WARNING)
         properties = {
             **self.properties,
             **self.secrets,

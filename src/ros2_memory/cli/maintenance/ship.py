@@ -71,7 +71,7 @@ def ship(
     # The extra is there: `lake_location` has checked that.
     from ros2_memory.lake.lease import writing_alone  # noqa: PLC0415
 
-    shown = settings.logging.level if verbose or not once else "warning"
+    shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
     pace = _Pace(settings.lake.commit_interval_s)
     with writing_alone(location.state_dir):
