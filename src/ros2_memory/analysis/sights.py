@@ -580,7 +580,7 @@ def decode_joined(packed: Sequence[bytes]) -> tuple[Sights, list[int], list[str]
 
 
 def _decoded(packed: Sequence[bytes], which: list[int]) -> tuple[Sights, list[int], list[str]]:
-    heads = [_head(each) for each in packed]
+    heads = _heads(packed)
     topics: dict[str, int] = {}
     labels: dict[str, int] = {}
     of_topic, of_label = (
@@ -652,20 +652,27 @@ class _Head(NamedTuple):
 _WIDTHS: Final = tuple(len(each) for each in _TABLES)
 
 
-def _head(packed: bytes) -> _Head:
-    """Decodes what precedes the tables.
+def _heads(packed: Sequence[bytes]) -> list[_Head]:
+    """Decodes what precedes the tables of each.
 
     Raises:
-        ValueError: it does not, or tables are missing.
+        ValueError: something else does, or tables are missing.
     """
-    end = packed.find(b"\n")
-    base, frame_id, topics, labels, shapes = json.loads(packed[:end])
-    if len(shapes) != len(_WIDTHS):
-        raise ValueError("not sights: tables are missing")
-    size = sum(rows * width * size for (rows, size), width in zip(shapes, _WIDTHS, strict=True))
-    if end + 1 + size != len(packed):
-        raise ValueError("not sights: some of them are missing")
-    return _Head(int(base), frame_id, topics, labels, shapes, end + 1)
+    ends = [each.find(b"\n") for each in packed]
+    texts = [each[:end] for each, end in zip(packed, ends, strict=True)]
+    # As one text: a call for each of thousands takes four times as long.
+    decoded = json.loads(b"[" + b",".join(texts) + b"]")
+    heads: list[_Head] = []
+    for each, end, (base, frame_id, topics, labels, shapes) in zip(
+        packed, ends, decoded, strict=True
+    ):
+        if len(shapes) != len(_WIDTHS):
+            raise ValueError("not sights: tables are missing")
+        size = sum(rows * width * size for (rows, size), width in zip(shapes, _WIDTHS, strict=True))
+        if end + 1 + size != len(each):
+            raise ValueError("not sights: some of them are missing")
+        heads.append(_Head(int(base), frame_id, topics, labels, shapes, end + 1))
+    return heads
 
 
 def _fill(table: Ints, packed: bytes, start: int, size: int) -> None:

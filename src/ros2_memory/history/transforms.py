@@ -432,16 +432,24 @@ def connects(
         return True
     pairs: set[tuple[str, str]] = set()
     unread: list[tuple[Ns, Ns, tuple[str, ...]]] = []
-    for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window)):
-        recorded = _recorded(view, topics)
-        known, unknown = _known_pairs(view, recorded, within, among)
-        pairs |= known
-        unread += [(stop, start, recorded) for start, stop in dict.fromkeys(unknown)]
-    if _link(pairs, frames):
-        if window is None:
-            known_to.add(asked)
-        return True
-    for stop, start, recorded in sorted(unread, reverse=True):
+    asked_of = [
+        (recorded, topic, within or TimeWindow.everything())
+        for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window))
+        for recorded in (_recorded(view, topics),)
+        for topic in recorded
+    ]
+    for segment in view.snapshot.timeline.segments:
+        before = len(pairs)
+        for recorded, topic, within in asked_of:
+            known, unknown = _stored_pairs(view, segment, topic, within, among)
+            pairs |= known
+            unread += [(stop, start, recorded) for start, stop in unknown]
+        # One segment is mostly enough, and a week has dozens.
+        if len(pairs) > before and _link(pairs, frames):
+            if window is None:
+                known_to.add(asked)
+            return True
+    for stop, start, recorded in sorted({*unread}, reverse=True):
         view.bags.check_deadline()
         read = _transforms(view, recorded, TimeWindow(start, stop), among)
         found = {(each.parent, each.child) for each in read}

@@ -241,7 +241,9 @@ class _Finder:
         best = int(sights.spots[rows, Spot.BEST].max())
         if best < 0:
             return None, None
-        of = np.isin(sights.scores[:, Score.SPOT], rows)
+        mine = np.zeros(len(sights.spots), bool)
+        mine[rows] = True
+        of = mine[sights.scores[:, Score.SPOT]]
         counts = np.bincount(sights.scores[of, Score.BIN], sights.scores[of, Score.N], SCORE_BINS)
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
         return best / 1000, (middle + 0.5) / SCORE_BINS

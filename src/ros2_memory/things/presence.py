@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Look
+from ros2_memory.things.places import distinct_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -71,18 +72,15 @@ class Cells:
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
         self.yaw = looks[:, Look.YAW] / 10.0
-        keys = np.stack(
+        _, self.cell = distinct_rows(
             (
                 self.topic,
                 epoch[self.bag],
                 looks[:, Look.X] // CELL_MM,
                 looks[:, Look.Y] // CELL_MM,
                 looks[:, Look.YAW] // CELL_DECIDEG,
-            ),
-            axis=1,
+            )
         )
-        _, cell = np.unique(keys, axis=0, return_inverse=True)
-        self.cell: Ints = cell.reshape(-1).astype(np.int64)
         self._count = int(self.cell.max(initial=-1)) + 1
         order = np.argsort(self.cell, kind="stable")
         after, before = order[1:], order[:-1]
