@@ -163,6 +163,12 @@ def calls(days: int) -> list[Asked]:
             **week,
         ),
         *each("get_topic_in_range /odom", topic=messages.ODOM.topic, **week),
+        *each(
+            "get_topic_in_range /odom fields",
+            topic=messages.ODOM.topic,
+            fields=["linear_velocity.x"],
+            **week,
+        ),
         Asked("recap last_s", "recap", {"last_s": 3600}),
         Asked("recap last_s of a day", "recap", {"last_s": DAY}),
         Asked("recap of a day", "recap", yesterday),

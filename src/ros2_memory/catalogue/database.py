@@ -221,6 +221,20 @@ class CatalogueDatabase:
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
 
+    def compact(self) -> None:
+        """Writes the file anew without the gaps in it: after many entries some tenth of it.
+
+        Left undone where another program writes to it, or the disk has no space for a copy.
+        """
+        with self._lock:
+            opened = self._ready()
+            if opened is None or opened.path is None:
+                return
+            with suppress(sqlite3.Error):
+                opened.connection.execute("VACUUM")
+                # The copy went through the write-ahead log, which would stay as long.
+                opened.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
     def look_after(self, *, thorough: bool = False) -> None:
         """Reopens the file where it was deleted, replaced, or could not be opened before.
 

@@ -83,7 +83,7 @@ if TYPE_CHECKING:
 FOLDER: Final = ".episodic"
 FILE: Final = "catalogue.sqlite"
 
-MOST_JOINED: Final = 85
+MOST_JOINED: Final = 200
 """Bytes for each entry that what many entries add up to may take."""
 _BATCH: Final = 4096
 """Rows that are held at a time while known files are made of them."""

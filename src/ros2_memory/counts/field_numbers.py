@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder
+from ros2_memory.analysis.field_ranges import FieldRangesBuilder
 from ros2_memory.analysis.payload_templates import template_for
+from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.counts.segment_fold import SegmentFold
-from ros2_memory.history.bag_groups import DigestKind
+from ros2_memory.counts.segment_fold import Digested, SegmentFold
+from ros2_memory.history.bag_groups import DigestKind, store_shared
 from ros2_memory.insights.field_extremes import numbers_in
 
 if TYPE_CHECKING:
@@ -29,10 +31,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
+    from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.segment_fold import Digested, Folded
-    from ros2_memory.history.bag_groups import Span
+    from ros2_memory.counts.segment_fold import Folded
+    from ros2_memory.history.bag_groups import Group, Span
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Record
@@ -94,6 +97,7 @@ class FieldReader:
         self._topic = topic
         self._fields = tuple(fields)
         self.failures: list[UndecodableError] = []
+        self._shared: dict[tuple[int, ...], Digested[Numbers]] | None = None
         self._decoder = BulkDecoder(self._decode, self._template, self._apply)
 
     def over(self, window: TimeWindow, edges: Sequence[Ns]) -> Folded[NumberTable]:
@@ -111,8 +115,36 @@ class FieldReader:
             edges=edges,
             cut_ns=0,
             failures=self.failures,
+            unread=self._of_shared,
+            question="by ranges",
         )
         return fold.over(self._view, self._topic, window)
+
+    def _of_shared(self, group: Group) -> Digested[Numbers] | None:
+        """Returns the numbers of recordings that overlap, by what `store_shared_ranges` stored."""
+        if group.may_be_relatched or len(group.bags) < 2:
+            return None
+        numbers = self._view.bags.entry_numbers(group.bags)
+        if self._shared is None:
+            self._shared = self._all_shared()
+        return None if numbers is None else self._shared.get(tuple(numbers))
+
+    def _all_shared(self) -> dict[tuple[int, ...], Digested[Numbers]]:
+        keys: list[tuple[int, ...]] = []
+        spans: list[Span] = []
+        rows: list[tuple[int, str, bytes]] = []
+        for key, answer in self._view.bags.cached_answers(f"{_SHARED.name} {self._topic}").items():
+            try:
+                packed, first, last = json.loads(answer)
+                text, ranges = _SHARED.decode(bytes.fromhex(packed))
+                field_column([(0, text, ranges)], "")
+            except (ValueError, TypeError, LookupError, AttributeError):
+                continue  # a damaged file can hold anything
+            rows.append((len(keys), text, ranges))
+            keys.append(key)
+            spans.append((int(first), int(last)))
+        found = _numbers_of([field_column(rows, field) for field in self._fields])
+        return {keys[at]: Digested(numbers, *spans[at]) for at, numbers in found.items()}
 
     def between(self, first: Ns, last: Ns) -> Numbers | None:
         """Returns the numbers between two log times (inclusive); None without a message."""
@@ -167,24 +199,76 @@ class FieldReader:
         self, digests: SegmentDigests, topic: str, among: Sequence[int]
     ) -> Mapping[int, Numbers]:
         """Returns the numbers of bags whose digests have the sums of all fields."""
-        columns = [digests.catalogue.field_column(topic, field, among) for field in self._fields]
-        found: dict[int, list[FieldNumbers]] = {}
-        for column in columns:
-            known = (column.size >= 0) & np.isfinite(column.total)
-            rows = zip(*(each[known].tolist() for each in column), strict=True)
-            for number, low, high, count, total, each in rows:
-                # Of one number in every message the first message is the first that has it.
-                exact = low == high and each > 0
-                one = (
-                    FieldNumbers(count, total, low, _AT_FIRST, high, _AT_FIRST)
-                    if exact
-                    else FieldNumbers(count, total, low, None, high, None)
-                )
-                found.setdefault(number, []).append(one)
-        whole = len(self._fields)
-        return {number: tuple(each) for number, each in found.items() if len(each) == whole}
+        return _numbers_of(
+            [digests.catalogue.field_column(topic, field, among) for field in self._fields]
+        )
 
 
+def _numbers_of(columns: Sequence[FieldColumn]) -> dict[int, Numbers]:
+    """Returns, by entry, the numbers of all fields, where the sums of all are known."""
+    found: dict[int, list[FieldNumbers]] = {}
+    for column in columns:
+        known = (column.size >= 0) & np.isfinite(column.total)
+        rows = zip(*(each[known].tolist() for each in column), strict=True)
+        for number, low, high, count, total, each in rows:
+            # Of one number in every message the first message is the first that has it.
+            exact = low == high and each > 0
+            one = (
+                FieldNumbers(count, total, low, _AT_FIRST, high, _AT_FIRST)
+                if exact
+                else FieldNumbers(count, total, low, None, high, None)
+            )
+            found.setdefault(number, []).append(one)
+    return {number: tuple(each) for number, each in found.items() if len(each) == len(columns)}
+
+
+def store_shared_ranges(view: View, topic: str, window: TimeWindow) -> int:
+    """Stores the ranges of all fields in recordings that overlap; returns of how many groups."""
+    return store_shared(view, topic, _SHARED, partial(_collected, view), window)
+
+
+def _collected(
+    view: View, messages: Iterable[StoredMessage]
+) -> tuple[tuple[str, bytes] | None, Span | None]:
+    """Returns the encoded ranges of messages, and the first and the last of their times."""
+    builder = FieldRangesBuilder()
+    reader, extractor = view.memory.reader, view.memory.extractor
+
+    def decode(record: Record) -> None:
+        builder.add(extractor.exact(reader.decode(record), record.channel.type))
+
+    def template(record: Record, _: None) -> PayloadTemplate | None:
+        return template_for(reader, extractor, record)
+
+    def apply(
+        template: PayloadTemplate, _: None, records: Sequence[Record], rows: Bytes
+    ) -> list[None]:
+        builder.add_rows(template, rows)
+        return [None] * len(records)
+
+    decoder = BulkDecoder(decode, template, apply)
+    times: list[Ns] = []
+    rest = iter(messages)
+    while some := list(islice(rest, _MOST_AT_ONCE)):
+        times += [each.time for each in some]
+        if any(decoder.decode([each.record for each in some])):
+            builder.give_up()
+    if not times:
+        return None, None
+    return encode_field_ranges(builder.ranges()), (times[0], times[-1])
+
+
+def _encoded_ranges(ranges: tuple[str, bytes]) -> bytes:
+    return b"\n".join((ranges[0].encode("utf-8", "surrogatepass"), ranges[1]))
+
+
+def _decoded_ranges(packed: bytes) -> tuple[str, bytes]:
+    text, _, ranges = packed.partition(b"\n")
+    return text.decode("utf-8", "surrogatepass"), ranges
+
+
+_SHARED: Final = DigestKind("ranges", lambda *_: {}, _encoded_ranges, _decoded_ranges)
+"""The ranges of all fields of recordings that overlap; single bags have digests of their own."""
 _AT_FIRST: Final[Ns] = -1
 """Means the time of the first message, which `_table` inserts."""
 

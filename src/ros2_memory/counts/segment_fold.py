@@ -136,11 +136,12 @@ class SegmentFold(Generic[T, R]):
         since: Ns | None = None
         left_unread = False
         for group in reversed(share.groups(view, topic, window)):
-            known = stored.of(group) if group.is_whole and not self._is_cut(group) else None
+            is_usable = group.is_whole and not self._is_cut(group)
+            known = stored.of(group) if is_usable else None
             if known is not None and not self._lacks(known[0]):
                 found.append(Digested(known[0], *known[1]))
                 continue
-            other = None if self.unread is None or not group.is_whole else self.unread(group)
+            other = self.unread(group) if self.unread is not None and is_usable else None
             if other is not None:
                 found.append(other)
                 left_unread = True

@@ -280,7 +280,7 @@ class Fold(Generic[T, R]):
         question = f"joined {JOINED_VERSION} {self.kind.name} {self.name} {stored.topic}"
         look_up = partial(digests.catalogue.joined, question, entries)
         known = self._reduced(digests, name, stored, groups, look_up)
-        if view.call.stores_joined and known is not None and look_up() is None:
+        if view.call.stores_joined and known is not None and not look_up():
             digests.catalogue.store_joined(question, entries, self._encoded(known))
         return known
 

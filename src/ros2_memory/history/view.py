@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_left
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
@@ -129,8 +130,8 @@ class View:
     def _overlap_census(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
         """Returns, by type, the messages stored in overlapping bags, and those that count."""
         bags = self.stream.overlapping_bags([topic], window)
-        question = f"contest {topic} {window.start} {window.stop - window.start}"
-        known = self.bags.cached_answer(question, bags, _decode_overlap)
+        question = f"overlap {topic} {window.start:x} {window.stop - window.start:x}"
+        known = self.bags.cached_answer(question, bags, partial(_decode_overlap, window.start))
         if known is not None:
             return known
         stored: dict[str, Census] = {}
@@ -139,19 +140,27 @@ class View:
             merged = self.stream.merged(bags, [topic], window, newest_first=False)
             once = _counted(deduplicate_forward(_tallied(merged, stored), everywhere))
             counted = {type_name: (stored[type_name], once[type_name]) for type_name in once}
+            # From the window's start: thousands of these are stored, and most of each is digits.
             answer = {
-                type_name: [astuple(stored), astuple(once)]
-                for type_name, (stored, once) in counted.items()
+                type_name: [
+                    (each.first - window.start, each.last - window.start, each.count)
+                    for each in both
+                ]
+                for type_name, both in counted.items()
             }
             self.bags.cache_answer(question, bags, json.dumps(answer))
         return counted
 
 
-def _decode_overlap(answer: str) -> dict[str, tuple[Census, Census]]:
+def _decode_overlap(start: Ns, answer: str) -> dict[str, tuple[Census, Census]]:
     return {
-        type_name: (Census(*stored), Census(*once))
+        type_name: (_census_from(start, *stored), _census_from(start, *once))
         for type_name, (stored, once) in json.loads(answer).items()
     }
+
+
+def _census_from(start: Ns, first: Ns, last: Ns, count: int) -> Census:
+    return Census(start + first, start + last, count)
 
 
 def _counted(messages: Iterable[StoredMessage]) -> dict[str, Census]:

@@ -134,6 +134,16 @@ def is_routine(change: PastChange) -> bool:
     return change.text.endswith(_ROUTINE)
 
 
+def topics_with_changes(view: View) -> list[str]:
+    """Returns the topics whose events tell what changed: those with events, and the commands."""
+    timeline, commands = view.snapshot.timeline, _commands(view)
+    return [
+        topic
+        for topic in timeline.topics()
+        if any(map(has_events, timeline.types_of(topic))) or topic in commands
+    ]
+
+
 def changes_in(
     view: View, window: TimeWindow, known: Mapping[str, TopicEvents | None]
 ) -> ChangesBefore:
@@ -148,10 +158,8 @@ def changes_in(
     joined: dict[str, TopicEvents] = {}
     recorded: list[str] = []
     commands = _commands(view)
-    for topic in timeline.topics():
+    for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
-        if not (any(map(has_events, types)) or topic in commands):
-            continue
         found = known[topic] if topic in known else events_in(view, topic, window)
         events = _with_lead(view, topic, window, found, types)
         if events is not None:

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import anyio
 import anyio.to_thread
 
-from ros2_memory.analysis.topic_events import has_events
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.lookup import bags_without_entry
-from ros2_memory.catalogue.store import BagKey
+from ros2_memory.catalogue.store import MOST_JOINED, BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns, ns_from_unix
+from ros2_memory.counts.field_numbers import store_shared_ranges
 from ros2_memory.history.bag_fold import JOINED_VERSION
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import store_shared_paths
@@ -34,6 +34,7 @@ from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
+from ros2_memory.insights.changes_before import topics_with_changes
 from ros2_memory.insights.drive import drive_in, store_shared_standstills
 from ros2_memory.insights.topic_events import events_in, store_shared_events
 from ros2_memory.places.bag_statics import BagStatics
@@ -237,10 +238,10 @@ class Backfill:
             poses = resolve_pose_topic(view)
             store_shared_paths(view, poses, window)
             store_shared_standstills(view, poses, window)
-        for topic, types in view.snapshot.timeline.types.items():
-            if any(has_events(each) for each in types):
-                with suppress(EpisodicError):
-                    store_shared_events(view, topic, window)
+            store_shared_ranges(view, poses, window)
+        for topic in topics_with_changes(view):
+            with suppress(EpisodicError):
+                store_shared_events(view, topic, window)
         store_joined(self._memory)
 
     def prune(self) -> None:
@@ -302,17 +303,17 @@ def store_joined(memory: Memory) -> None:
     if memory.recall is None or not numbers:
         return
     catalogue, limits = memory.recall.catalogue, memory.limits
-    mark = f"joined {JOINED_VERSION} all {limits.max_plausible_speed_mps:g} {limits.pose_topic}"
+    depends_on = f"{limits.max_plausible_speed_mps:g} {limits.pose_topic}"
+    mark = f"joined {JOINED_VERSION} all to {MOST_JOINED} {depends_on}"
     if catalogue.joined(mark, [numbers]) is not None:
         return
     # Not only what is new: `forget` empties the catalogue of all that was joined.
     window = TimeWindow.everything()
     with suppress(EpisodicError):
         drive_in(view, window)
-    for topic, types in timeline.types.items():
-        if any(map(has_events, types)):
-            with suppress(EpisodicError):
-                events_in(view, topic, window)
+    for topic in topics_with_changes(view):
+        with suppress(EpisodicError):
+            events_in(view, topic, window)
     catalogue.store_joined(mark, [numbers], b"-")
 
 

@@ -242,6 +242,22 @@ def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path
     assert catalogue.zone_maps("/odom", [before, after]) == {}
 
 
+def test_compacting_gives_back_what_was_deleted(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    other = KEY._replace(path="rec/rec_1.mcap")
+    assert catalogue.put_all([(KEY, DIGEST), (other, DIGEST)])
+    [number] = catalogue.find([other])
+    assert number is not None
+    assert catalogue.path is not None
+    catalogue.cache_answer("long", [number], random.Random(1).randbytes(200_000).hex())
+    catalogue.compact()
+    before = catalogue.path.stat().st_size
+    catalogue.forget([other.path])
+    catalogue.compact()
+    assert catalogue.path.stat().st_size < before - 100_000
+    assert holds(catalogue)
+
+
 def test_what_entries_add_up_to_is_kept_only_while_all_of_them_are_there(tmp_path: Path) -> None:
     catalogue = catalogue_in(tmp_path)
     keys = [KEY, KEY._replace(path="rec/rec_1.mcap"), KEY._replace(path="rec/rec_2.mcap")]

@@ -12,13 +12,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts import segment_fold
+from ros2_memory.counts.field_numbers import store_shared_ranges
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.view import TimeRange
+from ros2_memory.history.view import TimeRange, View
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
@@ -233,6 +235,9 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
         written = write_history(bags, Random(seed))
         memory = memory_of(bags, clock=FixedClock(max(written.moments) + S))
         known = recalling(memory, bags, part=part)
+        if seed % 2:
+            for topic in ("/odom", "/battery_state"):
+                store_shared_ranges(View(known, Call()), topic, TimeWindow.everything())
         start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
         questions: list[tuple[str, dict[str, object]]] = [
             ("find_matches", {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}),
@@ -250,6 +255,26 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
             plain = asked(memory, bags, name, **given_)
             assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
             assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
+
+
+def test_fields_of_recordings_that_overlap_are_stored_before_they_are_asked_about(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(3):
+        begin = BEGIN + number * 10 * S
+        moves = [odom(begin + at * S, number * 10.0 + at, 0.0) for at in range(13)]
+        write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", moves)
+    plain = memory_of(tmp_path, limits=LATEST)
+    known = recalling(plain, tmp_path)
+
+    def ask(memory: Memory) -> Bins:
+        return count_range(memory, Call(), "/odom", everything(), "day", fields=["position.x"])
+
+    answer = ask(plain)
+    assert store_shared_ranges(View(known, Call()), "/odom", TimeWindow.everything()) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(segment_fold, "READING_S", -1.0)
+        assert ask(known) == answer
 
 
 def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def fill_catalogue(
 
     A bag that changed a few seconds ago is left for a later run.
     """
-    done = 1
+    done, total = 1, 0
     while done:
         progress = backfill.progress()
         waiting = backfill.waiting()[:_BATCH]
@@ -139,8 +139,11 @@ def fill_catalogue(
         for number, bag in enumerate(left, done):
             show(replace(progress, waiting=progress.waiting - number))
             done += backfill.digest(bag)
+        total += done
     backfill.prune()
     backfill.precompute()
+    if total >= _BATCH:
+        backfill.catalogue.compact()
     return backfill.progress()
 
 
