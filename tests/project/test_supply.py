@@ -15,9 +15,12 @@ from tests.project.licences import UnknownLicenceError, closure, permitted, said
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())
 RUNTIME = [Requirement(line) for line in PROJECT["project"]["dependencies"]]
+ELSEWHERE = frozenset({"ray"})
+"""Extras that no environment of development has: a cluster's engine of hundreds of megabytes."""
 EXTRAS = {
     extra: [Requirement(line) for line in lines]
     for extra, lines in PROJECT["project"]["optional-dependencies"].items()
+    if extra not in ELSEWHERE
 }
 PERMISSIVE = frozenset(
     {
