@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bootstrap import build_memory, places_of, shared_parts
+from ros2_memory.bootstrap import build_memory, places_of, query_settings_of, shared_parts
 from ros2_memory.config import NullRecorderNode
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.timebase import WallClock
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
+_LAKE_REFRESH_S: Final = 60.0
+"""How old what is known of a lake may be: at most one commit of a table is made in this time."""
 
 
 def build_fleet(settings: Settings) -> Fleet | None:
@@ -30,6 +32,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
 
     Raises:
         ConfigError: other settings are not those of a fleet, or a robot's places are refused.
+        LakeError: there is to be a lake, and it cannot be opened.
     """
     fleet = settings.fleet
     if not fleet.robots:
@@ -38,6 +41,11 @@ def build_fleet(settings: Settings) -> Fleet | None:
 
     _require_only_reading(settings)
     shared = shared_parts(settings)
+    lake = None
+    if settings.lake.engine != "none":
+        from ros2_memory.bootstrap_lake import open_lake
+
+        lake = open_lake(settings)
     robots = []
     for name, bag_dir in fleet.robots.items():
         own = robot_settings(settings, name)
@@ -46,7 +54,21 @@ def build_fleet(settings: Settings) -> Fleet | None:
             # Here, so that a file that is refused keeps the server from starting.
             places_of(own)
         build = partial(_memory_of, own, shared, has_places=has_places)
-        robots.append(Robot(name, bag_dir, build))
+        source = None
+        if lake is not None:
+            from ros2_memory.lake.memory.robot import LakeRobot
+
+            limits = query_settings_of(own)
+            source = LakeRobot(
+                lake,
+                name,
+                WallClock(),
+                limits if has_places else replace(limits, places=()),
+                shared.extractor,
+                refresh_s=_LAKE_REFRESH_S,
+            )
+        is_mounted = lake is None or bag_dir.is_dir()
+        robots.append(Robot(name, bag_dir, build, lake=source, is_mounted=is_mounted))
     return Fleet(robots, WallClock(), shared_map=fleet.shared_map)
 
 

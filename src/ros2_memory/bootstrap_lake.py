@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import json
+from contextlib import ExitStack
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -21,6 +24,8 @@ if TYPE_CHECKING:
     from ros2_memory.config import Settings
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.lake.files import Lake
     from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import LakeLocation
     from ros2_memory.serving.backfill import Backfill
@@ -85,6 +90,43 @@ def _secrets_of(path: Path) -> dict[str, str]:
             "texts alone"
         )
     return {str(name): str(value) for name, value in found.items()}
+
+
+def open_lake(settings: Settings) -> Lake:
+    """Returns the lake with the engine of the settings, open until this process ends.
+
+    Raises:
+        ConfigError: its place or an extra is missing.
+        LakeError: it cannot be opened.
+    """
+    location = lake_location(settings)
+    from ros2_memory.lake.files import Lake
+
+    opened = ExitStack()
+    atexit.register(opened.close)
+    catalog = opened.enter_context(location.opened())
+    engine = _engine_of(settings)
+    # DuckDB complains at the end about objects that the garbage collector may not look at.
+    opened.callback(gc.unfreeze)
+    opened.callback(engine.close)
+    return Lake(catalog, engine, location.namespace, location.translated)
+
+
+def _engine_of(settings: Settings) -> LakeEngine:
+    wanted = {"duckdb": ("duckdb", "lake"), "ray": ("daft", "ray")}
+    name, extra = wanted.get(settings.lake.engine, wanted["duckdb"])
+    if find_spec(name) is None:
+        raise ConfigError(
+            f"lake.engine: {settings.lake.engine} needs the optional part of this package (no "
+            f"{name}): pip install 'ros2-memory[{extra}]'"
+        )
+    if settings.lake.engine == "ray":
+        from ros2_memory.lake.engines.ray_engine import RayEngine
+
+        return RayEngine()
+    from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+
+    return DuckdbEngine()
 
 
 def build_robots(settings: Settings) -> list[RobotBags]:

@@ -325,9 +325,11 @@ class FleetSettings:
 class LakeSettings:
     """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
 
+    `engine` is what a fleet's server asks it with; `none` for a server that asks no lake.
     Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
     """
 
+    engine: Literal["none", "duckdb", "ray"]
     warehouse: Annotated[Text, AfterValidator(_without_password)] | None
     catalog: Literal["sql", "rest"]
     uri: Annotated[Text, AfterValidator(_without_password)] | None

@@ -86,6 +86,7 @@ class TestDefaults:
             },
             "fleet": {"robots": {}, "places": None, "shared_map": False, "tokens": {}},
             "lake": {
+                "engine": "none",
                 "warehouse": None,
                 "catalog": "sql",
                 "uri": None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Final, cast
 
 from pyiceberg.exceptions import NoSuchTableError
@@ -14,6 +15,7 @@ from ros2_memory.lake.tables import NAMESPACE, TABLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
+    from contextlib import AbstractContextManager
     from datetime import date
 
     import pyarrow as pa
@@ -31,6 +33,10 @@ _MOST_PLANS: Final = 256
 """Plans that stay in memory."""
 
 
+def _as_they_are(_: str) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
 class Lake:
     """The tables of a lake as they are now, and the engine that reads them. Thread-safe.
 
@@ -38,11 +44,17 @@ class Lake:
         catalog: of the tables.
         engine: what runs selects.
         namespace: of the tables in the catalogue.
+        translated: turns the errors of catalogues and stores into those of this program.
     """
 
     def __init__(
-        self, catalog: IcebergCatalog, engine: LakeEngine, namespace: str = NAMESPACE
+        self,
+        catalog: IcebergCatalog,
+        engine: LakeEngine,
+        namespace: str = NAMESPACE,
+        translated: Callable[[str], AbstractContextManager[None]] = _as_they_are,
     ) -> None:
+        self._translated = translated
         self._catalog = catalog
         self._engine = engine
         self._namespace = namespace
@@ -55,7 +67,7 @@ class Lake:
 
         `bags` is committed last, so nothing else changes for those who ask about its rows.
         """
-        with self._lock:
+        with self._lock, self._translated("looking into the lake"):
             self._tables = {}
             table = self._table("bags")
             snapshot = None if table is None else table.current_snapshot()
@@ -78,7 +90,7 @@ class Lake:
         Raises:
             RefusedError: the lake cannot be read.
         """
-        with self._lock:
+        with self._lock, self._translated("looking into the lake"):
             files = {name: self._files(name, robots, days) for name in tables}
         return self._engine.select(sql, files, parameters or {})
 
