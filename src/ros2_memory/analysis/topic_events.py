@@ -156,6 +156,11 @@ def has_events(type_name: str) -> bool:
     return type_name in _MEASURED_WITH_EVENTS or not type_name.startswith(_MEASUREMENT_PACKAGES)
 
 
+def has_errors(type_name: str) -> bool:
+    """Returns whether messages of a type can report errors."""
+    return type_name in _ERROR_LEVELS
+
+
 def state_of(
     value: JsonValue, type_name: str, detections: Sequence[Detection] | None = None
 ) -> State:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.topic_events import has_errors
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import place_at
@@ -243,7 +244,7 @@ def _places(
 def _errors(view: View, window: TimeWindow) -> dict[str, float | None]:
     """Returns how often each error was reported."""
     counts: dict[str, float | None] = {}
-    for found in found_events(view, window).values():
+    for found in found_events(view, window, has_errors).values():
         for error in () if found is None else found.errors:
             counts[error.text] = (counts.get(error.text) or 0.0) + error.reports
     return counts

@@ -40,7 +40,7 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.results import Before, Event, Recap
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.intervals import IntervalTable
@@ -270,13 +270,15 @@ def _in_place(event: Event, places: RobotPlaces) -> Event:
     return replace(event, place=places.place_at(at))
 
 
-def found_events(view: View, window: TimeWindow) -> dict[str, TopicEvents | None]:
-    """Returns the events of each topic that can have some; None where it has no message."""
+def found_events(
+    view: View, window: TimeWindow, can_have: Callable[[str], bool] = has_events
+) -> dict[str, TopicEvents | None]:
+    """Returns the events of each topic whose type can have them; None where it has no message."""
     timeline = view.snapshot.timeline
     return {
         topic: events_in(view, topic, window)
         for topic in timeline.topics()
-        if any(map(has_events, timeline.types_of(topic)))
+        if any(map(can_have, timeline.types_of(topic)))
     }
 
 
