@@ -119,6 +119,7 @@ def retention_limits(settings: Settings) -> RetentionLimits:
         max_age_ns=ns_from_unix(retention.max_age_h * 3600),
         min_free_bytes=round(retention.min_free_gb * GB),
         keeps_foreign=retention.foreign == "keep",
+        require_shipped=retention.require_shipped,
     )
 
 

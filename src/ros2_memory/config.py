@@ -267,6 +267,7 @@ class RetentionSettings:
 
     `max_moments_gb` is the part of the total that saved moments may take, at most half of it.
     `foreign`: whether bags of other programs are left alone, or counted and deleted as its own.
+    `require_shipped`: whether age deletes no bag before `ros2-memory ship` has confirmed it.
     """
 
     max_total_gb: Positive
@@ -274,6 +275,7 @@ class RetentionSettings:
     min_free_gb: Tolerance
     max_moments_gb: Tolerance
     foreign: Literal["keep", "delete"]
+    require_shipped: Flag
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

@@ -54,6 +54,7 @@ def keeper_of(
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
     is_synchronised: Callable[[], bool] = lambda: True,
     keeps_foreign: bool = False,
+    require_shipped: bool = False,
     screening: Screening | None = None,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
@@ -65,7 +66,12 @@ def keeper_of(
         BagDirReader(reader or McapReader()),
         writer or McapWriter(),
         clock or later(),
-        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=keeps_foreign),
+        RetentionLimits(
+            max_bytes,
+            round(max_age_h * HOUR),
+            keeps_foreign=keeps_foreign,
+            require_shipped=require_shipped,
+        ),
         is_synchronised=is_synchronised,
         split_duration_s=10.0,
         moments_bytes=moments_bytes,

@@ -70,6 +70,7 @@ class TestDefaults:
                 "min_free_gb": 1.0,
                 "max_moments_gb": 1.0,
                 "foreign": "keep",
+                "require_shipped": False,
             },
             "server": {
                 "name": "episodic",

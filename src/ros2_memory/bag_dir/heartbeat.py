@@ -73,6 +73,8 @@ class Heartbeat:
         cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.
         held_back: which splits are not served since `recording.exclude_when` could not be applied,
             and why, as a sentence; else None.
+        unshipped: which bags were deleted before they were shipped, where `retention` requires
+            that, since the recorder started, as a sentence; else None.
         waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
     """
 
@@ -94,6 +96,7 @@ class Heartbeat:
     cut_short: tuple[str, ...] = ()
     waiting_for: str | None = None
     held_back: str | None = None
+    unshipped: str | None = None
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.

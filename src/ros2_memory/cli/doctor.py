@@ -416,6 +416,9 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.age_held:
         do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
         yield _warning("recorder", heartbeat.age_held, do)
+    if heartbeat.unshipped:
+        do = "does ros2-memory ship run? raise retention.max_total_gb until it has caught up"
+        yield _warning("recorder", heartbeat.unshipped, do)
     if heartbeat.held_back:
         do = "free the disk, or correct the rule; docs/how-to/forget.md explains each key"
         yield _warning("recorder", heartbeat.held_back, do)

@@ -154,6 +154,10 @@ class Housekeeper:
         """Describes the bags that are kept although their dates make them too old, or None."""
         return None
 
+    def unshipped(self) -> str | None:
+        """Describes the bags that were deleted before they were shipped, as they had to be."""
+        return None
+
     def faults(self) -> Mapping[str, str]:
         """Maps each task that failed in the background, such as `apply`, to the reason."""
         return {}

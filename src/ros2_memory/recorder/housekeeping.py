@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
-from ros2_memory.core.text import counted
+from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.base import Housekeeper
@@ -138,6 +138,7 @@ class Housekeeping(Housekeeper):
         self._over_budget = False
         self._out_of_reach = False
         self._collected = Collected()
+        self._unshipped: tuple[int, Sequence[str]] = (0, ())
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -251,6 +252,17 @@ class Housekeeping(Housekeeper):
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
 
+    def unshipped(self) -> str | None:
+        """Describes the bags that were deleted before they were shipped, as they had to be."""
+        count, newest = self._unshipped
+        if not count:
+            return None
+        bags = counted(count, "bag was", "bags were")
+        return (
+            f"since the recorder started, {bags} deleted unshipped, to make room "
+            f"(retention.max_total_gb, min_free_gb): {listed(newest, count)}"
+        )
+
     def _apply(self, free_bytes_wanted: int | None = None) -> None:
         begun = time.perf_counter_ns()
         self._update_moments()
@@ -270,6 +282,15 @@ class Housekeeping(Housekeeper):
             **wanted,
         )
         self._report_changes(before, collected)
+        if collected.unshipped:
+            lost = self._unshipped[0] + len(collected.unshipped)
+            self._unshipped = lost, collected.unshipped[: -MAX_NAMED - 1 : -1]
+            _log.warning(
+                "unshipped_deleted",
+                bags=len(collected.unshipped),
+                names=[*collected.unshipped],
+                reason=self.unshipped(),
+            )
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
 
@@ -482,6 +503,10 @@ class BackgroundHousekeeper(Housekeeper):
     def age_held(self) -> str | None:
         """Describes the bags that are kept though their dates make them too old, or None."""
         return self._housekeeper.age_held()
+
+    def unshipped(self) -> str | None:
+        """Describes the bags that were deleted before they were shipped, as they had to be."""
+        return self._housekeeper.unshipped()
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""

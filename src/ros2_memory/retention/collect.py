@@ -7,6 +7,7 @@ bag. Meanwhile the next oldest bag is deleted instead; where there is none, the 
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.layout import other_form
+from ros2_memory.bag_dir.state.shipped_file import ReceiptBook
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import free_bytes
@@ -54,6 +56,8 @@ class Collected:
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
         needed: how many of the deleted bags rules may still have needed.
+        unshipped: those of the deleted bags that had to be shipped and were in no lake, relative to
+            the bag directory; without those that are saved in moments.
         most_free: how much of the disk would be free if all bags were deleted that may be, where
             that was too little; then none was deleted for it.
     """
@@ -68,6 +72,7 @@ class Collected:
     fits: bool = True
     held: int = 0
     needed: int = 0
+    unshipped: tuple[str, ...] = ()
     most_free: int | None = None
 
 
@@ -134,6 +139,7 @@ class GarbageCollector:
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
         self._needed = needed
+        self._receipts = ReceiptBook(bag_dir) if limits.require_shipped else None
         self._measure_free = measure_free
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
@@ -159,9 +165,10 @@ class GarbageCollector:
             limits = replace(limits, min_free_bytes=free_bytes_wanted)
         run = _Pass(urgent=free_bytes_wanted is not None)
         needed = self._needed(snapshot)
+        lost: list[str] = []
         while True:
             stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
-            stock = replace(stock, needed=needed)
+            stock = replace(stock, needed=needed, unshipped=self._unshipped(stock))
             if free_bytes_wanted is not None:
                 stock = replace(stock, free_bytes=self._measure_free(self._bag_dir))
             stock = self._with_clocks(stock, limits, run)
@@ -173,6 +180,7 @@ class GarbageCollector:
             if to_delete:
                 saved = {file.inode for file in stock.saved}
                 self._delete_all(to_delete, saved, snapshot, run)
+                lost += sorted(stock.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
             else:
@@ -181,7 +189,20 @@ class GarbageCollector:
                 run.waiting.clear()
         self._remove_emptied(known, run)
         run.result.needed = len(needed & run.deleted)
+        run.result.unshipped = tuple(
+            relative_recording(path, self._bag_dir) for path in lost if Path(path) not in run.saved
+        )
         return run.result
+
+    def _unshipped(self, stock: RetentionStock) -> frozenset[str]:
+        """Returns the bags that are in no lake, where they must be."""
+        if self._receipts is None:
+            return frozenset()
+        root = f"{self._bag_dir}{os.sep}"
+        lacking = self._receipts.lacking(
+            (bag.path.removeprefix(root), bag.size) for bag in stock.bags
+        )
+        return frozenset(root + each for each in lacking)
 
     def _with_clocks(
         self, stock: RetentionStock, limits: RetentionLimits, run: _Pass
@@ -197,7 +218,7 @@ class GarbageCollector:
         if old.by_dates != old.by_recording and run.synchronised is None:
             run.synchronised = self._is_synchronised()
         synchronised = bool(run.synchronised)
-        run.result.held = len(old.held(synchronised=synchronised))
+        run.result.held = len(old.held(synchronised=synchronised) - stock.unshipped)
         return replace(stock, synchronised=synchronised)
 
     def _delete_all(

@@ -4,6 +4,9 @@ Age deletes only by a clock that is known to be right. If the system clock is sy
 count; else the monotonic clock does: a bag is too old when more than `max_age_ns` has been recorded
 after it. A bag that only its dates make too old is held.
 
+Nor does age delete what rules may still need, or, where bags must be shipped, what is in no lake.
+The budget and the disk do, the oldest first as ever.
+
 By dates, age counts from the newest recorded data, not from the wall clock: a robot that was
 switched off does not erase itself when it wakes. Clocks step, so not every date is believed:
 
@@ -44,12 +47,14 @@ class RetentionLimits:
     """The limits of retention: total bytes, maximum age, and minimum free disk space.
 
     `keeps_foreign`: bags that the recorder did not make are never deleted, and do not count.
+    `require_shipped`: age deletes no bag before it is in a lake.
     """
 
     max_total_bytes: int
     max_age_ns: Ns
     min_free_bytes: int = 0
     keeps_foreign: bool = True
+    require_shipped: bool = False
 
 
 class StoredFile(NamedTuple):
@@ -119,6 +124,7 @@ class RetentionStock:
         synchronised: whether the system clock is synchronised.
         foreign_bytes: the size of bags of other programs, which no limit counts.
         needed: bags that rules may still need; no age deletes them.
+        unshipped: bags that must be shipped, and are in no lake; no age deletes them.
     """
 
     bags: Sequence[StoredBag]
@@ -131,6 +137,7 @@ class RetentionStock:
     synchronised: bool = False
     foreign_bytes: int = 0
     needed: frozenset[str] = frozenset()
+    unshipped: frozenset[str] = frozenset()
 
 
 class Ages(NamedTuple):
@@ -183,7 +190,8 @@ def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPl
     total = plan.total
     eras = _eras(stock, limits)
     old = _ages(stock, eras, limits.max_age_ns)
-    aged = (old.by_dates if stock.synchronised else old.by_recording) - stock.needed
+    aged = old.by_dates if stock.synchronised else old.by_recording
+    aged -= stock.needed | stock.unshipped
     if not aged and plan.fits(limits):
         return DeletionPlan((), total, fits=True), plan.free
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)

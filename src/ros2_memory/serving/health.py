@@ -200,6 +200,7 @@ def _catalogue(backfill: Backfill) -> JsonObject:
 
 def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
     error, held, waits = heartbeat.last_error, heartbeat.age_held, heartbeat.waiting_for
+    unshipped = heartbeat.unshipped
     shown: JsonObject = {
         "state": str(heartbeat.state),
         "live": heartbeat.is_live(now),
@@ -208,6 +209,7 @@ def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
         "last_error": None if error is None else _short(error),
         "waiting_for": None if waits is None else _short(waits),
         "age_held": None if held is None else _short(held),
+        "unshipped": None if unshipped is None else _short(unshipped),
     }
     for kind, topics, most in (
         ("silent", heartbeat.silent, _MAX_TOPICS),

@@ -24,7 +24,16 @@ from tests.faults.small_disk import filled, needs_mounts, small_disk
 S = 10**9
 NOW = 1_800_000_000 * S
 NEWER = frozenset(
-    {"restarts", "missing", "age_held", "lost", "cut_short", "waiting_for", "held_back"}
+    {
+        "restarts",
+        "missing",
+        "age_held",
+        "lost",
+        "cut_short",
+        "waiting_for",
+        "held_back",
+        "unshipped",
+    }
 )
 """Keys that older recorders did not write."""
 BEAT = Heartbeat(

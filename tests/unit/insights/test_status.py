@@ -123,6 +123,8 @@ def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -
     told = shown(memory, tmp_path)
     assert told["notes"] == ["72 bags stay"]
     assert told["trust"] == "nothing is known to be missing"
+    beating(tmp_path, RecorderState.RECORDING, 59, unshipped="2 bags were deleted unshipped")
+    assert shown(memory, tmp_path)["notes"] == ["2 bags were deleted unshipped"]
     beating(tmp_path, RecorderState.STOPPED, -100, age_held="72 bags stay")
     assert "notes" not in shown(memory, tmp_path)
 

@@ -10,6 +10,7 @@ import structlog
 import zstandard
 
 from ros2_memory import queries
+from ros2_memory.bag_dir.state.shipped_file import Receipt, append_receipts
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
@@ -53,6 +54,11 @@ def recording(bag_dir: Path, name: str, start: int, splits: int = 3) -> list[Pat
     (bag_dir / name / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
     (bag_dir / name / "handover.json").write_text('{"format": 1}')
     return made
+
+
+def receipt(path: Path, bag_dir: Path, more: int = 0) -> Receipt:
+    name = path.relative_to(bag_dir).as_posix()
+    return Receipt(name, "id", path.stat().st_size + more, "00", "lake", T0)
 
 
 def left_open(path: Path, start: int = 0, count: int = 20) -> Path:
@@ -126,6 +132,35 @@ class TestRetention:
         assert len(events(captured, "age_no_longer_held")) == 1
         keeper.apply()
         assert clock.call_count == 3
+
+    def test_where_bags_must_be_shipped_age_waits_for_the_receipt_of_this_very_bag(
+        self, tmp_path: Path
+    ) -> None:
+        old, young = recording(tmp_path, "a", 0), recording(tmp_path, "b", 3 * 3600)
+        keeper = keeper_of(tmp_path, max_age_h=2, require_shipped=True)
+        keeper.apply()
+        append_receipts(tmp_path, [receipt(old[0], tmp_path), receipt(old[1], tmp_path, more=1)])
+        keeper.apply()
+        assert [each.exists() for each in old] == [False, True, True]
+        append_receipts(tmp_path, [receipt(each, tmp_path) for each in (*old[1:], young[0])])
+        keeper.apply()
+        assert not (tmp_path / "a").exists()
+        assert all(each.exists() for each in young)
+        assert keeper.unshipped() is None
+
+    def test_what_the_budget_deletes_unshipped_is_counted_and_named(self, tmp_path: Path) -> None:
+        old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 3 * 3600)
+        append_receipts(tmp_path, [receipt(old[1], tmp_path)])
+        budget = size_of(tmp_path) - sum(path.stat().st_size for path in old)
+        keeper = keeper_of(tmp_path, max_bytes=budget, max_age_h=2, require_shipped=True)
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply()
+            [lost] = events(captured, "unshipped_deleted")
+            assert (lost["bags"], lost["names"]) == (2, ["a/a_0.mcap", "a/a_2.mcap"])
+            assert lost["reason"] == keeper.unshipped()
+            assert "2 bags were deleted unshipped" in lost["reason"]
+        assert all(each.exists() for each in new)
+        assert BackgroundHousekeeper(keeper).unshipped() == keeper.unshipped()
 
     def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
         self, tmp_path: Path

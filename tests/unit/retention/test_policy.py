@@ -79,6 +79,12 @@ class TestAge:
         deleted = expired(stock(*hourly(172)), LIMITS)
         assert names(deleted) == ["h171", "h170", "h169"]
 
+    def test_what_is_not_shipped_waits_until_the_budget_needs_its_room(self) -> None:
+        held = replace(stock(*hourly(172)), unshipped=frozenset({"rec/h170", "rec/h0"}))
+        assert names(expired(held, LIMITS)) == ["h171", "h169"]
+        small = replace(LIMITS, max_total_bytes=1690)
+        assert names(expired(held, small)) == ["h171", "h170", "h169"]
+
     def test_a_bag_of_exactly_the_limit_stays(self) -> None:
         assert expired(stock(*hourly(169)), LIMITS) == ()
 
@@ -345,6 +351,21 @@ class TestAlways:
     ) -> None:
         turned = replace(held, bags=tuple(reversed(held.bags)))
         assert expired(turned, limits) == expired(held, limits)
+
+    @given(stocks(), all_limits, st.sets(st.integers(0, 20)))
+    def test_what_is_not_shipped_waits_for_the_budget_alone_which_is_held_all_the_same(
+        self, held: RetentionStock, limits: RetentionLimits, numbers: set[int]
+    ) -> None:
+        unshipped = frozenset(each.path for n, each in enumerate(held.bags) if n in numbers)
+        waiting = replace(held, unshipped=unshipped)
+        by_age = expired(waiting, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
+        assert unshipped.isdisjoint(each.path for each in by_age)
+        assert set(by_age) <= set(expired(held, limits))
+        assert plan_deletions(waiting, limits).fits == plan_deletions(held, limits).fits
+        lost = [each for each in expired(waiting, limits) if each not in by_age]
+        if lost:
+            spared = [each for each in lost if each.files != lost[-1].files]
+            assert not fits(without(waiting, [*by_age, *spared]), limits)
 
     @given(stocks(), all_limits)
     def test_after_it_is_applied_nothing_more_is_to_delete(
