@@ -11,10 +11,8 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from difflib import get_close_matches
-from enum import IntEnum
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -27,6 +25,11 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbe
 from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bootstrap import build_recorder, query_settings_of
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
+from ros2_memory.cli.doctor_lake import check_lake, check_shipping
+from ros2_memory.cli.findings import Finding, Level
+from ros2_memory.cli.findings import error as _error
+from ros2_memory.cli.findings import in_order as _ok
+from ros2_memory.cli.findings import warning as _warning
 from ros2_memory.cli.listing.info import assumed_active
 from ros2_memory.cli.options import (
     AsJson,
@@ -74,30 +77,7 @@ _UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 
 
-class Level(IntEnum):
-    """How bad a finding is; its value is the exit code."""
-
-    OK = 0
-    WARNING = 1
-    ERROR = 2
-
-
 _STYLES: Final = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """What was seen of one concern, and what to do about it; nothing where all is in order."""
-
-    level: Level
-    about: str
-    seen: str
-    do: str | None = None
-
-
-_ok = partial(Finding, Level.OK)
-_warning = partial(Finding, Level.WARNING)
-_error = partial(Finding, Level.ERROR)
 
 
 def doctor(
@@ -136,6 +116,8 @@ def _examine(
     if memory is None:
         for name in robots:
             yield from _of_robot(name, robot_settings(settings, name), verbose=verbose)
+        with spinner("asking the lake"):
+            yield from check_lake(settings)
         yield from check_extras(settings)
         yield from check_server(settings)
         return
@@ -152,6 +134,7 @@ def _examine(
         else:
             yield from check_ros(settings, recorder.setup_files, memory.reader, now)
             yield from check_recorder(settings, now)
+            yield from check_shipping(settings, snapshot, now)
             yield from check_topics(settings, snapshot, now)
         yield from check_extras(settings)
         yield from check_server(settings)

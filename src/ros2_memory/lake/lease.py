@@ -58,6 +58,31 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+def holder_of(state_dir: Path) -> str | None:
+    """Returns who holds the lock of a lake; None where nobody does. Writes nothing.
+
+    Raises:
+        LakeError: that cannot be found out.
+    """
+    path = state_dir / LEASE_FILE
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise LakeError(f"{path} cannot be opened: {error.strerror}") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _holder(descriptor)
+    except OSError as error:
+        raise LakeError(f"{path} cannot be locked: {error.strerror}") from error
+    else:
+        return None
+    finally:
+        os.close(descriptor)
+
+
 def _holder(descriptor: int) -> str:
     try:
         value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))

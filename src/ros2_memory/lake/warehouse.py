@@ -17,6 +17,7 @@ from pyiceberg.catalog.rest import RestCatalog
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import LakeError
+from ros2_memory.core.timebase import NS_PER_MS
 from ros2_memory.lake.tables import NAMESPACE, open_tables
 from ros2_memory.lake.written_files import file_properties
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.core.timebase import Ns
 
 CATALOGUE_FILE: Final = "catalogue.sqlite"
 _MOST_CHARS: Final = 500
@@ -95,13 +98,30 @@ class LakeLocation:
             yield rest
             return
         with self.translated("opening the lake's catalogue"):
-            self.state_dir.mkdir(parents=True, exist_ok=True)
             file = self.state_dir.absolute() / CATALOGUE_FILE
+            if self.uri is None:
+                self.state_dir.mkdir(parents=True, exist_ok=True)
             catalog = SqlCatalog("lake", **{**properties, "uri": self.uri or f"sqlite:///{file}"})
         try:
             yield catalog
         finally:
             catalog.close()
+
+    def last_commit(self) -> Ns | None:
+        """Returns when a bag was last committed; None where none was. Makes nothing.
+
+        Raises:
+            LakeError: the lake cannot be read.
+        """
+        is_file = self.catalog == "sql" and self.uri is None
+        if is_file and not (self.state_dir / CATALOGUE_FILE).exists():
+            return None
+        with self.opened() as catalog, self.translated("looking into the lake"):
+            name = f"{self.namespace}.bags"
+            if not catalog.table_exists(name):
+                return None
+            newest = catalog.load_table(name).current_snapshot()
+            return None if newest is None else newest.timestamp_ms * NS_PER_MS
 
     def tables(self, catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
         """Returns tables by name, made where they are missing.

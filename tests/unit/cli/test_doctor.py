@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,8 @@ from mcap.writer import Writer
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.bag_dir.state.shipped_file import Receipt, append_receipts
+from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 
@@ -238,6 +240,26 @@ def test_files_that_metadata_lists_and_are_not_there_are_counted(
     assert wrong["bags"][0]["seen"] == (
         "metadata.yaml of rec lists 12 missing files and 250 messages that no file here contains"
     )
+
+
+def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_newest_receipt(
+    robot: Path, capsys: Capture
+) -> None:
+    old = time.time_ns() - 2 * 3600 * NS_PER_S
+    path = write_mcap(robot / "old" / "old_0.mcap", [odom(old, 0.0, 0.0)])
+    assert "shipping" not in examined(capsys)[1]
+    required = "retention.require_shipped=true"
+    code, wrong = examined(capsys, required)
+    assert (code, len(wrong["shipping"])) == (1, 1)
+    assert "2 of 2 closed bags not shipped" in wrong["shipping"][0]["seen"]
+    assert "no receipt" in wrong["shipping"][0]["seen"]
+    other = Receipt("old/old_1.mcap", "id", 1, "00", "lake", old)
+    append_receipts(robot, [other])
+    seen = examined(capsys, required)[1]["shipping"][0]["seen"]
+    assert seen == f"2 of 2 closed bags not shipped; the newest receipt is from {iso_local(old)}"
+    append_receipts(robot, [replace(other, bag="old/old_0.mcap", size=path.stat().st_size)])
+    # The other one has just been closed.
+    assert examined(capsys, required) == (0, {})
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,6 +90,52 @@ def test_a_second_writer_ends_and_names_the_first(
     assert "process" in capsys.readouterr().err
     with writing_alone(tmp_path / "lake" / ".ros2-memory"):
         pass
+
+
+def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
+    ship: Callable[..., int],
+    fleet: Path,
+    tmp_path: Path,
+    capsys: Capture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shutil.copytree(fleet / "hall", tmp_path / "hall")
+    (tmp_path / "hall" / "recorder.json").touch()  # a recorder has recorded here
+    robots, lake = f"fleet.robots={{hall: {tmp_path}/hall}}", tmp_path / "lake"
+
+    def found(*more: str) -> dict[str, list[str]]:
+        cli.main(["doctor", "--json", robots, f"lake.warehouse={lake}", *more])
+        seen: dict[str, list[str]] = {}
+        for each in json.loads(capsys.readouterr().out)["findings"]:
+            if each["about"] == "lake" or "receipts" in each["seen"]:
+                seen.setdefault(f"{each['about']} {each['level']}", []).append(each["seen"])
+        return seen
+
+    assert "has no bag yet" in found()["lake warning"][0]
+    assert not lake.exists()
+    assert ship(robots) == 0
+    capsys.readouterr()
+    with writing_alone(lake / ".ros2-memory"):
+        told = found()
+    assert [*told] == ["lake ok"]
+    assert "its newest commit is from" in told["lake ok"][0]
+    assert f"process {os.getpid()} on " in told["lake ok"][1]
+    assert found()["lake ok"][1] == "no process writes into it now"
+    can = os.access
+    own = tmp_path / "hall" / ".episodic"
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: own not in Path(path).parents and can(path, mode)
+    )
+    [told_of] = found()["robot warning"]
+    assert "hall: " in told_of
+    assert "can never work" in told_of
+    # What was recorded of its files is in the folder of another machine.
+    shutil.copytree(lake / ".ros2-memory", tmp_path / "state")
+    (tmp_path / "state" / "written.jsonl").unlink()
+    [told_of] = found(f"lake.state_dir={tmp_path}/state")["lake warning"]
+    assert "another machine" in told_of
+    shutil.rmtree(lake / "ros2_memory")
+    assert "looking into the lake failed" in found()["lake error"][0]
 
 
 def test_without_the_extra_it_names_the_extra(
