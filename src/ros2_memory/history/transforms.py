@@ -6,6 +6,7 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
@@ -77,6 +78,9 @@ _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAME
 
 _Connection: TypeAlias = "tuple[tuple[str, str], tuple[str, ...], tuple[str, ...], Session | None]"
 _CONNECTED: Final[WeakKeyDictionary[Timeline, set[_Connection]]] = WeakKeyDictionary()
+_STATIC: Final[
+    WeakKeyDictionary[Timeline, dict[tuple[Session, tuple[str, ...]], Sequence[StampedTransform]]]
+] = WeakKeyDictionary()
 """Frames that are connected by what some topics recorded, static ones first, in a session."""
 
 
@@ -89,12 +93,20 @@ class FoundTransform(NamedTuple):
 
 
 def transform_at(
-    view: View, parent: str, child: str, at: Ns, recording: Path | None = None
+    view: View,
+    parent: str,
+    child: str,
+    at: Ns,
+    recording: Path | None = None,
+    *,
+    explains: bool = True,
 ) -> FoundTransform:
     """Returns the pose of `child` in `parent` at a moment, by tf2's rules.
 
     With the `recording` of a message the transforms of that recording's session are used; else
     those of the session that was recorded then. Where several were, and differ, a note reports it.
+    To learn why there is none takes far longer than to learn that: who drops the reason passes
+    `explains=False`.
 
     Raises:
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
@@ -105,13 +117,15 @@ def transform_at(
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     frames, sessions = (parent, child), sessions_of(view)
     if recording is not None:
-        return _transform_in(view, lending_to(view, recording, frames, at), frames, at)
+        session = lending_to(view, recording, frames, at)
+        return _transform_in(view, session, frames, at, explains=explains)
     recorded = sessions.recorded_at(at)
     answers: list[tuple[Session, FoundTransform]] = []
     failures: list[NoDataError] = []
     for session in (sessions.nearest_to(at) if recorded is None else recorded) or [frozenset()]:
         try:
-            answers.append((session, _transform_in(view, session, frames, at)))
+            found = _transform_in(view, session, frames, at, explains=explains)
+            answers.append((session, found))
         except NoDataError as error:
             failures.append(error)
         if recorded is None and answers:
@@ -153,7 +167,9 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
     return sessions.chosen[key]
 
 
-def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -> FoundTransform:
+def _transform_in(
+    view: View, among: Session, frames: tuple[str, str], at: Ns, *, explains: bool
+) -> FoundTransform:
     """Does as `transform_at`, by the transforms of one session."""
     limits = view.memory.limits
     static = static_at(static_transforms(view, among), at)
@@ -175,6 +191,8 @@ def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -
             return look_up(moving)
         except NoDataError as error:
             raise _stamp_failure(error, at, nothing_near=not moving) from error
+    if not explains:
+        raise failure
     raise _explained(view, failure, frames, at, among, nothing_near=not moving) from failure
 
 
@@ -196,25 +214,33 @@ def _clock(view: View, moving: Sequence[StampedTransform]) -> TfClock:
     return agreeing_clock(moving) if configured == "auto" else configured
 
 
-def static_transforms(view: View, among: Session) -> list[StampedTransform]:
-    """Returns every static transform of a session, in log-time order.
+def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
+    """Returns the static transforms of a session, in log-time order.
 
-    Where each split has the same messages again, they are decoded once.
+    One that is equal to the one before of its child is left out: each split may have all again.
     """
     topics = view.memory.limits.tf_static_topics
+    known = _STATIC.setdefault(view.snapshot.timeline, {})
+    if (among, topics) in known:
+        return known[among, topics]
+    before = view.notes.keys()
     decoded: dict[tuple[Schema, str, bytes], tuple[StampedTransform, ...]] = {}
+    latest: dict[str, StampedTransform] = {}
     found: list[StampedTransform] = []
-    for each in _messages(view, topics, TimeWindow.everything(), among):
-        channel, at = each.record.channel, each.time
-        key = (channel.schema, channel.encoding, each.record.payload)
+    for message in _messages(view, topics, TimeWindow.everything(), among):
+        channel = message.record.channel
+        key = (channel.schema, channel.encoding, message.record.payload)
         if key not in decoded:
-            decoded[key] = _decoded(view, each)
-        found += (
-            StampedTransform(
-                edge.parent, edge.child, edge.stamp, at, edge.transform, static=edge.static
-            )
-            for edge in decoded[key]
-        )
+            decoded[key] = _decoded(view, message)
+        for each in decoded[key]:
+            child = each.child.lstrip("/")
+            last = latest.get(child)
+            if last is None or (last.parent, last.transform) != (each.parent, each.transform):
+                latest[child] = replace(each, log_time=message.time)
+                found.append(latest[child])
+    # What was noted must be noted in each answer.
+    if view.notes.keys() == before and not view.call.used_active:
+        known[among, topics] = found
     return found
 
 
@@ -232,7 +258,7 @@ def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransfo
     return list(newest.values())
 
 
-def static_changes(static: list[StampedTransform]) -> list[Ns]:
+def static_changes(static: Sequence[StampedTransform]) -> list[Ns]:
     """Returns the log times at which a child's static transform differs from the one before."""
     changes: dict[Ns, None] = {}
     latest: dict[str, StampedTransform] = {}

@@ -465,8 +465,9 @@ def _spot(
         if target == thing.frame_id:
             return LabelledPlace(thing.label, thing.place, target)
         try:
+            recording = found.bag.recording
             found_transform = transform_at(
-                view, target, thing.frame_id, found.time, found.bag.recording
+                view, target, thing.frame_id, found.time, recording, explains=False
             )
         except NoDataError:
             continue

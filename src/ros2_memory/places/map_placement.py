@@ -33,6 +33,7 @@ from ros2_memory.history.transforms import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.transform_tree import FrameGraph
@@ -60,7 +61,7 @@ class _SessionTransforms:
             session; None where it moves, or is not known.
     """
 
-    static: list[StampedTransform]
+    static: Sequence[StampedTransform]
     changes: list[Ns]
     fixed: Transform | None
 
@@ -79,7 +80,7 @@ class MapPlacement:
     pose_frame: str
     _window: TimeWindow = field(default_factory=TimeWindow.everything)
     _known: dict[Session, _SessionTransforms] = field(default_factory=dict)
-    _moving: dict[Session, list[StampedTransform]] = field(default_factory=dict)
+    _moving: dict[Session, Sequence[StampedTransform]] = field(default_factory=dict)
     _graphs: dict[tuple[Session, int], FrameGraph] = field(default_factory=dict)
 
     @property

@@ -36,10 +36,10 @@ def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) ->
     if not pose.frame_id:
         return None
     try:
-        found = transform_at(view, frame_id, pose.frame_id, time, recording).transform
+        transform = transform_at(view, frame_id, pose.frame_id, time, recording, explains=False)
     except NoDataError:
         return None
-    turn = pose.orientation
+    found, turn = transform.transform, pose.orientation
     return Pose(
         transform_point(found, pose.position),
         None if turn is None else multiply(found.rotation, turn),

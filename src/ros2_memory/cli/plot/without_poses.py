@@ -91,7 +91,8 @@ def _by_transforms(view: View, window: TimeWindow, frame: str | None) -> FoundPa
     failure: NoDataError | None = None
     for at in np.linspace(window.start, window.stop - 1, _MOST_MOMENTS).astype(np.int64).tolist():
         try:
-            x, y, _ = transform_at(view, parent, body, at).transform.translation
+            explains = failure is None
+            x, y, _ = transform_at(view, parent, body, at, explains=explains).transform.translation
         except NoDataError as error:
             failure = failure or error
             continue

@@ -1,0 +1,126 @@
+"""Transforms of a memory: what is read of its bags for them, and what of that is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory import queries
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS
+from ros2_memory.history.context import Call
+from ros2_memory.history.transforms import sessions_of, static_at, static_transforms
+from ros2_memory.history.view import AtTime, View
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import Msg, detections, tf, transform, write_mcap
+from tests.support.examples import examples
+from tests.support.memories import memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.storage.base import Record
+
+S = 10**9
+T0 = 1_784_000_000 * S
+
+
+class Noting(McapReader):
+    """Notes which bags the messages of a topic were read from."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read: list[tuple[str, str]] = []
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self.read += [(topic, path.name) for topic in topics]
+        return super().records(path, topics, window, newest_first=newest_first)
+
+    def of(self, topic: str) -> set[str]:
+        return {name for each, name in self.read if each == topic}
+
+
+def static(second: int, child: str, x: float) -> Msg:
+    at = T0 + second * S
+    return tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
+
+
+def bag(folder: Path, number: int, messages: Sequence[Msg]) -> None:
+    write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+
+
+@settings(max_examples=examples(30))
+@given(
+    received=st.lists(
+        st.tuples(st.sampled_from(["arm", "/arm", "eye"]), st.integers(0, 2)),
+        min_size=1,
+        max_size=12,
+    ),
+    at=st.integers(-1, 13),
+)
+def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repeated(
+    received: list[tuple[str, int]], at: int
+) -> None:
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for second, (child, x) in enumerate(received):
+            bag(folder, second, [static(second, child, float(x))])
+        view = View(memory_of(folder), Call())
+        [session] = sessions_of(view).recorded_at(T0) or []
+        found = static_at(static_transforms(view, session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
+    expected: dict[str, float] = {}
+    for second, (child, x) in enumerate(received):
+        if second <= at or child.lstrip("/") not in expected:
+            expected[child.lstrip("/")] = float(x)
+    assert {each.child.lstrip("/"): each.transform.translation[0] for each in found} == expected
+
+
+def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) -> None:
+    for second in range(3):
+        bag(tmp_path, second, [static(second, "eye", 1.0)])
+    reader = Noting()
+    memory = memory_of(tmp_path, reader=reader)
+    moment = AtTime(T0 / 1e9 + 2.5)
+
+    def place() -> float:
+        return queries.transform(memory, Call(), "base_link", "eye", moment).transform.translation[
+            0
+        ]
+
+    assert place() == 1.0
+    assert reader.of("/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
+    reader.read.clear()
+    assert place() == 1.0
+    assert reader.of("/tf_static") == set()
+    bag(tmp_path, 3, [static(2, "eye", 2.0)])
+    assert place() == 2.0
+
+
+def test_where_no_transform_leads_to_the_map_a_sighting_reads_those_around_it_alone(
+    tmp_path: Path,
+) -> None:
+    for minute in range(20):
+        at = T0 + minute * 60 * S
+        messages = [tf(at, transform(at, "odom", "other", (1.0, 0.0, 0.0)))]
+        messages += [detections(at, ["cup"])] if minute == 10 else []
+        bag(tmp_path, minute, messages)
+    reader = Noting()
+    answer = find_matches(
+        memory_of(tmp_path, reader=reader), Call(), "/vision/scene/scene_objects", "contains", "cup"
+    )
+    [sighting] = answer.sightings
+    assert sighting.thing is not None
+    assert sighting.thing.frame_id == "base_link"
+    assert reader.of("/tf") == {"rec_10.mcap"}
