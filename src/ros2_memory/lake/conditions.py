@@ -12,6 +12,7 @@ from pyiceberg.expressions import (
     IsNull,
     LessThan,
     LessThanOrEqual,
+    NotIn,
     Or,
 )
 
@@ -32,11 +33,22 @@ _at_most: Final = cast("Predicate", LessThanOrEqual)
 _below: Final = cast("Predicate", LessThan)
 _is_null: Final = cast("Callable[[str], BooleanExpression]", IsNull)
 _one_of: Final = cast("Predicate", In)
+_none_of: Final = cast("Predicate", NotIn)
 
 
 def any_of(conditions: Sequence[BooleanExpression]) -> BooleanExpression:
     """Returns the condition that one of some conditions holds, of which there is at least one."""
     return Or(*conditions) if len(conditions) > 1 else conditions[0]
+
+
+def except_bags(condition: BooleanExpression, ids: Collection[str]) -> BooleanExpression:
+    """Returns a condition without the rows of some bags."""
+    return And(condition, _none_of("bag_id", ids)) if ids else condition
+
+
+def of_topics(condition: BooleanExpression, topics: Collection[str]) -> BooleanExpression:
+    """Returns a condition on rows of some topics alone."""
+    return And(condition, _one_of("topic", topics))
 
 
 def of_day(robot: str, day: date) -> BooleanExpression:
@@ -50,15 +62,17 @@ def of_bags(ids: Mapping[tuple[str, date], Collection[str]]) -> BooleanExpressio
     The bounds of the ids let Iceberg pass over the files of other times.
     """
     return any_of(
-        [
-            And(
-                of_day(robot, day),
-                _at_least("bag_id", min(of_one)),
-                _at_most("bag_id", max(of_one)),
-                _one_of("bag_id", of_one),
-            )
-            for (robot, day), of_one in ids.items()
-        ]
+        [And(of_day(robot, day), of_ids(robot, of_one)) for (robot, day), of_one in ids.items()]
+    )
+
+
+def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
+    """Returns the condition on rows of bags of a robot, of any day."""
+    return And(
+        equal("robot", robot),
+        _at_least("bag_id", min(ids)),
+        _at_most("bag_id", max(ids)),
+        _one_of("bag_id", ids),
     )
 
 

@@ -1,7 +1,8 @@
 """Forgets a time of a robot in a lake: rows, old versions and files.
 
-Each bag that reaches into the time goes as a whole, since what its digests hold cannot be taken
-apart; where its file is still there without the messages, it is shipped again.
+Each bag that reaches into the time goes as a whole, or, where topics are forgotten, that holds some
+of them, since what its digests hold cannot be taken apart; where its file is still there without
+the messages, it is shipped again.
 """
 
 from __future__ import annotations
@@ -10,7 +11,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.lake.conditions import any_of, between, of_bags, overlapping
+from ros2_memory.lake.conditions import (
+    any_of,
+    between,
+    except_bags,
+    of_bags,
+    of_ids,
+    of_topics,
+    overlapping,
+)
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.tombstones import append_tombstone
 from ros2_memory.lake.upkeep import expire
@@ -20,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from datetime import date
 
+    import pyarrow as pa
     from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
@@ -48,21 +58,22 @@ def forget_in_lake(
         LakeError: the lake cannot be read or written.
     """
     with location.translated("forgetting in the lake"):
-        found = (
-            tables["bags"]
-            .refresh()
-            .scan(
-                row_filter=_reaching(tombstone, "start_ns", "end_ns"),
-                selected_fields=("bag_id", "day"),
-            )
-            .to_arrow()
-        )
+        named = _named(tombstone)
+        reaching = named or _reaching(tombstone, "start_ns", "end_ns")
+        found = _bags(tables["bags"], reaching)
+        spared: set[str] = set()
+        if tombstone.topics:
+            # What is in the lake of a bag shows in its digests.
+            holding = _reaching(tombstone, "first_ns", "last_ns")
+            of_these = _bags(tables["digests"], of_topics(holding, tombstone.topics))
+            spared = {*found["bag_id"].to_pylist()} - {*of_these["bag_id"].to_pylist()}
         ids: dict[tuple[str, date], set[str]] = {}
         for bag_id, day in zip(found["bag_id"].to_pylist(), found["day"].to_pylist(), strict=True):
-            ids.setdefault((tombstone.robot, day), set()).add(bag_id)
+            if bag_id not in spared:
+                ids.setdefault((tombstone.robot, day), set()).add(bag_id)
         # `bags` last: until then it tells which rows are to go.
         for name in sorted(TABLES, key=lambda each: each == "bags"):
-            conditions = [_in_window(tombstone, name)]
+            conditions = [named or except_bags(_in_window(tombstone, name), spared)]
             if ids:
                 conditions.append(of_bags(ids))
             table = tables[name]
@@ -80,8 +91,19 @@ def forget_in_lake(
         if each.snapshot_id != table.metadata.current_snapshot_id
     )
     append_tombstone(location.state_dir, tombstone, done=True)
-    log.info("forgotten_in_lake", robot=tombstone.robot, bags=found.num_rows, files=files)
-    return Forgotten(found.num_rows, files, kept_by)
+    gone = found.num_rows - len(spared)
+    log.info("forgotten_in_lake", robot=tombstone.robot, bags=gone, files=files)
+    return Forgotten(gone, files, kept_by)
+
+
+def _bags(table: IcebergTable, condition: BooleanExpression) -> pa.Table:
+    scan = table.refresh().scan(row_filter=condition, selected_fields=("bag_id", "day"))
+    return scan.to_arrow()
+
+
+def _named(tombstone: Tombstone) -> BooleanExpression | None:
+    """Returns the condition on rows of the bags that a tombstone names, if it names any."""
+    return of_ids(tombstone.robot, tombstone.bags) if tombstone.bags else None
 
 
 def _in_window(tombstone: Tombstone, name: str) -> BooleanExpression:

@@ -76,7 +76,12 @@ def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
     file, whether it counts there or in another recording. The id begins with it, so that the files
     of a table that can hold a bag are few: ids of one time lie side by side.
     """
-    name = json.dumps([robot, bag.recording.name, bag.path.name, first])
+    return id_of_file(robot, bag.recording.name, bag.path.name, first)
+
+
+def id_of_file(robot: str, recording: str, file: str, first: Ns) -> str:
+    """Returns the id of a bag that need not be there any more; see `bag_id_of`."""
+    name = json.dumps([robot, recording, file, first])
     digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()
     return f"{max(first, 0):016x}{digest[:16]}"
 

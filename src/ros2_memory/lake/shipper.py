@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import pyarrow as pa
 
-from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, has_recorded, is_carried
+from ros2_memory.bag_dir.layout import (
+    FORGOTTEN_FILE,
+    MOMENTS_FOLDER,
+    has_recorded,
+    is_carried,
+)
+from ros2_memory.bag_dir.state.forgotten_file import read_forgettings
 from ros2_memory.bag_dir.state.shipped_file import (
     Receipt,
     append_receipts,
@@ -25,8 +31,10 @@ from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
 from ros2_memory.lake.conditions import equal, of_bags
+from ros2_memory.lake.forgetting import forget_in_lake
 from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of, sha256_of
 from ros2_memory.lake.tables import TABLES, day_of, to_arrow
+from ros2_memory.lake.tombstones import Tombstone, append_tombstone
 from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.warehouse import quiet_deletes
 
@@ -42,7 +50,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
-    from ros2_memory.lake.tombstones import Tombstone
     from ros2_memory.lake.warehouse import LakeLocation
 
 log = get_logger(__name__)
@@ -99,9 +106,10 @@ class RobotBags:
 
 @dataclass(slots=True)
 class Shipped:
-    """What a pass did: bags that were committed, that wait, and what went wrong."""
+    """What a pass did: bags that were committed, forgotten, that wait, and what went wrong."""
 
     bags: int = 0
+    forgotten: int = 0
     rows: int = 0
     waiting: int = 0
     problems: list[str] = field(default_factory=list)
@@ -164,7 +172,7 @@ class Shipper:
         self._robots = robots
         self._clock = clock
         self._messages = messages
-        self._tombstones = tombstones
+        self._tombstones = set(tombstones)
         self._forbidden: dict[str, bool] = {}
         self._pause = pause
         self._alive = alive
@@ -186,9 +194,10 @@ class Shipper:
             LakeError: the lake cannot be read or written; what is not committed is tried again.
         """
         done = Shipped()
+        robots = [each for each in self._robots if self._forget(each, done)]
         batch: list[_Ready] = []
         rows = 0
-        for robot in self._robots:
+        for robot in robots:
             for ready in self._ready(robot, done):
                 batch.append(ready)
                 rows += sum(map(len, ready.rows.values()))
@@ -198,6 +207,37 @@ class Shipper:
         if batch:
             self._commit(batch, done)
         return done
+
+    def _forget(self, robot: RobotBags, done: Shipped) -> bool:
+        """Forgets what the robot's bag directory asks for; returns whether that is known.
+
+        Raises:
+            LakeError: the lake cannot be written; what is left is done when it is opened again.
+        """
+        try:
+            wanted = [Tombstone.of(robot.name, each) for each in read_forgettings(robot.bag_dir)]
+        except (OSError, ValueError) as error:
+            done.problems.append(
+                f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}; nothing of this robot "
+                "is shipped until it is repaired, since what was forgotten could come back"
+            )
+            return False
+        new = [each for each in wanted if each not in self._tombstones]
+        for each in new:
+            append_tombstone(self._location.state_dir, each, done=False)
+        for each in new:
+            self._alive()
+            gone = forget_in_lake(self._location, self._tables, each, self._clock.now())
+            done.forgotten += gone.bags
+            done.problems += [
+                f"{robot.name}: a branch or tag keeps what was forgotten: {kept}"
+                for kept in gone.kept_by
+            ]
+            self._tombstones.add(each)
+        if new:
+            self._known.clear()
+            self._forbidden.clear()
+        return True
 
     def keep_up(self, grace: Ns) -> None:
         """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
@@ -285,7 +325,7 @@ class Shipper:
         if key not in self._forbidden:
             reader = robot.memory.reader
             self._forbidden[key] = any(
-                each.forbids(reader, robot.name, bag) for each in self._tombstones
+                each.forbids(reader, robot.name, bag, bag_id) for each in self._tombstones
             )
         if self._forbidden[key]:
             done.problems.append(

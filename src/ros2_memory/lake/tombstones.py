@@ -7,17 +7,19 @@ anything is deleted, and again as done when all of it is gone.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import append_durably
 from ros2_memory.bag_dir.json_fields import is_integer
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.lake.rows import id_of_file
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.bag_dir.state.forgotten_file import Forgetting
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader
@@ -27,27 +29,47 @@ TOMBSTONES_FILE: Final = "tombstones.jsonl"
 
 @dataclass(frozen=True, slots=True)
 class Tombstone:
-    """Messages of a robot that were forgotten: those of a window (log times, half-open)."""
+    """Messages of a robot that were forgotten: those of a window (log times, half-open).
+
+    Where there are `topics`, only theirs; where there are `bags`, all of these alone, by their ids.
+    """
 
     robot: str
     start: Ns
     stop: Ns
+    topics: tuple[str, ...] = ()
+    bags: tuple[str, ...] = ()
 
     @property
     def window(self) -> TimeWindow:
         """The window."""
         return TimeWindow(self.start, self.stop)
 
-    def forbids(self, reader: BagReader, robot: str, bag: BagFile) -> bool:
+    @classmethod
+    def of(cls, robot: str, forgetting: Forgetting) -> Tombstone:
+        """Returns what a robot's bag directory asks for."""
+        ids = [id_of_file(robot, *astuple(each)) for each in forgetting.bags]
+        return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
+
+    def forbids(self, reader: BagReader, robot: str, bag: BagFile, bag_id: str) -> bool:
         """Returns whether a bag has a message that was forgotten.
 
         Raises:
             BagError: it cannot be read.
         """
+        if self.bags:
+            return robot == self.robot and bag_id in self.bags
         if robot != self.robot or not self.window.overlaps(bag.start, bag.end):
             return False
-        topics = tuple(each.topic for each in bag.summary.topics)
-        return next(iter(reader.records(bag.path, topics, self.window)), None) is not None
+        topics = tuple(
+            each.topic
+            for each in bag.summary.topics
+            if not self.topics or each.topic in self.topics
+        )
+        return (
+            bool(topics)
+            and next(iter(reader.records(bag.path, topics, self.window)), None) is not None
+        )
 
 
 def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> None:
@@ -83,14 +105,19 @@ def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
         if not line:
             continue
         try:
-            fields: object = json.loads(line)
+            value: object = json.loads(line)
         except ValueError:
-            fields = None
-        match fields:
-            case {"robot": str(robot), "start": start, "stop": stop, "done": bool(done)} if (
-                is_integer(start) and is_integer(stop)
-            ):
-                tombstone = Tombstone(robot, start, stop)
+            value = None
+        match value:
+            case {
+                "robot": str(robot),
+                "start": start,
+                "stop": stop,
+                "done": bool(done),
+                **more,
+            } if is_integer(start) and is_integer(stop):
+                names = [_names(more.get(key, []), path, number) for key in ("topics", "bags")]
+                tombstone = Tombstone(robot, start, stop, *names)
                 found[tombstone] = done or found.get(tombstone, False)
             case _ if number == len(lines) - 1 or _was_cut(line):
                 continue
@@ -100,6 +127,12 @@ def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
                     "repaired, since what was forgotten could come back"
                 )
     return found
+
+
+def _names(value: object, path: Path, line: int) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+        raise LakeError(f"{path}, line {line}: topics and bags must be lists of names")
+    return tuple(value)
 
 
 def _was_cut(line: str) -> bool:

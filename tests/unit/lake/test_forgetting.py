@@ -1,5 +1,6 @@
 """What is forgotten is gone from every byte of the lake, and no late copy brings it back."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.io.pyarrow import PyArrowFileIO
 from pyiceberg.typedef import Record
 
+from ros2_memory import cli
+from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
+from ros2_memory.bag_dir.state.forgotten_file import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.forgetting import Forgotten, forget_in_lake
@@ -23,8 +27,9 @@ from ros2_memory.lake.tombstones import (
 )
 from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.written_files import recorded_files
-from tests.support.bags import detections, text, write_mcap
+from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
+from tests.support.housekeepers import own_all
 from tests.support.lakes import (
     LATER,
     START_S,
@@ -40,9 +45,9 @@ MARKER = "zyxwv-9876"
 DAY_NS = 86_400 * NS_PER_S
 
 
-def secret_bag(bag_dir: Path, number: int = 7) -> Path:
+def secret_bag(bag_dir: Path, number: int = 7, *more: Msg) -> Path:
     first = (START_S + 10 * number) * NS_PER_S
-    messages = [detections(first, [MARKER]), text(first + NS_PER_S, MARKER)]
+    messages = [detections(first, [MARKER]), text(first + NS_PER_S, MARKER), *more]
     return write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
 
 
@@ -111,6 +116,103 @@ def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy
     # Without the messages it comes again.
     write_mcap(kept, [text((START_S + 76) * NS_PER_S, "after")])
     assert ship_with_tombstones(lake, bag_dir).bags == 1
+
+
+@pytest.fixture
+def shipped_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path, Path]:
+    """A robot's bags in a lake, and a late copy of the one with the marker."""
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    write_bag(bag_dir, 0)
+    write_bag(bag_dir, 6)
+    late = tmp_path / "late.mcap"
+    shutil.copy(secret_bag(bag_dir, 7, odom((START_S + 72) * NS_PER_S, 0.0, 0.0)), late)
+    for path in bag_dir.rglob("*.mcap"):
+        os.utime(path, (START_S, START_S))  # nobody writes it any more
+    own_all(bag_dir)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    ship(lake, [robot_bags("hall", bag_dir)])
+    assert files_with(lake, MARKER)
+    return bag_dir, lake, late
+
+
+def forget_on_robot(*more: str) -> int:
+    start = START_S + 70
+    return cli.main(["forget", "--yes", "--start", str(start), "--end", str(start + 5), *more])
+
+
+def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
+    shipped_robot: tuple[Path, Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag_dir, lake, late = shipped_robot
+    assert forget_on_robot() == 0
+    assert "next pass of ros2-memory ship" in capsys.readouterr().out
+    done = ship(lake, [robot_bags("hall", bag_dir)])
+    assert (done.forgotten, done.bags, done.problems) == (1, 0, [])
+    assert files_with(lake, MARKER) == []
+    assert len(lake_column(lake, "bags", "bag_id")) == 2
+    (bag_dir / "rec").mkdir(exist_ok=True)
+    shutil.copy(late, bag_dir / "rec" / "rec_7.mcap")
+    done = ship_with_tombstones(lake, bag_dir)
+    assert (done.forgotten, done.bags, len(done.problems)) == (0, 0, 1)
+    assert files_with(lake, MARKER) == []
+    # A bag of the same time that stayed is another one.
+    write_bag(bag_dir, 8, at_s=START_S + 70)
+    assert ship_with_tombstones(lake, bag_dir).bags == 1
+
+
+def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_comes_again(
+    shipped_robot: tuple[Path, Path, Path],
+) -> None:
+    bag_dir, lake, late = shipped_robot
+    topics = sorted({str(each) for each in lake_column(lake, "sightings", "topic")})
+    assert forget_on_robot("--topic", "/chatter", "--topic", topics[0]) == 0
+    done = ship(lake, [robot_bags("hall", bag_dir)])
+    assert (done.forgotten, done.bags, done.problems) == (1, 1, [])
+    assert len(lake_column(lake, "bags", "bag_id")) == 3
+    assert files_with(lake, MARKER) == []
+    shutil.copy(late, bag_dir / "rec" / "rec_7.mcap")
+    assert any("rec_7" in each for each in ship_with_tombstones(lake, bag_dir).problems)
+    assert files_with(lake, MARKER) == []
+
+
+def test_topics_are_forgotten_only_in_bags_that_hold_them(tmp_path: Path) -> None:
+    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
+    secret_bag(bag_dir)
+    start = (START_S + 70) * NS_PER_S
+    write_mcap(bag_dir / "other" / "other_0.mcap", [text(start, "kept")])
+    ship(lake, [robot_bags("hall", bag_dir)])
+    seen = str(lake_column(lake, "sightings", "topic")[0])
+    assert forget(lake, Tombstone("hall", start, start + NS_PER_S, (seen,))).bags == 1
+    assert files_with(lake, MARKER) == []
+    assert len(lake_column(lake, "bags", "bag_id")) == 1
+    assert len(lake_column(lake, "messages", "value")) == 1
+
+
+def test_where_the_robot_cannot_write_it_down_the_lake_keeps_it_and_the_command_is_named(
+    shipped_robot: tuple[Path, Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag_dir, _, _ = shipped_robot
+    (bag_dir / FORGOTTEN_FILE).mkdir()  # as on a read-only disk
+    assert forget_on_robot() == 1
+    told = capsys.readouterr().out
+    assert f"--forget ROBOT --start {START_S + 70} --end {START_S + 73}`" in told
+
+
+def test_a_list_of_what_was_forgotten_that_cannot_be_read_keeps_its_robot_from_being_shipped(
+    tmp_path: Path,
+) -> None:
+    bag_dir, other = tmp_path / "hall", tmp_path / "kitchen"
+    write_bag(bag_dir, 0)
+    write_bag(other, 0)
+    path = bag_dir / FORGOTTEN_FILE
+    # A crash cut the first line short.
+    path.write_text('{"start": 1, "sto\n{"start": 1, "stop": 2, "topics": ["/a"]}\n')
+    assert read_forgettings(bag_dir) == [Forgetting(1, 2, ("/a",))]
+    path.write_text('{"start": 1, "stop": 2}\n')
+    done = ship(tmp_path / "lake", [robot_bags("hall", bag_dir), robot_bags("kitchen", other)])
+    assert done.bags == 1
+    assert "forgotten.jsonl: line 1" in done.problems[0]
 
 
 def test_killed_while_forgetting_it_is_finished_later(

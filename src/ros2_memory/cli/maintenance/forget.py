@@ -20,15 +20,22 @@ import typer
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
+    FORGOTTEN_FILE,
     LOCK_FILE,
     METADATA_FILE,
     MOMENTS_FOLDER,
+    SHIPPED_FILE,
     is_kept_apart,
     other_form,
 )
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.state.erasure_file import Erasure, read_erasure
+from ros2_memory.bag_dir.state.forgotten_file import (
+    Forgetting,
+    ForgottenBag,
+    append_forgettings,
+)
 from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_reader, catalogue_paths, supposed_own
 from ros2_memory.catalogue.purge import purge
@@ -144,8 +151,8 @@ def forget(
         print_line(f"to be deleted: {_describe(plan)}")
         if not yes:
             typer.confirm("Delete them? This cannot be undone.", abort=True)
-        counts = _message_counts(build_reader(settings), plan.to_delete)
-        kept += _delete(memory, plan, carrier, counts)
+        counts, firsts = _contents(build_reader(settings), plan.to_delete)
+        kept += _delete(memory, plan, carrier, counts, firsts)
     if kept or interrupted:
         raise typer.Exit(EXIT_NEGATIVE)
 
@@ -271,14 +278,17 @@ class _Taking:
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             if recorder is not None and self._recorder is None:
                 raise RecorderError(f"nothing was deleted: {recorder}; forget again")
+            told = _tell_lake(
+                self._bag_dir, [Forgetting(*each, erasure.topics) for each in erasure.windows]
+            )
             result = self._eraser.erase(erasure, survey, self._forget_derived)
         print_line(
             "not all is deleted" if result.kept else f"deleted: {survey.counts.total()} messages"
         )
-        _print_kept(result.kept)
+        _print_kept([*result.kept, *told])
         for note in result.notes:
             print_line(note)
-        return bool(kept or result.kept)
+        return bool(kept or result.kept or told)
 
     def _forget_derived(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
@@ -407,22 +417,33 @@ def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
     return linked
 
 
-def _message_counts(reader: BagReader, bags: Sequence[BagFile]) -> dict[Path, Counter[str]]:
-    """Returns the messages of each topic in each file, also those that do not count in answers.
+def _contents(
+    reader: BagReader, bags: Sequence[BagFile]
+) -> tuple[dict[Path, Counter[str]], dict[Path, Ns]]:
+    """Returns the messages of each topic in each file, and the log time of its first message.
 
-    `metadata.yaml` lists them. A file that cannot be read is left out.
+    Also those that do not count in answers: `metadata.yaml` lists them. A file that cannot be read
+    is left out.
     """
     counts: dict[Path, Counter[str]] = {}
+    firsts: dict[Path, Ns] = {}
     for bag in bags:
         with suppress(BagError):
             in_file = counts.setdefault(bag.path, Counter())
-            for topic in reader.summarize(bag.path).topics:
+            summary = reader.summarize(bag.path)
+            for topic in summary.topics:
                 in_file[topic.topic] += topic.count
-    return counts
+            if not summary.empty:
+                firsts[bag.path] = summary.start
+    return counts, firsts
 
 
 def _delete(
-    memory: Memory, plan: Plan, carrier: Carrier, counts: Mapping[Path, Counter[str]]
+    memory: Memory,
+    plan: Plan,
+    carrier: Carrier,
+    counts: Mapping[Path, Counter[str]],
+    firsts: Mapping[Path, Ns],
 ) -> list[str]:
     """Deletes the planned bags that are still there; returns a line for each that is kept.
 
@@ -450,6 +471,12 @@ def _delete(
                 "forget again"
                 for bag in sorted(latched)
             ]
+        kept += [
+            f"what a lake has of {_name(bag.path, plan.bag_dir)}, which cannot be read"
+            for bag in bags
+            if bag.path not in firsts
+        ]
+        kept += _tell_lake(plan.bag_dir, [*_forgetting_of(bags, firsts)])
         deleted, freed = _delete_files(plan.bag_dir, bags, kept)
         reported_open = read_heartbeat(plan.bag_dir).recordings
         open_recordings = {plan.bag_dir / name for name in reported_open}
@@ -471,6 +498,38 @@ def _delete(
     for note in notes:
         print_line(note)
     return kept
+
+
+def _forgetting_of(bags: Sequence[BagFile], firsts: Mapping[Path, Ns]) -> Iterator[Forgetting]:
+    known = [bag for bag in bags if bag.path in firsts]
+    if known:
+        yield Forgetting(
+            min(min(firsts[bag.path], bag.start) for bag in known),
+            max(bag.end for bag in known) + 1,
+            bags=tuple(
+                ForgottenBag(bag.recording.name, bag.path.name, firsts[bag.path]) for bag in known
+            ),
+        )
+
+
+def _tell_lake(bag_dir: Path, forgettings: Sequence[Forgetting]) -> list[str]:
+    """Writes down what a lake has to forget; returns a line for what it keeps."""
+    if not forgettings:
+        return []
+    try:
+        append_forgettings(bag_dir, forgettings)
+    except OSError as error:
+        first = min(each.start for each in forgettings) // NS_PER_S
+        last = -(-max(each.stop for each in forgettings) // NS_PER_S)
+        line = (
+            f"what a lake has of it: {bag_dir / FORGOTTEN_FILE} cannot be written "
+            f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "
+            f"--forget ROBOT --start {first} --end {last}` where that is done"
+        )
+        return [line]
+    if (bag_dir / SHIPPED_FILE).exists():
+        print_line("the next pass of ros2-memory ship deletes it from the lake, too")
+    return []
 
 
 def _recorder_of(bag_dir: Path) -> str | None:

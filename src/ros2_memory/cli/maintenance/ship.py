@@ -89,6 +89,7 @@ def ship(
                 {
                     "bags": done.bags,
                     "rows": done.rows,
+                    "forgotten": done.forgotten,
                     "waiting": done.waiting,
                     "problems": done.problems,
                 }
@@ -98,6 +99,8 @@ def ship(
         rows = counted(done.rows, "row")
         waiting = f"; {counted(done.waiting, 'bag waits', 'bags wait')}" if done.waiting else ""
         print_line(f"shipped {counted(done.bags, 'bag')} ({rows}){waiting}")
+        if done.forgotten:
+            print_line(f"forgotten as on the robot: {counted(done.forgotten, 'bag')}")
         for problem in done.problems:
             print(f"note: {problem}", file=sys.stderr)
     if done.waiting or done.problems:
