@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
-_LAKE_REFRESH_S: Final = 60.0
+LAKE_REFRESH_S: Final = 60.0
 """How old what is known of a lake may be: at most one commit of a table is made in this time."""
 
 
@@ -65,7 +65,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
                 WallClock(),
                 limits if has_places else replace(limits, places=()),
                 shared.extractor,
-                refresh_s=_LAKE_REFRESH_S,
+                refresh_s=LAKE_REFRESH_S,
             )
         is_mounted = lake is None or bag_dir.is_dir()
         robots.append(Robot(name, bag_dir, build, lake=source, is_mounted=is_mounted))

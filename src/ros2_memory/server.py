@@ -258,16 +258,11 @@ async def _in_background(
 async def _fleet_in_background(
     robots: Mapping[Robot, Backfill], every_s: float, overrides: Sequence[str]
 ) -> None:
-    """Keeps the indexes fresh and the catalogues full, until it is cancelled.
-
-    A disk that hangs keeps the scans of its own robot waiting alone.
-    """
+    """Keeps the indexes fresh and the catalogues full, until it is cancelled."""
     import anyio
 
     from ros2_memory.serving.backfill import Filler, keep_all_backfilled
-    from ros2_memory.serving.health import keep_fresh
 
-    limiter = anyio.CapacityLimiter(len(robots))
     fillers = [
         (
             each.memory(),
@@ -276,9 +271,27 @@ async def _fleet_in_background(
         for each, backfill in robots.items()
     ]
     async with anyio.create_task_group() as tasks:
-        for memory, _ in fillers:
-            tasks.start_soon(keep_fresh, memory, every_s, limiter)
+        tasks.start_soon(keep_fleet_fresh, [*robots], every_s)
         tasks.start_soon(keep_all_backfilled, fillers, every_s)
+
+
+async def keep_fleet_fresh(robots: Sequence[Robot], every_s: float) -> None:
+    """Looks for new bags of each robot, and for what was shipped of it, until it is cancelled.
+
+    A disk that hangs keeps the scans of its own robot waiting alone.
+    """
+    import anyio
+
+    from ros2_memory.bootstrap_fleet import LAKE_REFRESH_S
+    from ros2_memory.serving.health import keep_fresh
+
+    limiter = anyio.CapacityLimiter(2 * len(robots))
+    async with anyio.create_task_group() as tasks:
+        for each in robots:
+            tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
+            if (shipped := each.lake_memory) is not None:
+                # Sooner than a question would have to look itself.
+                tasks.start_soon(keep_fresh, shipped, LAKE_REFRESH_S / 2, limiter)
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:

@@ -100,6 +100,11 @@ class Robot:
                 self._memory = self._build()
             return self._memory
 
+    @property
+    def lake_memory(self) -> Memory | None:
+        """Its memory over what was shipped to a lake; None without one."""
+        return None if self._lake_source is None else self._lake_source.memory
+
     def asked(self, ask: Callable[[Memory], T], *, lake: bool) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to tell with it where that is a lake's.
 

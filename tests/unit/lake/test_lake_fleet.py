@@ -6,11 +6,13 @@ import importlib.util
 import shutil
 from pathlib import Path
 
+import anyio
 import pytest
 
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.server import keep_fleet_fresh
 from tests.support.fleets import SEEN
 from tests.support.lakes import robot_bags, ship, write_bag
 from tests.unit.lake.test_questions import reply
@@ -40,6 +42,26 @@ def test_a_robot_whose_bags_are_gone_is_answered_from_the_lake(tmp_path: Path) -
     assert found["notes"][-1].startswith("from the lake, which has what was shipped: ")
     assert fleet.robots["attic"].is_mounted
     assert not fleet.robots["hall"].is_mounted
+
+
+async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: Path) -> None:
+    for name in ("hall", "attic"):
+        write_bag(tmp_path / name, 0)
+    ship(tmp_path / "lake", [robot_bags(name, tmp_path / name) for name in ("hall", "attic")])
+    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert fleet is not None
+    robots = [*fleet.robots.values()]
+    indexes = [each.lake_memory.index for each in robots if each.lake_memory is not None]
+    assert [each.published for each in indexes] == [None, None]
+    with anyio.fail_after(60):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_fleet_fresh, robots, 1.0)
+            while any(each.published is None for each in indexes):
+                await anyio.sleep(0.01)
+            tasks.cancel_scope.cancel()
+    assert [each.published.latest for each in indexes if each.published] == [
+        each.memory().index.snapshot().latest for each in robots
+    ]
 
 
 def test_an_engine_that_is_not_installed_is_named_with_its_extra(
