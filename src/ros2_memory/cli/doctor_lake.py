@@ -112,7 +112,7 @@ def _check_writer(location: LakeLocation, *, has_bags: bool) -> Iterator[Finding
 
 
 def _check_receipts(name: str, bag_dir: Path) -> Iterator[Finding]:
-    """Checks whether a robot's recorder can be told what was shipped."""
+    """Checks whether receipts can be written for a robot's recorder."""
     if not has_recorded(bag_dir):
         return
     own, file = bag_dir / OWN_FOLDER, bag_dir / SHIPPED_FILE

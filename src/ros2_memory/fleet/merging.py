@@ -43,7 +43,7 @@ class RobotReply:
         value: its reply, as a server of this robot alone would send it, before it is shortened.
         latest: the log time of its newest data; None where there is none.
         is_ahead: whether that lies in the future, so that its times say little beside others'.
-        lake: what to tell where the answer is from a lake.
+        lake: what the reply has to report if the answer is from a lake.
     """
 
     name: str

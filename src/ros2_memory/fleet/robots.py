@@ -34,7 +34,7 @@ class StoppedClock(Clock):
 
 
 class FromLake(NamedTuple):
-    """What an answer from a lake is to be told with.
+    """What a reply has to report of an answer from a lake.
 
     Attributes:
         latest: the log time of the newest message that was shipped; None where there is none.
@@ -57,7 +57,7 @@ class LakeSource(Protocol):
         """The log time of the newest message that was shipped; None where there is none."""
 
     def notes(self) -> Iterable[str]:
-        """Returns what the answer that this thread has just computed is to be told with."""
+        """Returns the notes for the answer that this thread has just computed."""
 
 
 class Robot:
@@ -106,7 +106,7 @@ class Robot:
         return None if self._lake_source is None else self._lake_source.memory
 
     def asked(self, ask: Callable[[Memory], T], *, lake: bool) -> tuple[T, FromLake | None]:
-        """Returns what `ask` finds in a memory, and what to tell with it where that is a lake's.
+        """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
         With `lake` that is the memory of the lake, where there is one; the mounted one answers what
         needs messages that the lake does not hold.

@@ -147,8 +147,8 @@ class _FleetQuestions:
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
             raise found
-        answer, told = found
-        notes = () if told is None else (*shipped_to({robot.name: told.latest}), *told.notes)
+        answer, lake = found
+        notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
         return OfRobot(robot.name, robot.bag_dir, answer, notes)
 
     @property
@@ -196,8 +196,8 @@ class _FleetQuestions:
         def ask(memory: Memory) -> RobotReply:
             return self._replied(question, replace(memory, clock=now), page, robot, call)
 
-        reply, told = robot.asked(ask, lake=self._is_of_lake)
-        return replace(reply, lake=told)
+        reply, lake = robot.asked(ask, lake=self._is_of_lake)
+        return replace(reply, lake=lake)
 
     def _replied(
         self, question: Question, memory: Memory, page: Page, robot: Robot, call: Call

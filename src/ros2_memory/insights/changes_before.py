@@ -135,7 +135,7 @@ def is_routine(change: PastChange) -> bool:
 
 
 def topics_with_changes(view: View) -> list[str]:
-    """Returns the topics whose events tell what changed: those with events, and the commands."""
+    """Returns the topics whose events show changes: those with events, and the commands."""
     timeline, commands = view.snapshot.timeline, _commands(view)
     return [
         topic

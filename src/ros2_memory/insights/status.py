@@ -46,7 +46,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     now = memory.now(wall, latest)
     live = heartbeat is not None and heartbeat.is_live(wall)
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
-    told = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
+    notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)
@@ -77,7 +77,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         ),
         notes=(
             *view.notes.sentences(),
-            *filter(None, told),
+            *filter(None, notes),
             *describe_mixed(memory, call),
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
         ),

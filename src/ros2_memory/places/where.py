@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.places.robot_tracks import Inside
 
-PLACES_SETTING: Final = "data.places_file (of the robots of a fleet: fleet.places)"
+PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""
 _EXPECTED: Final = (
     "give the name of a place, "

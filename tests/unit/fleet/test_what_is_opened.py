@@ -16,59 +16,15 @@ from ros2_memory.core.timebase import WallClock
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.fleets import LENGTH_S, seeded, write_robot
+from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Channel, Record
-
 NAMES = ("r1", "r2", "r3")
-
-
-class Noting(McapReader):
-    """Notes the bags of which it is asked anything."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.opened: set[str] = set()
-
-    def _note(self, path: Path) -> None:
-        self.opened.add("/".join(path.parts[-3:]))
-
-    def summarize(self, path: Path) -> BagSummary:
-        self._note(path)
-        return super().summarize(path)
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        self._note(path)
-        return super().records(path, topics, window, newest_first=newest_first)
-
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        self._note(path)
-        return super().newest(path, topic, window)
-
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        self._note(path)
-        return super().log_times(path, topic, window)
-
-    def channels(self, path: Path) -> Sequence[Channel]:
-        self._note(path)
-        return super().channels(path)
 
 
 @pytest.mark.parametrize("label", ["mug", "elephant"])
@@ -88,7 +44,7 @@ def test_only_the_bag_of_the_newest_sight_is_opened(
         fill_catalogue(build_backfill(own, memory))
         assert memory.recall is not None
         memory.recall.catalogue.close()
-    reader = Noting()
+    reader = NotingReader()
     noted = shared._replace(reader=reader)
     fleet = Fleet(
         [
@@ -110,4 +66,4 @@ def test_only_the_bag_of_the_newest_sight_is_opened(
         if times:
             expected.add(f"{robot.name}/rec/rec_{times[-1] // (LENGTH_S // 2)}.mcap")
     assert len(found["matches"]) == len(expected)
-    assert reader.opened == expected
+    assert {"/".join(path.parts[-3:]) for path, _ in reader.asked} == expected

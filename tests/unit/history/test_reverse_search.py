@@ -16,47 +16,21 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.memories import memory_of, recalling
+from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
     from ros2_memory.results import Match
-    from ros2_memory.storage.base import Record
 
 T0_S = 1_700_000_000
 T0 = T0_S * NS_PER_S
 SCENE = "/vision/scene/scene_objects"
-
-
-class Counting(McapReader):
-    """Notes which bags' messages were read."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.read: list[str] = []
-
-    def summarize(self, path: Path) -> BagSummary:
-        self.read.append(path.name)
-        return super().summarize(path)
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        self.read.append(path.name)
-        return super().records(path, topics, window, newest_first=newest_first)
 
 
 def seen(number: int, *labels: str, x: float = 0.0) -> list[Msg]:
@@ -76,10 +50,10 @@ def bag_dir(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def filled(bag_dir: Path) -> tuple[Memory, Counting]:
-    reader = Counting()
+def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
+    reader = NotingReader()
     memory = recalling(memory_of(bag_dir, reader=reader), bag_dir)
-    reader.read.clear()
+    reader.asked.clear()
     return memory, reader
 
 
@@ -105,13 +79,13 @@ def at(match: Match) -> int:
 def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     assert at(last(memory, "contains", "scissors")) == 1
-    assert reader.read == ["rec_0.mcap"]
+    assert reader.names == ["rec_0.mcap"]
 
 
 def test_the_newest_of_many_matches_is_found_first(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     assert at(last(memory, "contains", "cup")) == 41
-    assert reader.read == ["rec_4.mcap"]
+    assert reader.names == ["rec_4.mcap"]
 
 
 @pytest.mark.parametrize(
@@ -127,19 +101,19 @@ def test_what_never_was_is_answered_without_reading_a_bag(
 ) -> None:
     memory, reader = filled(bag_dir)
     assert last(memory, condition_type, value, topic=topic).found is None
-    assert reader.read == []
+    assert reader.names == []
 
 
 def test_a_place_never_visited_is_looked_up_in_no_bag_but_the_newest(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     assert last(memory, "near_position", {"x": 500.0, "y": 0.0}, topic="/odom").found is None
-    assert set(reader.read) == {"rec_4.mcap"}
+    assert set(reader.names) == {"rec_4.mcap"}
 
 
 def test_a_place_is_looked_for_only_where_it_may_be(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     assert at(last(memory, "near_position", {"x": 20.0, "y": 0.0}, topic="/odom")) == 20
-    assert reader.read == ["rec_2.mcap"]
+    assert reader.names == ["rec_2.mcap"]
 
 
 def test_what_is_known_of_all_bags_is_reported_without_reading_one(bag_dir: Path) -> None:
@@ -149,7 +123,7 @@ def test_what_is_known_of_all_bags_is_reported_without_reading_one(bag_dir: Path
     queries.trajectory_summary(
         memory, Call(), TimeRange(start_s=T0_S - 1, end_s=T0_S + 100), topic="/odom"
     )
-    assert reader.read == []
+    assert reader.names == []
 
 
 # Before, and the deadline
@@ -206,25 +180,6 @@ def test_a_catalogue_that_is_gone_in_the_middle_changes_no_answer(bag_dir: Path)
         )
 
 
-class Topical(McapReader):
-    """Counts of how many topics messages were asked for, over all reads."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.asked = 0
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        self.asked += len(topics)
-        return super().records(path, topics, window, newest_first=newest_first)
-
-
 @pytest.mark.parametrize("tool", ["find_last_match", "find_matches"])
 def test_a_search_of_many_short_topics_reads_each_where_it_has_messages(
     tmp_path: Path, tool: str
@@ -234,10 +189,10 @@ def test_a_search_of_many_short_topics_reads_each_where_it_has_messages(
         tmp_path / "bag.mcap",
         [boolean(T0 + nth * NS_PER_S, True, topic=f"/door_{nth:02}") for nth in range(count)],
     )
-    reader = Topical()
+    reader = NotingReader()
     memory = memory_of(tmp_path, reader=reader)
     if tool == "find_last_match":
         assert queries.find_last_match(memory, Call(), "/*", "equals", False).found is None
     else:
         assert not find_matches(memory, Call(), "/*", "equals", False).sightings
-    assert reader.asked <= 2 * count
+    assert sum(len(topics) for _, topics in reader.asked) <= 2 * count

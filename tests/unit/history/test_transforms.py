@@ -15,41 +15,20 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import sessions_of, static_at, static_transforms
 from ros2_memory.history.view import AtTime, View
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of
+from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
-
-    from ros2_memory.core.model import TimeWindow
-    from ros2_memory.storage.base import Record
+    from collections.abc import Sequence
 
 S = 10**9
 T0 = 1_784_000_000 * S
 
 
-class Noting(McapReader):
-    """Notes which bags the messages of a topic were read from."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.read: list[tuple[str, str]] = []
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        self.read += [(topic, path.name) for topic in topics]
-        return super().records(path, topics, window, newest_first=newest_first)
-
-    def of(self, topic: str) -> set[str]:
-        return {name for each, name in self.read if each == topic}
+def asked(reader: NotingReader, topic: str) -> set[str]:
+    return {path.name for path, topics in reader.asked if topic in topics}
 
 
 def static(second: int, child: str, x: float) -> Msg:
@@ -90,7 +69,7 @@ def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repe
 def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) -> None:
     for second in range(3):
         bag(tmp_path, second, [static(second, "eye", 1.0)])
-    reader = Noting()
+    reader = NotingReader()
     memory = memory_of(tmp_path, reader=reader)
     moment = AtTime(T0 / 1e9 + 2.5)
 
@@ -100,10 +79,10 @@ def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) ->
         ]
 
     assert place() == 1.0
-    assert reader.of("/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
-    reader.read.clear()
+    assert asked(reader, "/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
+    reader.asked.clear()
     assert place() == 1.0
-    assert reader.of("/tf_static") == set()
+    assert asked(reader, "/tf_static") == set()
     bag(tmp_path, 3, [static(2, "eye", 2.0)])
     assert place() == 2.0
 
@@ -116,11 +95,11 @@ def test_where_no_transform_leads_to_the_map_a_sighting_reads_those_around_it_al
         messages = [tf(at, transform(at, "odom", "other", (1.0, 0.0, 0.0)))]
         messages += [detections(at, ["cup"])] if minute == 10 else []
         bag(tmp_path, minute, messages)
-    reader = Noting()
+    reader = NotingReader()
     answer = find_matches(
         memory_of(tmp_path, reader=reader), Call(), "/vision/scene/scene_objects", "contains", "cup"
     )
     [sighting] = answer.sightings
     assert sighting.thing is not None
     assert sighting.thing.frame_id == "base_link"
-    assert reader.of("/tf") == {"rec_10.mcap"}
+    assert asked(reader, "/tf") == {"rec_10.mcap"}

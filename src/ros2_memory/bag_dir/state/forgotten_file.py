@@ -1,8 +1,8 @@
 """`.episodic/forgotten.jsonl`: what `ros2-memory forget` deleted, for the lake that may have it.
 
 A line is written before each deletion. `ros2-memory ship` deletes the same from the lake before it
-ships anything, and remembers there what it did: nothing is ever taken off this list. A line that a
-crash cut short is ignored, since nothing was deleted after it.
+ships anything, and stores there what it did: lines of this file are never removed. A line that a
+crash cut short is ignored, since nothing was deleted for it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from pydantic import TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import append_durably, open_plain
-from ros2_memory.bag_dir.json_fields import Int64, validated
+from ros2_memory.bag_dir.json_fields import Int64, json_object, validated
 from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: a line is no such thing: what was deleted is unknown.
+        ValueError: a line is damaged: what was deleted is unknown.
     """
     try:
         with open_plain(bag_dir / FORGOTTEN_FILE) as stream:
@@ -75,13 +75,12 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
     found: dict[Forgetting, None] = {}
     for number, line in enumerate(lines, 1):
         try:
-            value: object = json.loads(line)
-        except (ValueError, RecursionError):
-            continue
-        if not isinstance(value, dict):
-            raise ValueError(f"line {number}: it is not a JSON object")  # noqa: TRY004 - as above
-        try:
-            forgetting = validated(_FORGETTING, value)
+            forgetting = validated(_FORGETTING, json_object(line))
+        except (json.JSONDecodeError, RecursionError) as error:
+            # A whole line ends with the list of bags; of one that was cut, nothing was deleted.
+            if not line or (line.startswith("{") and not line.endswith("]}")):
+                continue
+            raise ValueError(f"line {number}: it is damaged: {error}") from error
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from error
         if not (forgetting.topics or forgetting.bags):

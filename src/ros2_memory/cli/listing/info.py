@@ -147,15 +147,15 @@ def info(
     settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY, "server.tools=all"], recording)
     robots = settings.fleet.robots
     if not robots:
-        told = _told(settings, verbose=verbose)
+        report = _report(settings, verbose=verbose)
         if as_json:
-            print_line(json.dumps(told.as_json()))
+            print_line(json.dumps(report.as_json()))
         else:
-            told.show()
-        are_bags = told.are_bags
+            report.show()
+        are_bags = report.are_bags
     else:
         every = {
-            name: _told(robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING)
+            name: _report(robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING)
             for name in robots
         }
         if as_json:
@@ -169,8 +169,8 @@ def info(
         raise typer.Exit(EXIT_NEGATIVE)
 
 
-class _Told(NamedTuple):
-    """What is told of one bag directory.
+class _Report(NamedTuple):
+    """What is recorded in one bag directory.
 
     Attributes:
         empty: the sentence where it has no files.
@@ -203,7 +203,7 @@ class _Told(NamedTuple):
                 print_reply(console, {name: rows})
 
 
-def _told(settings: Settings, *, verbose: bool, setting: str | None = None) -> _Told:
+def _report(settings: Settings, *, verbose: bool, setting: str | None = None) -> _Report:
     memory = open_memory(settings, verbose=verbose, setting=setting)
     dispatcher = build_dispatcher(settings, memory)
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
@@ -233,7 +233,7 @@ def _told(settings: Settings, *, verbose: bool, setting: str | None = None) -> _
     if not _has_files(snapshot):
         empty = f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}"
     by_tool = dict(zip(tools, replies, strict=True))
-    return _Told(empty, bool(snapshot.bags), _held(snapshot), by_tool, lists)
+    return _Report(empty, bool(snapshot.bags), _held(snapshot), by_tool, lists)
 
 
 def _held(snapshot: Snapshot) -> dict[str, JsonValue]:

@@ -278,17 +278,17 @@ class _Taking:
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             if recorder is not None and self._recorder is None:
                 raise RecorderError(f"nothing was deleted: {recorder}; forget again")
-            told = _tell_lake(
+            kept_by_lake = _request_of_lake(
                 self._bag_dir, [Forgetting(*each, erasure.topics) for each in erasure.windows]
             )
             result = self._eraser.erase(erasure, survey, self._forget_derived)
         print_line(
             "not all is deleted" if result.kept else f"deleted: {survey.counts.total()} messages"
         )
-        _print_kept([*result.kept, *told])
+        _print_kept([*result.kept, *kept_by_lake])
         for note in result.notes:
             print_line(note)
-        return bool(kept or result.kept or told)
+        return bool(kept or result.kept or kept_by_lake)
 
     def _forget_derived(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
@@ -476,7 +476,7 @@ def _delete(
             for bag in bags
             if bag.path not in firsts
         ]
-        kept += _tell_lake(plan.bag_dir, [*_forgetting_of(bags, firsts)])
+        kept += _request_of_lake(plan.bag_dir, [*_forgetting_of(bags, firsts)])
         deleted, freed = _delete_files(plan.bag_dir, bags, kept)
         reported_open = read_heartbeat(plan.bag_dir).recordings
         open_recordings = {plan.bag_dir / name for name in reported_open}
@@ -512,8 +512,8 @@ def _forgetting_of(bags: Sequence[BagFile], firsts: Mapping[Path, Ns]) -> Iterat
         )
 
 
-def _tell_lake(bag_dir: Path, forgettings: Sequence[Forgetting]) -> list[str]:
-    """Writes down what a lake has to forget; returns a line for what it keeps."""
+def _request_of_lake(bag_dir: Path, forgettings: Sequence[Forgetting]) -> list[str]:
+    """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
     if not forgettings:
         return []
     try:

@@ -1,4 +1,4 @@
-"""One robot of a lake: its memory, and what answers from it are to be told with."""
+"""One robot of a lake: its memory, and the notes that answers from it get."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class LakeRobot:
         return None if known is None else known.latest
 
     def notes(self) -> Iterator[str]:
-        """Yields what the answer that this thread has just computed is to be told with."""
+        """Yields the notes for the answer that this thread has just computed."""
         if self._index.since is not None:
             yield f"the lake has days before {self._index.since}, which were not looked at"
         yield from self._reader.take_notes()

@@ -1,0 +1,60 @@
+"""A reader of MCAP bags that notes what it was asked."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory.storage.mcap_reader import McapReader
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import Channel, Record
+
+
+class NotingReader(McapReader):
+    """Notes which bags were asked for what, in order.
+
+    Attributes:
+        asked: a bag and the topics of messages or log times; none for a summary or its channels.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[tuple[Path, tuple[str, ...]]] = []
+
+    @property
+    def names(self) -> list[str]:
+        """The files of these bags."""
+        return [path.name for path, _ in self.asked]
+
+    def summarize(self, path: Path) -> BagSummary:
+        self.asked.append((path, ()))
+        return super().summarize(path)
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        self.asked.append((path, ()))
+        return super().channels(path)
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self.asked.append((path, tuple(topics)))
+        return super().records(path, topics, window, newest_first=newest_first)
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        self.asked.append((path, (topic,)))
+        return super().newest(path, topic, window)
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        self.asked.append((path, (topic,)))
+        return super().log_times(path, topic, window)
