@@ -9,8 +9,10 @@ import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import yaml
@@ -21,6 +23,7 @@ from tests.support.live_recorder import LiveRecorder, Machine, machine
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import end, ros_environment, wait_for
+from tests.timing import Watch, driven
 
 TOPICS = ("/odom", "/scan", "/watched")
 STALLS_S = (0.2, 0.3, 0.5, 1.0)
@@ -72,12 +75,38 @@ def overrides(recorder: LiveRecorder) -> dict[str, dict[str, object]]:
     return found
 
 
+class Stalled(NamedTuple):
+    """A recorder that was stalled after a rotation had given it deep queues."""
+
+    watch: Watch
+    profiles: Mapping[str, Mapping[str, object]]
+    received: Mapping[str, list[int]]
+    """The numbers that it recorded of each topic since that rotation."""
+
+
 def test_a_stalled_recorder_loses_nothing_once_its_queues_are_deep(site: Machine) -> None:
     """Reliable, best effort and with a deadline: one rotation after the first closed split."""
+    stalled = driven(partial(_stalled, site), _lost_nothing)
+    assert {topic: each["reliability"] for topic, each in stalled.profiles.items()} == {
+        "/odom": "reliable",
+        "/scan": "best_effort",
+        "/watched": "reliable",
+        "/tf_static": "reliable",
+    }
+    assert int(str(stalled.profiles["/odom"]["depth"])) >= 200
+    # A deadline that is asked for refuses every publisher without one.
+    assert "deadline" not in stalled.profiles["/watched"]
+    with stalled.watch.excusing():
+        _lost_nothing(stalled)
+
+
+def _stalled(site: Machine, watch: Watch) -> Stalled:
     robot = ("/odom:100:reliable", "/scan:50:best_effort", "/watched:20:reliable:deadline")
     with publishing(site.env, *robot):
         recorder = site.record(
-            "deep", "recording.split_duration_s=1", topics=(*TOPICS, "/tf_static")
+            f"deep{len(site.recorders)}",
+            "recording.split_duration_s=1",
+            topics=(*TOPICS, "/tf_static"),
         )
         [deepened] = recorder.wait_for("queues_deepened")
         assert "/odom" in deepened["reason"]
@@ -88,21 +117,19 @@ def test_a_stalled_recorder_loses_nothing_once_its_queues_are_deep(site: Machine
             stall(recorder, seconds)
             recorder.wait_for("split_closed", before + 1)
         recorder.stop()
-    profiles = overrides(recorder)
-    assert {topic: each["reliability"] for topic, each in profiles.items()} == {
-        "/odom": "reliable",
-        "/scan": "best_effort",
-        "/watched": "reliable",
-        "/tf_static": "reliable",
-    }
-    assert int(str(profiles["/odom"]["depth"])) >= 200
-    # A deadline that is asked for refuses every publisher without one.
-    assert "deadline" not in profiles["/watched"]
     after = numbers(recorder.bag_dir, rotated["next"])
-    for topic, found in numbers(recorder.bag_dir).items():
-        kept = found[found.index(after[topic][0]) :]
-        assert len(kept) > 50, topic
-        assert [pair for pair in pairwise(kept) if pair[1] != pair[0] + 1] == [], topic
+    found = numbers(recorder.bag_dir)
+    received = {topic: each[each.index(after[topic][0]) :] for topic, each in found.items()}
+    return Stalled(watch, overrides(recorder), received)
+
+
+def _lost_nothing(stalled: Stalled) -> None:
+    """The queues hold two seconds: more than the stalls, and what the machine adds to them."""
+    assert stalled.received.keys() == set(TOPICS)
+    for topic, received in stalled.received.items():
+        assert len(received) > 50, topic
+        holes = [pair for pair in pairwise(received) if pair[1] != pair[0] + 1]
+        assert holes == [], topic
 
 
 def test_a_publisher_that_comes_with_weaker_qos_is_recorded_at_once(site: Machine) -> None:
