@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from benchmarks.home.truth import Standstill
 
 _REASONS: Final = {
-    "blocked": ("block", "abort", "no way", "failed to create plan"),
+    "blocked": ("block", "abort", "no way", "no path", "failed to create plan"),
     "bump": ("bump",),
     "hot": ("overheat", "motor"),
     "low battery": ("battery", "cancel"),
