@@ -26,7 +26,7 @@ LAKE_REFRESH_S: Final = 60.0
 
 
 def build_fleet(settings: Settings) -> Fleet | None:
-    """Returns the robots of `fleet.robots`, whose bags are only read; None where there are none.
+    """Returns the robots of `fleet.robots`, whose bags are only read; None if there are none.
 
     A robot's memory is built when it is first asked; what reads and decodes bags is shared.
 

@@ -418,7 +418,7 @@ def trajectory_summary(
 ) -> results.TrajectorySummary:
     """Returns the driven path in a window, from one pose topic in log-time order.
 
-    Of its waypoints, which are in the poses' own frame or in `frame_id`, 0 is none, and 1 the last.
+    Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
     """
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)

@@ -453,7 +453,7 @@ class Status(AnswerWithNotes):
         live: whether it is running.
         restarts: how often it restarted `ros2 bag record`; 0 without a recorder.
         missing: topics that it should record by name, and that no publisher offers.
-        never_heard: topics it subscribed to that brought no message.
+        never_heard: topics it subscribed to that sent no message.
         lost: how many messages of each topic are known to be missing of the recorder's last hour.
         fell_silent: topics that had messages, but not lately.
         silences: when topics with a usual rate were silent although the robot was on.
@@ -827,7 +827,7 @@ class Bins(AnswerWithNotes):
         start: of the window, as far as the memory reaches; inclusive.
         end: of the window, likewise.
         columns: the name of each column after that of the bin, and what its values are.
-        rows: for each bin its name and its values; None where there is none.
+        rows: for each bin its name and its values; None if there is none.
         all: the values of all bins together.
         usual: the usual time of the first beginning in a day, where beginnings are counted.
         usual_exit: of the first exit in a day, where visits are counted.

@@ -81,7 +81,7 @@ class TransformColumns:
         self, edge: tuple[str, str], stamps: Times, log_times: Times, numbers: Floats
     ) -> None:
         """Takes transforms of one parent and child: rows of x, y, z, and qx, qy, qz, qw."""
-        # tf2 refuses what is not finite, and rotations that are none.
+        # tf2 refuses what is not finite, and rotations that are not unit quaternions.
         fine = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 3:]).max(axis=1) > 0)
         rotation = _normalised(numbers[fine, 3:])
         parent, child = edge

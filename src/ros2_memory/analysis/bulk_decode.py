@@ -67,7 +67,7 @@ class BulkDecoder(Generic[T]):
             try:
                 decoded = self._decode(record)
             except UndecodableError as error:
-                # Made anew, since the one that was raised keeps the message by its traceback.
+                # A new one, since the one that was raised keeps the message by its traceback.
                 found[at] = UndecodableError(error.topic, error.type_name, error.reason)
                 continue
             found[at] = decoded

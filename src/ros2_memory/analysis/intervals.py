@@ -341,7 +341,7 @@ def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64
     by_time = np.argsort(last, kind="stable")
     rank = np.empty(len(last), np.intp)
     rank[by_time] = np.arange(len(last))
-    # Labels are whole tables apart, so that the running maximum starts anew at each label.
+    # Labels are whole tables apart, so that the running maximum starts again at each label.
     far = label * len(last)
     latest: NDArray[np.int64] = last[by_time[np.maximum.accumulate(rank + far) - far]]
     return latest

@@ -537,7 +537,7 @@ def joined(parts: Iterable[Sights]) -> Sights:
 
 
 def encode_sights(sights: Sights) -> bytes:
-    """Encodes the sights of one bag; empty where there are none."""
+    """Encodes the sights of one bag; empty if there are none."""
     if not sights.topics:
         return b""
     base = min(
@@ -683,7 +683,7 @@ def _fill(table: Ints, packed: bytes, start: int, size: int) -> None:
 
 
 def _summed(zigzag: Ints, begins: Ints) -> Ints:
-    """Returns the rows of a table of several bags, whose steps begin anew with each."""
+    """Returns the rows of a table of several bags, whose steps start again with each."""
     # Summed where the numbers of a column lie together, which is several times as fast.
     sums = np.cumsum((zigzag >> 1) ^ -(zigzag & 1), axis=1)
     before = np.concatenate((np.zeros((len(sums), 1), np.int64), sums), axis=1)[:, begins[:-1]]

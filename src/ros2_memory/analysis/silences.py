@@ -86,7 +86,7 @@ class Silence(NamedTuple):
     goes_on: bool = False
 
     def within(self, start: Ns, end: Ns) -> Silence | None:
-        """Returns the part in a window with inclusive bounds; None where there is none.
+        """Returns the part in a window with inclusive bounds; None if there is none.
 
         How long the robot was on in a part is not known: the whole part counts, if that is less.
         """

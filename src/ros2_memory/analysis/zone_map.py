@@ -68,7 +68,7 @@ class ZoneMap:
             they are too many. A word is a longest run of letters, digits and underscores.
         texts: whether there was any string at all, even without a word.
         booleans: the distinct booleans, in no order.
-        low: the least number, rounded down to a float; above `high` where there is none.
+        low: the least number, rounded down to a float; above `high` if there is none.
         high: the greatest number, rounded up; NaN is no number.
         numbers: the distinct numbers; None where they are too many.
         box: around the positions that `near_position` tests; None without any.

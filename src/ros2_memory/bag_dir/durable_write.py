@@ -65,7 +65,7 @@ def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> 
 
 
 def append_durably(target: Path, text: str) -> None:
-    """Appends lines to a regular file, which is created where there is none, and flushes it.
+    """Appends lines to a regular file, which is created if it is absent, and flushes it.
 
     Raises:
         OSError: the lines cannot be written, and nothing is appended.
@@ -158,7 +158,7 @@ def flush_bags(directory: Path, names: Iterable[str]) -> list[str]:
     """Flushes closed splits, then the directory that names them.
 
     Returns:
-        A sentence for each that could not be flushed; a split deleted meanwhile is none.
+        A sentence for each that could not be flushed; a split deleted meanwhile is not reported.
     """
     faults: list[str] = []
     for path in [*(directory / name for name in names), directory]:

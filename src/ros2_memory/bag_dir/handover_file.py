@@ -167,7 +167,7 @@ class Exclusion(NamedTuple):
     def excludes(self, publish_time: Ns, log_time: Ns) -> bool:
         """Returns whether a message with these times counts in another recording.
 
-        A publish time of 0 is none: then the cut is by log time.
+        A publish time of 0 means none: then the cut is by log time.
         """
         return (
             self.publish_from <= (publish_time or log_time) < self.publish_until

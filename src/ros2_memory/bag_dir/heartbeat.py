@@ -61,13 +61,13 @@ class Heartbeat:
         recordings: what is being written, as directories relative to the bag directory with
             forward slashes; two during a rotation.
         bytes_written: by all recordings since the recorder started.
-        subscribed: topics subscribed to; `silent` ones of them have brought no message.
+        subscribed: topics subscribed to; `silent` ones of them have sent no message.
         last_error: the last fault, as a sentence.
         interval_s: seconds between two heartbeats.
         restarts: how often `ros2 bag record` had to be started again.
         missing: topics configured by name that no publisher has offered since the start.
         age_held: which bags stay though their dates are too old, because the clock may be wrong;
-            None where there are none.
+            None if there are none.
         lost: how many messages of each topic are known to be missing of the last hour; topics
             without a counter, or a regular header stamp, are not in it.
         cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.

@@ -49,7 +49,7 @@ def validated(adapter: TypeAdapter[_T], fields: Mapping[object, object]) -> _T:
 
 
 def is_integer(value: object) -> TypeGuard[int]:
-    """Returns whether a value is an integer of 64 bits; a boolean is none."""
+    """Returns whether a value is an integer of 64 bits; a boolean is not one."""
     return isinstance(value, int) and not isinstance(value, bool) and MIN_NS <= value <= MAX_NS
 
 

@@ -135,7 +135,7 @@ def _write_holder(descriptor: int) -> None:
 
 
 def _read_holder(descriptor: int) -> tuple[int | None, str | None]:
-    """Returns the process id and host in the file; None for both where there are none."""
+    """Returns the process id and host in the file; None for both if there are none."""
     try:
         value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))
     except (OSError, ValueError):

@@ -62,7 +62,7 @@ class Listing(NamedTuple):
 
 
 def parse_listing(text: str) -> Listing:
-    """Returns what a metadata.yaml lists; nothing where it is none."""
+    """Returns what a metadata.yaml lists; nothing if it is not one."""
     names: list[str] = []
     totals: list[tuple[int, int]] = []
     messages: dict[str, int] = {}
@@ -116,7 +116,7 @@ class Contents(NamedTuple):
 def correct(recording: Path, reader: BagReader) -> bool:
     """Corrects metadata.yaml by the content of the recording's files, all `.mcap` or all `.db3`.
 
-    Where there is none, or an empty one, it is made if the files are named as rosbag2 names them.
+    If it is absent or empty, it is created if the files are named as rosbag2 names them.
 
     Returns:
         Whether it was written.

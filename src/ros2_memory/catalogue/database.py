@@ -1,8 +1,8 @@
 """The catalogue's SQLite connection, which repairs itself.
 
 The file may be deleted, replaced, overwritten, locked or on a full disk at any moment. None of that
-raises here: a file that is damaged or of another version is renamed and made anew, one that is busy
-or full is tried again later, and meanwhile nothing is known.
+raises here: a file that is damaged or of another version is renamed and created again, one that is
+busy or full is tried again later, and meanwhile nothing is known.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class OpenDatabase:
 
 
 class CatalogueDatabase:
-    """One SQLite database after the other, as files are lost and made anew. Thread-safe.
+    """One SQLite database after the other, as files are lost and created again. Thread-safe.
 
     Args:
         paths: where the file may lie, in order of preference; a database in memory serves where
@@ -222,7 +222,7 @@ class CatalogueDatabase:
             time.sleep(_PAUSE_S)
 
     def compact(self) -> None:
-        """Writes the file anew without the gaps in it: after many entries some tenth of it.
+        """Rewrites the file without its gaps, which are about a tenth of it after many entries.
 
         Left undone where another program writes to it, or the disk has no space for a copy.
         """
@@ -494,7 +494,7 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _identities(path: Path) -> tuple[tuple[int, int] | None, ...]:
-    """Returns device and inode of each of the database's files; None where there is none."""
+    """Returns device and inode of each of the database's files; None if there is none."""
     found: list[tuple[int, int] | None] = []
     for each in _files_of(path):
         try:

@@ -2,7 +2,7 @@
 
 Which fields there are, and how the range of each is stored, is a text that most bags share; the
 numbers of one bag are some bytes. Bounds are float32, rounded outwards, and a field that was 0
-throughout takes no byte: of odometry that is most fields of a robot that stands.
+throughout takes no byte: which in odometry are most fields of a robot at rest.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _stored(text: str, field: str) -> tuple[_Stored, ...]:
     """Returns where the ranges of a field, and of those below it, lie.
 
     Raises:
-        ValueError: the text is none.
+        ValueError: the text is not valid.
     """
     found: list[tuple[str, int, int, bool]] = []
     offset = _MESSAGES.size

@@ -1,4 +1,4 @@
-"""What the catalogue knows of the bags of a snapshot, computed once for each segment of bags.
+"""What the catalogue holds about the bags of a snapshot, computed once for each segment of bags.
 
 A segment never changes, and neither does an entry of the catalogue, so what is computed here is
 valid for as long as the segment is in use. Only a segment with bags that have no entry yet is
@@ -60,7 +60,7 @@ class FieldBounds:
 
 
 class SegmentDigests:
-    """What the catalogue knows of one segment, leaving out bags without an entry.
+    """What the catalogue holds about one segment, leaving out bags without an entry.
 
     Attributes:
         catalogue: where the rest of the entries is read from.

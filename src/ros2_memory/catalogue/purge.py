@@ -3,7 +3,7 @@
 Deleting rows is not enough: answers were computed from them, payloads and models are shared between
 bags, and SQLite leaves deleted rows in free pages and in its write-ahead log. A model is what the
 first bag said of a topic; where no bag that is left says so, another is chosen, and what was packed
-with it is packed anew.
+with it is compressed again.
 """
 
 from __future__ import annotations

@@ -249,7 +249,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
 def _insert_events(
     connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest, summary: BagSummary
 ) -> None:
-    """Inserts the topic's standstills and events; no row where there are none."""
+    """Inserts the topic's standstills and events; no row if there are none."""
     number, bag = key
     spans = [(each.first, each.last) for each in summary.of(topic.topic)]
     quiet = TopicEvents(min(first for first, _ in spans), max(last for _, last in spans))

@@ -194,7 +194,7 @@ class Catalogue(CatalogueDatabase):
         return self.read(ask, [])
 
     def find(self, keys: Sequence[BagKey]) -> list[int | None]:
-        """Returns the number of each file's entry; None where there is none for these bytes."""
+        """Returns the number of each file's entry; None if there is none for these bytes."""
 
         def ask(connection: sqlite3.Connection) -> dict[BagKey, int]:
             rows = entry_rows(connection, self._usable(connection), [key.path for key in keys])
@@ -318,7 +318,7 @@ class Catalogue(CatalogueDatabase):
     ) -> dict[int, T]:
         """Decodes what is packed of one topic, by entry.
 
-        Where there is none it is `absent`; without that, the entry is left out.
+        If there is none it is `absent`; without that, the entry is left out.
         """
 
         def ask(connection: sqlite3.Connection) -> dict[int, T]:

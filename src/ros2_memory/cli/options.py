@@ -231,7 +231,7 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
 def _is_of_others(
     settings: Settings, sources: Sources, named: Path | None, *, is_path: bool
 ) -> bool:
-    """Returns whether the bags are none of this deployment, which may record elsewhere."""
+    """Returns whether another deployment recorded the bags."""
     bag_dir = settings.recording.bag_dir
     own_files = bool(os.environ.get("MEMORY_CONFIG_DIR"))
     is_chosen = own_files or any(each.key in GROUPS for each in sources.overrides)

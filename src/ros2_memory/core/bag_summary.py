@@ -217,7 +217,7 @@ class BagSummary:
 
     @property
     def topics(self) -> tuple[TopicSummary, ...]:
-        """Each topic under each of its types, made anew."""
+        """Each topic under each of its types, computed again."""
         return tuple(
             _topic_of(*each)
             for each in zip(self.schema.topics, _NUMBERS.iter_unpack(self.numbers), strict=True)

@@ -33,7 +33,7 @@ class Identity(NamedTuple):
     """Shows whether a directory is the very one that was seen before, and not another of its name.
 
     An inode number alone does not: ext4 gives a directory that was deleted and restored its number
-    again. Its generation (FS_IOC_GETVERSION) does: ext4, XFS, Btrfs and F2FS choose one anew for
+    again. Its generation (FS_IOC_GETVERSION) does: ext4, XFS, Btrfs and F2FS choose a new one for
     each inode. It is None on other file systems, where the number has to do. Clocks play no part.
     """
 
@@ -46,7 +46,7 @@ class Identity(NamedTuple):
 
 
 def identity_of(directory: Path | str) -> Identity | None:
-    """Returns the identity of a directory; None where there is none of that name, or a link.
+    """Returns the identity of a directory; None if there is none of that name, or a link.
 
     Raises:
         OSError: the directory cannot be opened.

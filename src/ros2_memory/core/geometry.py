@@ -320,7 +320,7 @@ def _farthest_in(
 
 
 def _rate(seconds: Sequence[float] | Numbers, start: int, end: int) -> float:
-    """Returns one over the time from one point to another; 0 where there is none."""
+    """Returns one over the time from one point to another; 0 if there is none."""
     lasted = float(seconds[end]) - float(seconds[start])
     return 1 / lasted if lasted > 0 else 0.0
 

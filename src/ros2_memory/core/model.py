@@ -101,7 +101,7 @@ class TimeWindow:
         return self.start <= first and last < self.stop
 
     def intersect(self, other: TimeWindow) -> TimeWindow:
-        """Returns the part that both share; empty (`start == stop`) where there is none."""
+        """Returns the part that both share; empty (`start == stop`) if there is none."""
         start = max(self.start, other.start)
         return TimeWindow(start, max(start, min(self.stop, other.stop)))
 

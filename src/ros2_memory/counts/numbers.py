@@ -200,7 +200,7 @@ class _Extremes:
         self._read: dict[int, Numbers | None] = {}
 
     def cell(self, field: int, rows: Sequence[int]) -> _Cell | None:
-        """Returns the numbers of a field in some of the times; None where there are none."""
+        """Returns the numbers of a field in some of the times; None if there are none."""
         some = [row for row in rows if self._numbers[row][field].size]
         count = sum(self._numbers[row][field].size for row in some)
         if not count:

@@ -44,7 +44,7 @@ def count_visits(
     `placed_s` is for how long it was known where the robot was.
 
     Raises:
-        InvalidArgumentsError: the place is none, the frame is another one, there are too many
+        InvalidArgumentsError: the place is invalid, the frame is another one, there are too many
             bins, or a place is given besides `by` place.
         NoDataError: nothing is recorded in the window, or no poses.
         QueryTimeoutError: the call's time runs out before any result.

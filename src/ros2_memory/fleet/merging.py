@@ -41,7 +41,7 @@ class RobotReply:
     Attributes:
         name: of the robot.
         value: its reply, as a server of this robot alone would send it, before it is shortened.
-        latest: the log time of its newest data; None where there is none.
+        latest: the log time of its newest data; None if there is none.
         is_ahead: whether that lies in the future, so that its times say little beside others'.
         lake: what the reply has to report if the answer is from a lake.
     """

@@ -37,7 +37,7 @@ class FromLake(NamedTuple):
     """What a reply has to report of an answer from a lake.
 
     Attributes:
-        latest: the log time of the newest message that was shipped; None where there is none.
+        latest: the log time of the newest message that was shipped; None if there is none.
         notes: what else was not looked at, or is not exact.
     """
 
@@ -54,7 +54,7 @@ class LakeSource(Protocol):
 
     @property
     def latest(self) -> Ns | None:
-        """The log time of the newest message that was shipped; None where there is none."""
+        """The log time of the newest message that was shipped; None if there is none."""
 
     def notes(self) -> Iterable[str]:
         """Returns the notes for the answer that this thread has just computed."""

@@ -312,7 +312,7 @@ class BagAccess:
 
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:
-    """Returns the part of a window that the snapshot knows of: an active bag grows meanwhile."""
+    """Returns the part of a window that the snapshot covers: an active bag grows meanwhile."""
     if bag.state is not BagState.ACTIVE:
         return window
     return window.intersect(TimeWindow.until(bag.end))

@@ -1,7 +1,7 @@
 """Joins what bags hold of a topic: whole bags by their digests, the others by their messages.
 
 What is joined from consecutive bags of one segment serves every later question, so that a week need
-not be joined anew.
+not be joined again.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class Fold(Generic[T, R]):
     def over(self, view: View, topic: str, window: TimeWindow) -> Span | None:
         """Folds a window: groups that lie in it by their digests, the others by their messages.
 
-        Returns the times of the first and the last message; None where there is none.
+        Returns the times of the first and the last message; None if there is none.
         """
         spans: list[Span] = []
         for share in shares_of(view, topic, window):

@@ -121,7 +121,7 @@ class Memory:
         return self.index.foreign(snapshot) if kept is not None and kept.keeps_foreign else None
 
     def heartbeat(self) -> Heartbeat | None:
-        """Returns the last heartbeat of the recorder of these bags; None where there is none.
+        """Returns the last heartbeat of the recorder of these bags; None if there is none.
 
         None for bags of another day, too (`recorder=none`, `data.now=latest`): a heartbeat that was
         copied with them is not about today.

@@ -105,8 +105,7 @@ def transform_at(
 
     With the `recording` of a message the transforms of that recording's session are used; else
     those of the session that was recorded then. Where several were, and differ, a note reports it.
-    To learn why there is none takes far longer than to learn that: who drops the reason passes
-    `explains=False`.
+    The reason why there is none takes far longer to find: `explains=False` leaves it out.
 
     Raises:
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,

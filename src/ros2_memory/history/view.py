@@ -57,7 +57,7 @@ class View:
     """What one call sees of a memory; it stays the same while the call lasts.
 
     `reach` is the latest log time that the question is about: where the index does not reach as
-    far, it is scanned anew.
+    far, it is scanned again.
 
     Attributes:
         bags: each bag by itself.

@@ -37,7 +37,7 @@ _FILE: Final = attrgetter("size", "mtime_ns", "inode")
 
 @dataclass(frozen=True, slots=True)
 class KnownBags:
-    """What the index knows of the bag directory, by path.
+    """What the index holds about the bag directory, by path.
 
     Attributes:
         counted: classifications of files, of all forms and links of a bag only the one that counts.
@@ -326,7 +326,7 @@ class BagTable:
         return removed, added
 
     def _that_counts(self, path: str, context: ScanContext) -> Classification | None:
-        """Returns a file's classification; None where there is none, or another file counts.
+        """Returns a file's classification; None if there is none, or another file counts.
 
         While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
         complete ones that have been there for three splits are kept on purpose: both count.

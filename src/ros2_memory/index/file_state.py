@@ -189,7 +189,7 @@ class FileNotes:
         if stamp.inode != self.stamp.inode:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
-            self.grew_at = now  # also anew after the clock was set back
+            self.grew_at = now  # also again after the clock was set back
         is_outdated = self._is_outdated(stamp, now)
         if is_outdated:
             self.closing, self.summary, self.fault = None, None, None
@@ -306,7 +306,7 @@ def _active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classi
         return Classification(FileState.ACTIVE, aside=aside)
     summary = _summary_so_far(notes, reader)
     if summary is None and notes.stamp.size:
-        # It may become a bag. If it is none, that is found once it is not active any more.
+        # It may become a bag. Whether it is one shows once it is no longer active.
         return Classification(FileState.ACTIVE, aside=aside)
     if summary is None or summary.empty:
         return Classification(FileState.ACTIVE, aside=replace(aside, answers=True))

@@ -55,7 +55,7 @@ class Timeline:
         return cls(_segments_of(bags))
 
     def changed(self, removed: Iterable[BagFile], added: Iterable[BagFile]) -> Timeline:
-        """Returns a timeline without some bags and with others; itself where there are none.
+        """Returns a timeline without some bags and with others; itself if there are none.
 
         Raises:
             ValueError: a removed bag is not in it.

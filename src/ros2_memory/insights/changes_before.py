@@ -189,7 +189,7 @@ def changes_in(
 
 
 def _commands(view: View) -> set[str]:
-    """Returns the topic of velocities that the robot's base is given; none where there is none.
+    """Returns the topic of velocities that command the robot's base; None if there is none.
 
     Of `/cmd_vel_nav`, `/cmd_vel_smoothed` and `/cmd_vel`, which follow each other, the last.
     """

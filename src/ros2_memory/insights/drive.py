@@ -180,7 +180,7 @@ def _encoded(joined: StandstillDigest | StandstillRun) -> bytes:
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
-    """Returns where the poses of a topic stand still, in order, as far as it is in a window.
+    """Returns where the robot of a pose topic stood still, in order, as far as it is in a window.
 
     And where they lose speed suddenly without standing still next.
 

@@ -134,7 +134,7 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
     try:
         state = read_trigger_state(bag_dir)
     except ValueError:
-        return ()  # the recorder reports that, and begins anew
+        return ()  # the recorder reports that, and starts again
     return tuple(
         FiredRule(
             name,

@@ -226,7 +226,7 @@ def _collect(
                 before = each.time
                 found.end_silent(each.time)
                 matches = search.matches(each)
-                # Where the scope does not hold, a match is like a message that is none.
+                # Where the scope does not hold, a match counts as no match.
                 if matches and scope.holds_at(each.time):
                     found.add(each)
                 elif matches is None:

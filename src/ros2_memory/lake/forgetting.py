@@ -71,7 +71,7 @@ def forget_in_lake(
         for bag_id, day in zip(found["bag_id"].to_pylist(), found["day"].to_pylist(), strict=True):
             if bag_id not in spared:
                 ids.setdefault((tombstone.robot, day), set()).add(bag_id)
-        # `bags` last: until then it tells which rows are to go.
+        # `bags` last: until then it lists the rows to delete.
         for name in sorted(TABLES, key=lambda each: each == "bags"):
             conditions = [named or except_bags(_in_window(tombstone, name), spared)]
             if ids:

@@ -184,7 +184,7 @@ class Shipper:
 
     @property
     def lake_id(self) -> str:
-        """The id of the lake: another one where its tables were made anew."""
+        """The id of the lake: another one where its tables were created again."""
         return str(self._tables["bags"].metadata.table_uuid)
 
     def run(self) -> Shipped:

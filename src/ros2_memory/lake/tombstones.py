@@ -90,7 +90,7 @@ def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
 
     Raises:
         LakeError: they cannot be read, or a line is damaged: nothing may be shipped then. A last
-            line that a crash cut short is none.
+            line that a crash cut short is skipped.
     """
     path = state_dir / TOMBSTONES_FILE
     try:

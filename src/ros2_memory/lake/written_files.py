@@ -51,7 +51,7 @@ def file_properties(state_dir: Path) -> dict[str, str]:
 
 
 def recorded_files(state_dir: Path) -> dict[str, Ns]:
-    """Returns the files that were written, with when; a line that a crash cut short is none.
+    """Returns the files that were written, with when; a line that a crash cut short is skipped.
 
     Raises:
         OSError: the record cannot be read.

@@ -73,7 +73,7 @@ def driven_inside(
 ) -> DrivenInside:
     """Returns what was driven inside of a region in a window, by one pose topic.
 
-    Of its waypoints, which are in the poses' own frame or in `frame_id`, 0 is none, and 1 the last.
+    Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
 
     Raises:
         InvalidArgumentsError: the topic carries no position, or `where` is no region of a frame
@@ -166,7 +166,7 @@ class DrivenWay:
     def waypoints(self, spans: Sequence[Inside], at_most: int) -> tuple[Waypoint, ...]:
         """Returns the drawn way in some times; `jump` marks where another time begins.
 
-        Of `at_most` 0 is none, and 1 the last.
+        `at_most` 0 asks for none, 1 for the last.
         """
         path = DrawnPath(TOLERANCE_M)
         for span in spans:

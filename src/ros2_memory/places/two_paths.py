@@ -1,7 +1,7 @@
 """Compares two paths by the robot's tracks: where they are farthest apart, and where it stood.
 
 Both results are in one frame, so they are useful only if that is the map, or if odometry did not
-begin anew between the two.
+start again between the two.
 """
 
 from __future__ import annotations

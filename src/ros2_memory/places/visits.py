@@ -87,8 +87,8 @@ def visits(
     inclusive) alone, where these are given.
 
     Raises:
-        InvalidArgumentsError: the pose topic carries no position, the place is none, the frame is
-            another one, or the bounds are reversed.
+        InvalidArgumentsError: the pose topic carries no position, the place is invalid, the frame
+            is another one, or the bounds are reversed.
         NoDataError: nothing is recorded, or no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """

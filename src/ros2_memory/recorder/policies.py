@@ -160,7 +160,7 @@ def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: st
 def describe_silent_topics(
     subscribed: Collection[str], received: Collection[str], advice: str
 ) -> str | None:
-    """Describes the topics that brought nothing in a whole recording; None where all did."""
+    """Describes the topics that sent nothing in a whole recording; None if all did."""
     silent = sorted(set(subscribed) - set(received))
     if not silent:
         return None

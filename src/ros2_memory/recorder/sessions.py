@@ -121,7 +121,7 @@ class RecordingSessions:
         return self._ended_bytes + sum(each.splits.bytes_written for each in self.running)
 
     def begin(self, now: ClockReading) -> None:
-        """Starts a recording when there is none.
+        """Starts a recording if none is running.
 
         Raises:
             RecorderError: it cannot be started.

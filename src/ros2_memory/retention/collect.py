@@ -2,7 +2,7 @@
 
 A query works on a snapshot of the bags that is some seconds old. So a bag with latched messages is
 deleted only when those have been carried for that long: until then a query may look for them in the
-bag. Meanwhile the next oldest bag is deleted instead; where there is none, the limits come first.
+bag. Meanwhile the next oldest bag is deleted instead; if there is none, the limits come first.
 """
 
 from __future__ import annotations

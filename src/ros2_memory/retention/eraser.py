@@ -1,7 +1,7 @@
 """Deletes messages by rewriting their bags, and all files that name or repeat them.
 
 What goes is written down first (`bag_dir.state.erasure_file`), so that an interrupted erasure can
-be finished. Then for each bag: its messages leave the sidecar; the bag is written anew beside
+be finished. Then for each bag: its messages leave the sidecar; the bag is rewritten beside
 itself, read back, compared and flushed; and the new file takes the name of the old one, wherever a
 hard link in a moment has it. It is done when no name of the old one is left.
 """

@@ -183,7 +183,7 @@ class Backfill:
     def renew(self, bags: Sequence[BagFile]) -> list[BagFile]:
         """Keeps the entries of bags in which their recording's handover has changed nothing.
 
-        Each rotation writes the `handover.json` of a recording with many bags anew, and concerns
+        Each rotation writes the `handover.json` of a recording with many bags again, and concerns
         one or two of these. Returns the bags that are to be digested.
         """
         among = self.catalogue.with_other_sidecar([self._key(bag) for bag in bags])

@@ -1,6 +1,6 @@
 """Writes the `.db3` files of rosbag2 again without some of their messages.
 
-The copy is changed, and then written anew as a whole (`VACUUM`), so that no page of it holds what
+The copy is changed, and then rewritten as a whole (`VACUUM`), so that no page of it holds what
 was deleted.
 """
 

@@ -35,7 +35,7 @@ LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3
 _MOST_NAMES: Final = 5
 _JUST_NOW_NS: Final = 2 * NS_PER_S
-"""Detectors speak at their own times."""
+"""Detectors publish at their own times."""
 _MM: Final = 1000.0
 
 

@@ -225,7 +225,7 @@ class _Loader:
     ) -> tuple[list[int], tuple[str, ...]]:
         """Returns the epoch of each bag, and the frame of each epoch.
 
-        All bags in the map are of epoch 0. Odometry begins anew in each session.
+        All bags in the map are of epoch 0. Odometry starts again in each session.
         """
         in_map = self._view.memory.limits.map_frame
         sessions = sessions_of(self._view)

@@ -101,7 +101,7 @@ def excluded_intervals(
 
     Those in which the condition held, and those in which it was not known, are apart, and may
     overlap. Recordings come in the order in which they began; one that begins before the one before
-    it follows a clock that was set back, and is told nothing by it but that the condition held.
+    it follows a clock that was set back, and learns from it only that the condition held.
     """
     held: Spans = []
     free: list[Spans] = []

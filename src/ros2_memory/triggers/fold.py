@@ -2,7 +2,7 @@
 
 A match begins with a message that meets the condition, and ends as a sighting does: with a message
 of the topic that does not, or where the topic is silent for longer than `SILENCE_NS`; on a latched
-topic, whose publisher speaks only when something changes, a silence ends nothing. It ends at a gap,
+topic, whose publisher sends only when something changes, a silence ends nothing. It ends at a gap,
 where the recorder did not run on. A message that cannot be decoded neither begins nor ends one.
 
 A rule fires once in each match: when it begins, or once it has held for as long as the rule asks.

@@ -95,7 +95,7 @@ class Screening:
         rules: what is excluded, by unique names; with none nothing is announced.
         reader: reads files as they are, also what does not count in answers.
         extractor: gives the values that conditions are tested on.
-        writer: writes splits anew.
+        writer: rewrites splits.
         split_duration_s: how long one split is.
         monotonic: a clock that never steps, in seconds.
     """
@@ -251,7 +251,7 @@ class Screening:
         """Takes up what a file shows.
 
         Raises:
-            BagError: it cannot be read, or not be written anew.
+            BagError: it cannot be read or rewritten.
         """
         if path.suffix != ".mcap" or not summary.complete:
             raise BagError(str(path), "it is not a complete MCAP file")
@@ -345,7 +345,7 @@ class Screening:
         """Cuts out of a split what is excluded; returns the stretches by which that was decided.
 
         Raises:
-            EpisodicError: it cannot be written anew.
+            EpisodicError: it cannot be rewritten.
             OSError: likewise, or it has gone.
         """
         path, summary = ready.path, ready.summary

@@ -340,7 +340,7 @@ class PoseDigest:
         poses: how many valid poses.
         invalid: how many others.
         totals: what was driven. Without legs where there are few poses: then `vertices` are all of
-            them, and joining measures them anew.
+            them, and joining measures them again.
         twist: the highest speed (m/s) that a message states; None where none states one.
         frames: the frames of all poses, in order of appearance.
         vertices: the drawn path from the first valid pose to the last, split where the robot jumped

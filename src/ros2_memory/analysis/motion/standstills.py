@@ -177,7 +177,7 @@ class StandstillRun:
     """Consecutive bags, joined as far as no bag before or after them matters.
 
     Attributes:
-        lead: the first bags, up to one at whose end no standstill is open; all where there is none.
+        lead: the first bags, up to one at whose end no standstill is open; if none, all.
         found: the standstills of the bags after these, up to the last one of that kind.
         drops: of speed, in the same bags.
         last: the last bag of that kind.

@@ -180,7 +180,7 @@ class OwnRecordings:
     def owns(self, directory: Path) -> bool:
         """Returns whether a directory is a recording of this bag directory's recorder.
 
-        One that must not be opened is none.
+        One that must not be opened is left out.
 
         Raises:
             OSError: the list cannot be read.
@@ -415,7 +415,7 @@ class OwnRecordings:
 
     @contextmanager
     def _locked(self) -> Iterator[int | None]:
-        """Yields a descriptor of the list, locked; None where there is none.
+        """Yields a descriptor of the list, locked; None if there is none.
 
         Raises:
             OSError: it cannot be opened, or another program holds the lock.

@@ -198,7 +198,7 @@ def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is none, or too old.
+        ValueError: it is invalid, or too old.
     """
     if path.lstat().st_size > MAX_REQUEST_BYTES:
         raise ValueError(f"it is larger than {MAX_REQUEST_BYTES} bytes")

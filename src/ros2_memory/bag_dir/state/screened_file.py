@@ -129,7 +129,7 @@ _STATE: Final = TypeAdapter(ScreenState)
 
 
 def read_screen_state(bag_dir: Path) -> ScreenState | None:
-    """Returns the state, to be changed; None where there is none.
+    """Returns the state, to be changed; None if there is none.
 
     Raises:
         OSError: it cannot be read.

@@ -103,7 +103,7 @@ class TriggerState:
         rules: by name; those that are not configured any more are dropped.
         searched: until which log time (excluded) the newest recordings were searched.
         before: a recording; it and all that were listed before it were searched, or lie before the
-            rules. None where there is none.
+            rules. None if there is none.
         latched: by topic.
     """
 
@@ -117,7 +117,7 @@ _STATE: Final = TypeAdapter(TriggerState)
 
 
 def read_trigger_state(bag_dir: Path) -> TriggerState | None:
-    """Returns the state; None where there is none yet.
+    """Returns the state; None if there is none yet.
 
     Raises:
         OSError: it cannot be read.

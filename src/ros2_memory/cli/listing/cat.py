@@ -133,7 +133,7 @@ def _extracted(
         if message is None:
             left_out += 1
             continue
-        if not is_checked or not exact:  # `exact_at` does not tell which fields there are
+        if not is_checked or not exact:  # `exact_at` does not report which fields there are
             shown = extractor.shown(message, type_name, fields).value
             is_checked = True
         if not exact:

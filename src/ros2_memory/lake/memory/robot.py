@@ -88,7 +88,7 @@ class LakeRobot:
 
     @property
     def latest(self) -> Ns | None:
-        """The log time of the newest message that was shipped; None where there is none."""
+        """The log time of the newest message that was shipped; None if there is none."""
         known = self._index.published
         return None if known is None else known.latest
 

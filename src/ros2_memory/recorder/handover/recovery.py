@@ -214,7 +214,7 @@ def _end_of(recording: Path, reader: BagReader) -> _End | None:
     try:
         for record in _records(recording / name, reader):
             published, logged = newest or (MIN_NS, MIN_NS)
-            # A publish time of 0 is none.
+            # A publish time of 0 means that there is none.
             latest = max(published, record.publish_time or record.log_time)
             newest = _End(latest, max(logged, record.log_time))
     except BagUnreachableError:

@@ -2,7 +2,7 @@
 
 A hole counts once the next split has been measured, and the other recording of a handover up to
 there: until then that one may turn out to have its messages. After a split that does not show
-what it has of a topic, the topic is followed anew.
+what it has of a topic, the topic is followed from the start.
 """
 
 from __future__ import annotations
