@@ -76,7 +76,7 @@ def decode_poses(packed: bytes) -> PoseDigest:
     """Decodes a digest of poses.
 
     Raises:
-        ValueError: the bytes are not one.
+        ValueError: the bytes are not valid.
     """
     try:
         poses, invalid, driven, twist, frames, error_m, stored = json.loads(packed)
@@ -104,7 +104,7 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     """Decodes a digest of standstills.
 
     Raises:
-        ValueError: the bytes are not one.
+        ValueError: the bytes are not valid.
     """
     sizes, _, body = packed.partition(b"\n")
     try:
@@ -143,7 +143,7 @@ def decode_standstill_run(packed: bytes) -> StandstillRun:
     """Decodes consecutive bags' standstills that are joined.
 
     Raises:
-        ValueError: the bytes are not some.
+        ValueError: the bytes are not valid.
     """
     head, _, body = packed.partition(b"\n")
     try:
@@ -190,7 +190,7 @@ def decode_zone_map(packed: bytes) -> ZoneMap:
     """Decodes a zone map.
 
     Raises:
-        ValueError: the bytes are not one.
+        ValueError: the bytes are not valid.
     """
     try:
         flags, low, high = _ZONES.unpack_from(packed)
@@ -264,7 +264,7 @@ def decode_topic_events(packed: bytes) -> TopicEvents | None:
     """Decodes the events of a topic; None where no message can be decoded.
 
     Raises:
-        ValueError: the bytes are not those of any.
+        ValueError: the bytes are not valid.
     """
     if not packed:
         return None
@@ -349,7 +349,7 @@ def _decode_changes(
 
 
 def _decode_leg(stored: Leg | None) -> Leg | None:
-    """Returns the same leg, with tuples in place of the lists of JSON."""
+    """Returns the same leg, with tuples instead of JSON's lists."""
     if stored is None:
         return None
     first, last, poses, period_ns, length_m, sum_m, head, tail, still, *near = stored
@@ -394,7 +394,7 @@ def decode_schema(text: str) -> SummarySchema:
     """Decodes a summary schema.
 
     Raises:
-        ValueError: the text is not one.
+        ValueError: the text is not valid.
         TypeError: likewise.
     """
     topics, silent, complete, notes, set_back = json.loads(text)

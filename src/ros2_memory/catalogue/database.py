@@ -102,9 +102,9 @@ class OpenDatabase:
             return True
 
     def is_mixed(self) -> bool:
-        """Whether the file is in place but its write-ahead log is another's, or gone.
+        """Whether the file is in place but its write-ahead log is missing or another program's.
 
-        What several programs write to such files is no database.
+        Several programs that write to such files destroy the database.
         """
         now = () if self.path is None else _identities(self.path)
         return now[:1] == self.identities[:1] and now != self.identities
@@ -148,7 +148,7 @@ class CatalogueDatabase:
 
     @property
     def path(self) -> Path | None:
-        """Where the file lies; None in memory, and before there is one."""
+        """Path of the file; None in memory, and before it is opened."""
         with self._lock:
             opened = self._ready()
         return None if opened is None else opened.path
@@ -224,7 +224,7 @@ class CatalogueDatabase:
     def compact(self) -> None:
         """Rewrites the file without its gaps, which are about a tenth of it after many entries.
 
-        Left undone where another program writes to it, or the disk has no space for a copy.
+        Skipped if another program writes to it, or the disk has no space for a copy.
         """
         with self._lock:
             opened = self._ready()
@@ -232,7 +232,7 @@ class CatalogueDatabase:
                 return
             with suppress(sqlite3.Error):
                 opened.connection.execute("VACUUM")
-                # The copy went through the write-ahead log, which would stay as long.
+                # The copy went through the write-ahead log, which would keep that size.
                 opened.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def look_after(self, *, thorough: bool = False) -> None:
@@ -286,7 +286,7 @@ class CatalogueDatabase:
         """
         self._tried_s = self._monotonic()
         paths = tuple(self._candidate_paths())
-        # It does not move away from a path that is no longer a candidate.
+        # It stays at a path that is no longer a candidate.
         if before.path is not None:
             paths = paths[: paths.index(before.path)] if before.path in paths else ()
         found = open_file(paths, again=True, previous=before.path) if paths else ""
@@ -318,7 +318,7 @@ class CatalogueDatabase:
         self.trouble, self.is_failing = trouble, True
 
     def _lose(self, reason: str, *, aside: bool) -> None:
-        """Gives the open database up; the next read or write opens or makes another."""
+        """Closes the open database; the next read or write opens or creates another."""
         opened, self._opened = self._opened, None
         self.failures += 1
         self._databases += 1
@@ -395,7 +395,7 @@ def open_file(
 
 
 def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
-    """Copies the first of these files that is a catalogue of this version; none where none is.
+    """Copies the first of these files that is a catalogue of this version, if any.
 
     The copy appears as a whole, by a hard link, and never replaces a file of another program.
     """
@@ -406,7 +406,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
                 continue
             temporary.unlink(missing_ok=True)
             _refuse_links(source)
-            # Without a log nobody has it open: as immutable, nothing is made beside it.
+            # Without a log no program has it open; immutable: SQLite creates no file beside it.
             mode = "mode=ro" if _files_of(source)[1].exists() else "mode=ro&immutable=1"
             address = f"{source.absolute().as_uri()}?{mode}"
             with (
@@ -429,7 +429,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
 
 
 def _refuse_links(path: Path) -> None:
-    """Refuses a file that lies elsewhere: it would be written, or set aside, where it lies.
+    """Refuses a link: the file that it leads to would be written, or set aside.
 
     Raises:
         OSError: the file, its write-ahead log or its folder is a symbolic link.
@@ -440,13 +440,13 @@ def _refuse_links(path: Path) -> None:
 
 
 def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
-    """Returns what is wrong with a file that is open here, as another program would find it.
+    """Returns what is wrong with a file that is open here, as another program sees it.
 
     Args:
         path: the file.
         thorough: whether all of it is read; else only where its tables begin.
     """
-    # rw and not rwc: a file that has just gone is not made again.
+    # rw and not rwc: a file that was just deleted is not created again.
     address = f"{path.absolute().as_uri()}?mode=rw"
     try:
         with closing(sqlite3.connect(address, uri=True, timeout=_SHORT_MS / 1000)) as connection:

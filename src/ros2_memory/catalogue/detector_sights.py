@@ -115,7 +115,7 @@ class DetectorSights:
             return
         of_topic.is_detector |= bool(found)
         log_time = record.log_time
-        # A stamp of another clock says nothing of when the transforms were.
+        # A stamp of another clock cannot be compared with those of transforms.
         agrees = stamp is not None and abs(stamp - log_time) <= AGREEMENT_NS
         of_topic.times.append(stamp if stamp is not None and agrees else log_time)
         of_topic.log_times.append(log_time)

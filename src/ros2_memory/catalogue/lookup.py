@@ -124,7 +124,7 @@ class SegmentDigests:
     def _all_boxes(self, topic: str) -> Boxes:
         numbers = self._entries_with(topic)
         known = self.catalogue.boxes(topic, numbers)
-        # As with zone maps, nothing is ruled out that could not be read.
+        # As with zone maps, what could not be read rules nothing out.
         return Boxes({number: known.get(number, EVERYWHERE) for number in numbers})
 
     def field_bounds(self, topic: str, field: str) -> FieldBounds:
@@ -180,7 +180,7 @@ class SegmentDigests:
         return self.derived("map keys", lambda: self.catalogue.map_keys([*self.numbers.values()]))
 
     def derived(self, name: str, compute: Callable[[], T]) -> T:
-        """Returns what is computed from the entries of this segment once, by name.
+        """Returns a value computed once from the entries of this segment, by name.
 
         It lives as long as the segment is in use, but for what was asked for longest ago of very
         much. A name always has one type of value.
@@ -223,7 +223,7 @@ class SegmentDigests:
 
 
 class DigestCache:
-    """Caches what the catalogue knows, by segment. Thread-safe."""
+    """Caches the catalogue's entries, by segment. Thread-safe."""
 
     def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
         self.catalogue = catalogue
@@ -234,7 +234,7 @@ class DigestCache:
         self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
     def digests_for(self, segment: Segment, as_of: int) -> SegmentDigests:
-        """Returns what is known of a segment, at that state of the catalogue or a later one."""
+        """Returns the entries of a segment, at that state of the catalogue or a later one."""
         with self._lock:
             known = self._segments.get(segment)
         if known is None or not (known.as_of == as_of or known.is_complete):
@@ -242,7 +242,7 @@ class DigestCache:
         return known
 
     def looked_up_again(self, segment: Segment, as_of: int) -> SegmentDigests:
-        """Returns what is known of a segment now, where another program replaced its entries."""
+        """Returns the entries of a segment now, after another program replaced them."""
         known = SegmentDigests(self, segment, as_of)
         with self._lock:
             self._segments[segment] = known
@@ -290,7 +290,7 @@ class DigestCache:
 
 
 def bags_without_entry(segments: Sequence[Segment], cache: DigestCache) -> list[BagFile]:
-    """Returns the closed bags that the catalogue does not know, in order."""
+    """Returns the closed bags without an entry in the catalogue, in order."""
     as_of = cache.catalogue.newest()
     return [
         bag

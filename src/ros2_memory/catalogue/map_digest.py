@@ -281,7 +281,7 @@ def decode_map_tracks(stored: Sequence[tuple[bytes, int]], *, own: bool = False)
     Each comes with the hash of its statics.
 
     Raises:
-        ValueError: the bytes of some are not one.
+        ValueError: some of the bytes are not valid.
     """
     heads, frames, packed = [], [], []
     for each, _ in stored:

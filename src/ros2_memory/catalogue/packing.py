@@ -28,7 +28,7 @@ def packed(plain: bytes, model: bytes) -> bytes:
 
 
 def unpacked(stored: bytes, model: bytes) -> bytes:
-    """Returns what was packed.
+    """Returns the bytes that were packed.
 
     Raises:
         ValueError: the bytes are not what `packed` returned.

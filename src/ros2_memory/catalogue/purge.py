@@ -37,10 +37,10 @@ _KEYS: Final = {
 
 
 def purge(file: Path, bags: Sequence[str]) -> None:
-    """Has a catalogue's file forget bags, and deletes catalogues that were set aside.
+    """Deletes bags from a catalogue file, and deletes catalogues that were set aside.
 
     Args:
-        file: the catalogue; nothing is done where it is not there, or is of another version.
+        file: the catalogue; nothing is done if it is absent or of another version.
         bags: their paths, as entries name them.
 
     Raises:
@@ -93,7 +93,7 @@ def _purge(file: Path, bags: Sequence[str]) -> None:
 
 
 def _done(base: sqlite3.Connection, statement: str) -> bool:
-    """Executes a statement; returns whether no lock was in its way."""
+    """Executes a statement; returns False if another program holds a lock."""
     try:
         row = base.execute(statement).fetchone()
     except sqlite3.OperationalError as error:

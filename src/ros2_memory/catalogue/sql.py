@@ -1,6 +1,6 @@
 """Reads, writes and deletes rows of the catalogue's tables.
 
-Statements are put together from constants of this room; values are always parameters. Everything
+Statements are built from constants of this package; values are always parameters. Everything
 raises what sqlite3 raises.
 """
 
@@ -101,7 +101,7 @@ def topic_number(connection: sqlite3.Connection, topic: str) -> int:
 
 
 def model_of(connection: sqlite3.Connection, topic: int, kind: str) -> bytes:
-    """Returns the model that what is stored of a kind and topic was packed with, if any."""
+    """Returns the model that a kind and topic is packed with, if any."""
     row = connection.execute(
         "SELECT bytes FROM models WHERE topic = ? AND kind = ?", (topic, kind)
     ).fetchone()
@@ -109,7 +109,7 @@ def model_of(connection: sqlite3.Connection, topic: int, kind: str) -> bytes:
 
 
 def packed_by_model(connection: sqlite3.Connection, topic: int, kind: str, plain: bytes) -> bytes:
-    """Packs what is to be stored; the first of its kind becomes the model."""
+    """Packs a value; the first of its kind becomes the model."""
     model = model_of(connection, topic, kind)
     if plain and not model:
         model = plain[:MAX_MODEL_BYTES]
@@ -132,7 +132,7 @@ def message_rows(
 def any_is_gone(connection: sqlite3.Connection, row_ids: Sequence[int]) -> bool:
     """Returns whether an entry was deleted since it was read.
 
-    What it held is to be forgotten with it: nothing that was computed from it is stored.
+    Then nothing that was computed from it may be stored.
     """
     gone = "SELECT value FROM json_each(?) WHERE value NOT IN (SELECT id FROM bags) LIMIT 1"
     return connection.execute(gone, (json.dumps(row_ids),)).fetchone() is not None

@@ -254,7 +254,7 @@ class Catalogue(CatalogueDatabase):
         return self.read(ask, field_column([], field))
 
     def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
-        """Returns the map digests of entries, with their track alone.
+        """Returns the map digests of entries, with only their track.
 
         With `own` in the poses' own frame.
         """
@@ -417,7 +417,7 @@ class Catalogue(CatalogueDatabase):
         self.write(write)
 
     def joined(self, name: str, entries: Sequence[Sequence[int]]) -> bytes | None:
-        """Returns what `store_joined` stored; empty where it was too much."""
+        """Returns what `store_joined` stored; empty if it was too large."""
 
         def ask(connection: sqlite3.Connection) -> bytes | None:
             key = self._key_of_joined(name, entries)
@@ -429,7 +429,7 @@ class Catalogue(CatalogueDatabase):
         return self.read(ask, None)
 
     def store_joined(self, name: str, entries: Sequence[Sequence[int]], joined: bytes) -> None:
-        """Stores what many entries add up to, until the oldest of the first of them is deleted.
+        """Stores a digest joined from many entries, until the oldest of the first is deleted.
 
         Only that it is too much where it takes more than `MOST_JOINED` bytes for each of those.
         """

@@ -120,7 +120,7 @@ class Housekeeper:
         """
 
     def note_restart(self) -> None:
-        """Takes up that a recording ended unasked, and another one begins."""
+        """Records that a recording ended unexpectedly and another one begins."""
 
     def announce(self, recording: str) -> None:
         """Records that a recording is about to start; no file of it exists yet.

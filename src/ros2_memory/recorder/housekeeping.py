@@ -207,7 +207,7 @@ class Housekeeping(Housekeeper):
                     self._look(snapshot)
 
     def note_restart(self) -> None:
-        """Takes up that a recording ended unasked, and another one begins."""
+        """Records that a recording ended unexpectedly and another one begins."""
         if self._triggers is not None:
             now = self._clock.now()
             self._triggers.note_restart(now, now)
@@ -470,7 +470,7 @@ class BackgroundHousekeeper(Housekeeper):
         self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
 
     def note_restart(self) -> None:
-        """Takes up that a recording ended unasked, and another one begins."""
+        """Records that a recording ended unexpectedly and another one begins."""
         self._housekeeper.note_restart()
 
     def announce(self, recording: str) -> None:

@@ -189,11 +189,11 @@ def _carried(ended: RecordingConditions, others: Iterable[RecordingConditions], 
 
 
 class Cut:
-    """Which messages of one bag go.
+    """Which messages of one bag are deleted.
 
-    A message goes by when it was received. One on a latched topic, which each recording receives
-    again, goes by when it was published: in a stretch in which the condition held, or in one in
-    which that was not known as long as it was received in a stretch, too.
+    The time of receipt decides, but on a latched topic, which each recording receives again, the
+    publish time: a message is deleted if it lies in a stretch in which the condition held, or in
+    one in which that was not known and the message was received in a stretch, too.
 
     Args:
         stretches: those of the bag's own time.
@@ -211,7 +211,7 @@ class Cut:
         self._held = united((each.start, each.stop) for each in known if each.held)
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
-        """Returns whether a message goes."""
+        """Returns whether a message is deleted."""
         if topic not in self._latched:
             return lies_inside(self._all, log_time)
         published = publish_time if 0 < publish_time < log_time else log_time
@@ -220,7 +220,7 @@ class Cut:
         )
 
     def touches(self, topic: str, first: Ns, last: Ns) -> bool:
-        """Returns whether messages of a topic between two log times may go."""
+        """Returns whether messages of a topic between two log times may be deleted."""
         if topic in self._latched:
             return bool(self._known)
         return any(start <= last and first < stop for start, stop in self._all)

@@ -152,7 +152,7 @@ class Screening:
         return lambda: self._step(names, written)
 
     def problem(self) -> str | None:
-        """Describes the splits that are held back for a fault, or a rule in vain, or None."""
+        """Describes the splits that a fault or a useless rule holds back, or None."""
         known = [*self._problems.items()]
         if not known:
             refused = "; ".join([*self._refusals.values()])
@@ -165,7 +165,7 @@ class Screening:
         )
 
     def _step(self, names: Sequence[str], live: Collection[str]) -> None:
-        """Reads what was closed, and releases what can be.
+        """Reads closed files, and releases those that can be released.
 
         Raises:
             BagUnreachableError: the disk fails; the next step tries again.
@@ -248,7 +248,7 @@ class Screening:
         return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
 
     def _hear(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
-        """Takes up what a file shows.
+        """Adds what a file shows to the state.
 
         Raises:
             BagError: it cannot be read or rewritten.
@@ -298,7 +298,7 @@ class Screening:
         closed: dict[str, list[tuple[Path, BagSummary]]],
         live: Collection[str],
     ) -> list[_Ready]:
-        """Returns the splits that nothing which is still to come can reach into."""
+        """Returns the splits that no later message can affect."""
         known: dict[str, Ns] = {}
         for name in live:
             screen = state.recordings.get(name)
@@ -342,7 +342,7 @@ class Screening:
         return found
 
     def _cut(self, ready: _Ready, state: ScreenState, live: Collection[str]) -> list[Excluded]:
-        """Cuts out of a split what is excluded; returns the stretches by which that was decided.
+        """Cuts the excluded data out of a split; returns the stretches that decided it.
 
         Raises:
             EpisodicError: it cannot be rewritten.
@@ -420,7 +420,7 @@ class Screening:
         """Writes what a step changed, if anything, beside what was announced meanwhile.
 
         Raises:
-            OSError: it cannot be written; the state that is known stays as it was.
+            OSError: it cannot be written; the state in memory stays as it was.
         """
         if state == before:
             return

@@ -95,7 +95,7 @@ def _limits(
 
 
 def _known_until(recording: str, closed: Sequence[BagFile]) -> Ns | None:
-    """Returns until when nothing can come in a recording that is being written; None if unknown."""
+    """Returns until when a recording that is being written is complete; None if unknown."""
     end = max((bag.end for bag in closed), default=None)
     begun = named_start(recording) if end is None else end
     return None if begun is None else begun - OUT_OF_ORDER_NS

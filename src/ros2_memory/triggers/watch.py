@@ -1,6 +1,6 @@
-"""Evaluates the rules of one bag directory, and has kept what they ask for.
+"""Evaluates the rules of one bag directory, and stores the moments that they ask for.
 
-Each look takes up a copy of the state, searches what was closed since, begins or extends moments,
+Each look copies the state, searches what was closed since, begins or extends moments,
 and writes the state. A kill in between does no harm: the next look finds the same again, and a
 moment that was begun is recognised by its number. What cannot be stored, as on a full disk, is
 tried again with every look.
@@ -100,12 +100,12 @@ class Triggers:
         self._reported: dict[str, Ns] = {}
 
     def note_restart(self, first: Ns, at: Ns) -> None:
-        """Takes up that recording ended unasked and began again, between two wall clock times."""
+        """Records that the recording ended unexpectedly and restarted between two wall times."""
         with self._lock:
             self._restarts.append((first, at))
 
     def note_unclean_end(self) -> None:
-        """Takes up that the recorder ended without saying so, by its last heartbeat.
+        """Records, by the last heartbeat, that the recorder ended without a shutdown.
 
         Call it before anything is recorded.
         """
@@ -116,7 +116,7 @@ class Triggers:
 
     @property
     def has_restarts(self) -> bool:
-        """Whether a restart waits to be looked at."""
+        """Whether a restart is still to be evaluated."""
         return bool(self._restarts)
 
     def look(self, snapshot: Snapshot) -> None:
@@ -171,7 +171,7 @@ class Triggers:
         )
 
     def note_deleted(self, bags: int) -> None:
-        """Takes up that so many needed bags were deleted, since the size budget comes first."""
+        """Records how many needed bags were deleted: the size budget comes first."""
         with self._lock:
             self._deleted += bags
 

@@ -167,7 +167,7 @@ def decode_track(packed: bytes) -> RobotTrack:
     """Decodes a track.
 
     Raises:
-        ValueError: the bytes are not one.
+        ValueError: the bytes are not valid.
     """
     return decode_tracks([packed])[0]
 
@@ -176,7 +176,7 @@ def decode_tracks(packed: Sequence[bytes]) -> list[RobotTrack]:
     """Decodes tracks, all together: one by one, those of a week take four times as long.
 
     Raises:
-        ValueError: the bytes of some are not one.
+        ValueError: some of the bytes are not valid.
     """
     try:
         heads = [_HEAD.unpack_from(each) if each else _NOTHING for each in packed]

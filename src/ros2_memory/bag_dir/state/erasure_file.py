@@ -82,7 +82,7 @@ class Erasure:
         return None
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
-        """Returns whether a message goes."""
+        """Returns whether a message is deleted."""
         return self.window_of(topic, log_time, publish_time) is not None
 
 

@@ -99,7 +99,7 @@ class LakeCatalogue(Catalogue):
         return {number: known.get(number, NO_EVENTS) for number in numbers}
 
     def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
-        """Returns the map digests of entries, with their track alone."""
+        """Returns the map digests of entries, with only their track."""
         topic = self._index.pose_topic
         found = self._packed("map", topic, numbers)
         decoded = decode_map_tracks([(each, NO_STATICS.key) for each in found.values()], own=own)
