@@ -34,8 +34,20 @@ class MovingMap:
         ]
 
 
-def moving_map(draw: Random, seconds: int, *, ahead_s: float = 0.3) -> tuple[MovingMap, list[Msg]]:
-    """Drives between waypoints and stands at each, while odometry drifts against the map."""
+def moving_map(
+    draw: Random,
+    seconds: int,
+    *,
+    ahead_s: float = 0.3,
+    noise_m: float = 0.0,
+    drift_m: float = 0.004,
+    rate: int = 5,
+) -> tuple[MovingMap, list[Msg]]:
+    """Drives between waypoints and stands at each, while odometry drifts against the map.
+
+    On each axis `noise_m` is the standard deviation of each pose of odometry, and `drift_m` that of
+    what the map moves from one pose to the next; there are `rate` of these in a second.
+    """
     truth, messages = MovingMap(), []
     x, y, heading, stands = 0.0, 0.0, 0.0, 30
     target = 1
@@ -43,8 +55,9 @@ def moving_map(draw: Random, seconds: int, *, ahead_s: float = 0.3) -> tuple[Mov
     messages.append(
         tf(BEGIN, transform(BEGIN, "base_link", "cam", (0.2, 0, 0.5)), topic="/tf_static")
     )
-    for step in range(seconds * 5):
-        at = BEGIN + step * 200 * MS
+    stride = 0.4 / rate
+    for step in range(seconds * rate):
+        at = BEGIN + step * S // rate
         goal = _WAYPOINTS[target]
         if stands:
             stands -= 1
@@ -52,9 +65,9 @@ def moving_map(draw: Random, seconds: int, *, ahead_s: float = 0.3) -> tuple[Mov
             stands, target = draw.randint(10, 60), draw.randrange(len(_WAYPOINTS))
         else:
             heading = math.atan2(goal[1] - y, goal[0] - x)
-            x, y = x + 0.08 * math.cos(heading), y + 0.08 * math.sin(heading)
-        dx, dy = dx + draw.gauss(0, 0.004), dy + draw.gauss(0, 0.004)
-        turn += draw.gauss(0, 0.002)
+            x, y = x + stride * math.cos(heading), y + stride * math.sin(heading)
+        dx, dy = dx + draw.gauss(0, drift_m), dy + draw.gauss(0, drift_m)
+        turn += draw.gauss(0, drift_m / 2)
         if draw.random() < 0.003:
             dx += draw.uniform(-2, 2)
         truth.times.append(at)
@@ -63,13 +76,15 @@ def moving_map(draw: Random, seconds: int, *, ahead_s: float = 0.3) -> tuple[Mov
         cos, sin = math.cos(-turn), math.sin(-turn)
         ox = (x - dx) * cos - (y - dy) * sin
         oy = (x - dx) * sin + (y - dy) * cos
+        if noise_m:
+            ox, oy = draw.gauss(ox, noise_m), draw.gauss(oy, noise_m)
         messages.append(odom(at, ox, oy, heading - turn, vx=0.0 if stands else 0.4))
         base = transform(at, "odom", "base_link", (ox, oy, 0.0), heading - turn)
         messages.append(tf(at, base))
         ahead = at + round(ahead_s * S)
         correction = transform(ahead, "map", "odom", (dx, dy, 0.0), turn)
         messages.append(tf(ahead, correction, log_time=at + 3 * MS))
-        if step % 5 == 0:
+        if step % rate == 0:
             messages.append(detections(at + MS, ["cup"], at=(1.0, 0.2, 0.1)))
     return truth, messages
 

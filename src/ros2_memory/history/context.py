@@ -14,9 +14,10 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.topic_events import State
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.core.model import BagFile, TimeWindow
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.retention.policy import RetentionLimits
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.base import BagReader, Record
 
 ClockOfTransforms = Literal["auto", "stamp", "log"]
 NowOfMemory = Literal["wall", "latest"]
@@ -102,7 +103,9 @@ class SnapshotSource(Protocol):
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
-    `recall` holds digests of the bags. Every answer is the same with it and without.
+    `recall` holds digests of the bags. Every answer is the same with it and without. `stated` is
+    given where messages are not there as they were, but what was kept of them: it returns what a
+    message states, or None for one that can be decoded. Positions inside of bags are thinned there.
     """
 
     index: SnapshotSource
@@ -111,6 +114,7 @@ class Memory:
     clock: Clock
     limits: QuerySettings
     recall: DigestCache | None = None
+    stated: Callable[[Record], State | None] | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.

@@ -26,6 +26,7 @@ from ros2_memory.catalogue.codec import (
     encode_standstills,
 )
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_S,
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import Pose, TimeWindow
+    from ros2_memory.core.model import Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.driven_path import DrivenPath
@@ -177,6 +178,18 @@ def _encoded(joined: StandstillDigest | StandstillRun) -> bytes:
     return encode_standstill_run(joined)
 
 
+def _whole_bags(view: View, topic: str, window: TimeWindow) -> TimeWindow:
+    """Returns a window, or where positions inside of bags are thinned, that of all its bags.
+
+    They have digests of every position.
+    """
+    extents = [] if view.memory.stated is None else [*view.snapshot.timeline.extents(topic, window)]
+    if not extents:
+        return window
+    first, last = min(each.first for each in extents), max(each.last for each in extents)
+    return TimeWindow(min(first, window.start), max(last + 1, window.stop))
+
+
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
@@ -213,7 +226,7 @@ def _standstills_in(
         encode=_encoded,
         decode=decode_standstill_run,
         failures=failures,
-    ).over(view, topic, window.widened(CONTEXT_NS))
+    ).over(view, topic, _whole_bags(view, topic, window.widened(CONTEXT_NS)))
     found = builder.standstills()
     begins = [each.start for each in found]
     standstills = tuple(

@@ -109,8 +109,13 @@ def collect_events(
 
 def add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
     """Adds what messages of one topic report, in log-time order."""
+    stated = view.memory.stated
     for found in messages:
         channel = found.record.channel
+        state = None if stated is None else stated(found.record)
+        if state is not None:
+            to.add(found.time, state)
+            continue
         try:
             message = view.memory.reader.decode(found.record)
         except UndecodableError:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.motion.standstills import StandstillBuilder
 from ros2_memory.analysis.motion.trajectory import TrajectoryBuilder
 from ros2_memory.analysis.sights import Spot, decode_sights
-from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, has_events
+from ros2_memory.analysis.state_changes import has_levels
+from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, has_events, state_of
 from ros2_memory.catalogue.codec import encode_poses, encode_standstills, encode_topic_events
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import DIGEST_VERSION
@@ -26,6 +27,7 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.insights.topic_events import toggled
+from ros2_memory.lake.state_runs import KIND, StateRuns, is_stated
 from ros2_memory.lake.tables import TABLES, microseconds, topic_key
 from ros2_memory.messages.detections import detections_of
 
@@ -36,13 +38,13 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.catalogue.store import Catalogue
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
     from ros2_memory.storage.base import Record
 
-ROWS_VERSION: Final = 1
+ROWS_VERSION: Final = 2
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 _BLOCK: Final = 1 << 20
 _NO_SCORE: Final = -1
@@ -156,7 +158,7 @@ class _BagRows:
         events = {
             topic: self._events(topic)
             for topic, types in self._types.items()
-            if any(map(has_events, types))
+            if any(has_events(each) or has_levels(each) for each in types)
         }
         self._add_poses(in_map, own)
         self._add_digests(in_map, own, events)
@@ -242,24 +244,14 @@ class _BagRows:
         own: MapDigest | None,
         events: Mapping[str, TopicEvents | None],
     ) -> None:
-        version, number, catalogue = str(DIGEST_VERSION), self._number, self._catalogue
-
-        def add(topic: str, kind: str, packed: bytes) -> None:
-            summaries = self._bag.summary.of(topic)
-            first = min((each.first for each in summaries), default=self._bag.start)
-            last = max((each.last for each in summaries), default=self._bag.end)
-            count = sum(each.count for each in summaries)
-            self._rows["digests"].append(
-                (topic, topic_key(topic), kind, version, None, count, first, last, packed)
-            )
-
+        number, catalogue, add = self._number, self._catalogue, self._add_digest
         for each in self._bag.summary.topics:
             self._rows["digests"].append(
                 (
                     each.topic,
                     topic_key(each.topic),
                     "topic",
-                    version,
+                    str(DIGEST_VERSION),
                     each.type,
                     each.count,
                     each.first,
@@ -280,6 +272,16 @@ class _BagRows:
         if in_map is not None:
             add(self._pose_topic, "map", encode_map_track(replace(in_map, own=own)))
             add("", "sights", self._sights())
+
+    def _add_digest(self, topic: str, kind: str, packed: bytes) -> None:
+        summaries = self._bag.summary.of(topic)
+        first = min((each.first for each in summaries), default=self._bag.start)
+        last = max((each.last for each in summaries), default=self._bag.end)
+        count = sum(each.count for each in summaries)
+        version = str(DIGEST_VERSION)
+        self._rows["digests"].append(
+            (topic, topic_key(topic), kind, version, None, count, first, last, packed)
+        )
 
     def _sights(self) -> bytes:
         return self._catalogue.sights([self._number]).get(self._number, (0, b""))[1]
@@ -351,7 +353,7 @@ class _BagRows:
         messages: Sequence[str],
         in_map: MapDigest | None,
     ) -> None:
-        """Reads the detections of the bag, and the messages of the chosen topics."""
+        """Reads the detections of the bag, what messages state, and those of the chosen topics."""
         wants = DetectorSights(self._memory.reader, self._memory.extractor).wants
         # What the digest of a topic rules out is not read.
         seen = {
@@ -361,30 +363,45 @@ class _BagRows:
             and any(wants(topic, each) for each in self._types[topic])
         }
         whole = {topic for topic in messages if topic in self._types}
-        if not seen and not whole:
+        states = {
+            topic: StateRuns()
+            for topic, found in events.items()
+            if topic not in whole and is_stated(found)
+        }
+        topics = tuple(sorted({*seen, *whole, *states}))
+        if not topics:
             return
         robot = _RobotAt(in_map)
         numbers: dict[str, int] = {}
-        records = self._memory.reader.records(
-            self._bag.path, tuple(sorted(seen | whole)), TimeWindow.everything()
-        )
-        for record in records:
+        for record in self._memory.reader.records(self._bag.path, topics, TimeWindow.everything()):
             topic = record.channel.topic
             nth = numbers[topic] = numbers.get(topic, -1) + 1
             if topic in whole:
                 self._rows["messages"].append(self._message(record, nth))
-            if topic in seen:
-                self._rows["sightings"] += self._sightings(record, nth, robot)
+            value = self._decoded(record) if topic in seen or topic in states else None
+            if topic in seen and value is None:
+                self._undecodable += 1
+            elif topic in seen and value is not None:
+                self._rows["sightings"] += self._sightings(record, nth, value, robot)
+            if topic in states:
+                state = None if value is None else state_of(value.shown, record.channel.type)
+                states[topic].add(record.log_time, state)
+        for topic, runs in states.items():
+            self._add_digest(topic, KIND, runs.packed())
 
-    def _sightings(self, record: Record, nth: int, robot: _RobotAt) -> Iterator[Row]:
-        memory, channel, time = self._memory, record.channel, record.log_time
+    def _decoded(self, record: Record) -> _Decoded | None:
         try:
-            message = memory.reader.decode(record)
+            message = self._memory.reader.decode(record)
         except UndecodableError:
-            self._undecodable += 1
-            return
-        value = memory.extractor.exact(message, channel.type)
-        detections = detections_of(value, memory.extractor.frame(message))
+            return None
+        extractor = self._memory.extractor
+        return _Decoded(extractor.exact(message, record.channel.type), extractor.frame(message))
+
+    def _sightings(
+        self, record: Record, nth: int, value: _Decoded, robot: _RobotAt
+    ) -> Iterator[Row]:
+        channel, time = record.channel, record.log_time
+        detections = detections_of(value.shown, value.frame_id)
         if not detections:
             return
         start = (
@@ -420,6 +437,13 @@ class _BagRows:
             value,
             reason,
         )
+
+
+class _Decoded(NamedTuple):
+    """What a message shows, and the frame that its header names."""
+
+    shown: JsonValue
+    frame_id: str
 
 
 class _RobotAt:

@@ -93,10 +93,14 @@ class LakeCatalogue(Catalogue):
         return _decoded(self._packed("standstills", topic, numbers), decode_standstills)
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
-        """Returns the events on the topic."""
+        """Returns the events on the topic; of digests of another version nothing is known."""
         found = self._packed("events", topic, numbers)
         known = _decoded(found, decode_topic_events)
-        return {number: known.get(number, NO_EVENTS) for number in numbers}
+        return {
+            number: known.get(number, NO_EVENTS)
+            for number in numbers
+            if number in known or self._index.bag(number).is_current
+        }
 
     def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
         """Returns the map digests of entries, with only their track."""

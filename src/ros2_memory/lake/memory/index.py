@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
@@ -35,7 +36,7 @@ _BAGS: Final = (
     " ORDER BY start_ns, end_ns, bag_id"
 )
 _TOPICS: Final = (
-    "SELECT bag_id, topic, type, messages, first_ns, last_ns FROM digests"
+    "SELECT bag_id, topic, type, messages, first_ns, last_ns, version FROM digests"
     " WHERE kind = 'topic' AND messages > 0 AND bag_id IN (SELECT bag_id FROM bags)"
 )
 _DAYS: Final = "SELECT min(day) AS first, max(day) AS last FROM bags"
@@ -48,10 +49,12 @@ class LakeBag:
     Attributes:
         bag_id: its id there.
         day: the day that its rows are under.
+        is_current: whether its digests are of the version that is joined here.
     """
 
     bag_id: str
     day: date
+    is_current: bool
 
 
 class LakeIndex:
@@ -177,7 +180,10 @@ class LakeIndex:
         bags = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=days)
         topics = self._lake.select(_TOPICS, ["digests", "bags"], robots=[self._robot], days=days)
         summaries = _summaries(bags["bag_id"].to_pylist(), topics)
-        files = [*self._files(bags.to_pylist(), summaries)]
+        versions = dict(
+            zip(topics["bag_id"].to_pylist(), topics["version"].to_pylist(), strict=True)
+        )
+        files = [*self._files(bags.to_pylist(), summaries, versions)]
         self._files_by_name = {bag.file: bag for bag in files}
         self._detectors = self._topics_in("sightings", days)
         self._whole_topics = self._topics_in("messages", days)
@@ -189,7 +195,10 @@ class LakeIndex:
         return frozenset(rows["topic"].to_pylist())
 
     def _files(
-        self, rows: Sequence[Mapping[str, object]], summaries: Mapping[int, BagSummary]
+        self,
+        rows: Sequence[Mapping[str, object]],
+        summaries: Mapping[int, BagSummary],
+        versions: Mapping[str, str],
     ) -> Iterator[BagFile]:
         for nth, row in enumerate(rows):
             if nth not in summaries:
@@ -197,7 +206,8 @@ class LakeIndex:
             key = str(row["bag_id"]), str(row["sha256"]), str(row["made_of"])
             number = self._numbers.get(key)
             if number is None:
-                self._bags.append(LakeBag(key[0], _day(row["day"])))
+                is_current = versions[key[0]] == str(DIGEST_VERSION)
+                self._bags.append(LakeBag(key[0], _day(row["day"]), is_current))
                 number = self._numbers[key] = len(self._bags)
             # Numbered in the order of time, as the splits of one recording are.
             yield BagFile(

@@ -7,14 +7,19 @@ import threading
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.state_changes import has_levels
+from ros2_memory.analysis.topic_events import EMPTY_STATE, has_events
 from ros2_memory.core.errors import NotShippedError, UndecodableError
 from ros2_memory.lake.memory.rows_as_messages import (
     Tracks,
     channel,
     detections,
     even_times,
+    is_only_stated,
     message,
+    states,
 )
+from ros2_memory.lake.state_runs import KIND, StateRun, unpacked
 from ros2_memory.lake.tables import topic_key
 from ros2_memory.storage.base import BagReader, Closing
 
@@ -49,10 +54,18 @@ _POSES: Final = (
     "SELECT time_ns, frame_id, x, y, heading, begins FROM poses"
     " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns"
 )
+_STATES: Final = (
+    "SELECT kind, packed FROM digests"
+    " WHERE topic_key = $key AND topic = $topic AND kind IN ('events', $kind) AND bag_id = $bag"
+)
+_MOST_EMPTY: Final = 64
+"""Messages that state nothing, of a topic in a bag, which stand for all of them."""
 
 
 class LakeReader(BagReader):
     """Makes messages of rows: of detections, of the chosen topics, and of the robot's track.
+
+    Of topics with events there is what each message states, and nothing that could be shown.
 
     A detection has its label, score and place alone. A message without detections has no row: where
     some are left out between two, one stands for them.
@@ -128,15 +141,19 @@ class LakeReader(BagReader):
         Of a topic without rows they are taken to be as far apart as they were on average.
         """
         try:
-            return [each.log_time for each in self.records(path, [topic], window)]
+            found = [*self.records(path, [topic], window)]
         except NotShippedError:
-            self._served.even = True
-            times = [
-                time
-                for each in self._index.file(path).summary.of(topic)
-                for time in even_times(each.first, each.last, each.count).tolist()
-            ]
-            return sorted(filter(window.contains, times))
+            found = []
+        else:
+            if not any(map(is_only_stated, found)):
+                return [each.log_time for each in found]
+        self._served.even = True
+        times = [
+            time
+            for each in self._index.file(path).summary.of(topic)
+            for time in even_times(each.first, each.last, each.count).tolist()
+        ]
+        return sorted(filter(window.contains, times))
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns None: rows are of messages that could be decoded."""
@@ -152,10 +169,13 @@ class LakeReader(BagReader):
 
         Raises:
             UndecodableError: the message could not be decoded when it was shipped.
+            NotShippedError: only what it states was shipped.
         """
+        here = record.channel
         if not record.payload:
-            here = record.channel
             raise UndecodableError(here.topic, here.type, "when it was shipped")
+        if is_only_stated(record):
+            raise _not_shipped(here.topic)
         return json.loads(record.payload)
 
     def take_notes(self) -> Iterator[str]:
@@ -194,10 +214,31 @@ class LakeReader(BagReader):
             return self._tracks(bag, here).poses(topic)
         if topic in self._tf_topics:
             return self._tracks(bag, here).transforms(topic)
-        raise NotShippedError(
-            f"the lake has no messages of {topic}: name it in lake.messages of ros2-memory ship, "
-            "or ask the robot's own memory"
+        [summary, *_] = bag.summary.of(topic)
+        if has_events(summary.type) or has_levels(summary.type):
+            return [*states(topic, summary.type, self._runs(bag, here, topic))]
+        raise _not_shipped(topic)
+
+    def _runs(self, bag: BagFile, here: LakeBag, topic: str) -> Iterator[StateRun]:
+        """Yields what messages state; they state nothing where their digest has no event.
+
+        Raises:
+            NotShippedError: it was shipped by a version that did not ship what messages state.
+        """
+        asked = {"key": topic_key(topic), "topic": topic, "bag": here.bag_id, "kind": KIND}
+        rows = self._lake.select(
+            _STATES, ["digests"], asked, robots=[self._robot], days=(here.day, here.day)
         )
+        packed = dict(zip(rows["kind"].to_pylist(), rows["packed"].to_pylist(), strict=True))
+        known = packed.get(KIND)
+        if isinstance(known, bytes):
+            yield from unpacked(known)
+        elif packed:
+            raise _not_shipped(topic)
+        else:
+            for each in bag.summary.of(topic):
+                count = min(each.count, _MOST_EMPTY)
+                yield StateRun(EMPTY_STATE, each.first, each.last, count)
 
     def _sightings(self, bag: LakeBag, topic: str) -> Sequence[Mapping[str, JsonValue]]:
         key = self._index.version, topic, bag.day
@@ -232,3 +273,10 @@ class LakeReader(BagReader):
             sql, [table], asked, robots=[self._robot], days=days
         ).to_pylist()
         return rows
+
+
+def _not_shipped(topic: str) -> NotShippedError:
+    return NotShippedError(
+        f"the lake has no messages of {topic}: name it in lake.messages of ros2-memory ship, or "
+        "ask the robot's own memory"
+    )

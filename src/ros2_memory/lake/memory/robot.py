@@ -11,6 +11,7 @@ from ros2_memory.history.context import Memory
 from ros2_memory.lake.memory.catalogue import LakeCatalogue
 from ros2_memory.lake.memory.index import LakeIndex
 from ros2_memory.lake.memory.reader import LakeReader
+from ros2_memory.lake.memory.rows_as_messages import stated_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -83,7 +84,7 @@ class LakeRobot:
         # Nothing is recorded here, and nothing deleted.
         own = replace(limits, kept=None, recording="", screened=False)
         self.memory = Memory(
-            self._index, self._reader, LakeExtractor(extractor), clock, own, recall
+            self._index, self._reader, LakeExtractor(extractor), clock, own, recall, stated_in
         )
 
     @property

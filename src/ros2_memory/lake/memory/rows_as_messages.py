@@ -1,24 +1,31 @@
-"""Rows of a lake as messages: detections, whole messages, and the robot's track as poses."""
+"""Rows of a lake as messages: detections, whole ones, states, and the robot's track as poses."""
 
 from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.lake.state_runs import state_of_lists
 from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.topic_events import State
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.lake.state_runs import StateRun
 
     Row = Mapping[str, JsonValue]
+
+_STATED: Final = "stated"
+"""The encoding of messages of which only what they state is known."""
+_SEVERAL: Final = 3
 
 
 def channel(topic: str, type_name: str) -> Channel:
@@ -40,26 +47,52 @@ def message(topic: str, row: Row) -> Record:
     return found if isinstance(text, str) else found._replace(payload=b"")
 
 
-def detections(bag: BagFile, topic: str, rows: Sequence[Row]) -> Sequence[Record]:
-    """Returns the messages with detections, and one for those without between any two.
+def states(topic: str, type_name: str, runs: Iterable[StateRun]) -> Iterator[Record]:
+    """Yields messages that have nothing but what they state: `stated_in` has that.
 
-    That one has no time of its own: it ends sightings, and is nothing that is shown.
+    Those of a run are equally far apart. An undecodable one has no payload.
+    """
+    here = Channel(topic, _STATED, Schema(type_name))
+    for state, first, last, count in runs:
+        payload = b"" if state is None else json.dumps(state).encode()
+        for time in even_times(first, last, count).tolist():
+            yield Record(here, time, time, payload)
+
+
+def is_only_stated(record: Record) -> bool:
+    """Returns whether no more is known of a message than what it states."""
+    return record.channel.encoding == _STATED
+
+
+def stated_in(record: Record) -> State | None:
+    """Returns what a message states, if no more is known of it; None where it is to be decoded."""
+    is_known = is_only_stated(record) and record.payload
+    return state_of_lists(json.loads(record.payload)) if is_known else None
+
+
+def detections(bag: BagFile, topic: str, rows: Sequence[Row]) -> Sequence[Record]:
+    """Returns the messages with detections, and of those without between any two at most two.
+
+    These are the first and the last, as if messages were equally far apart there. They end
+    sightings, and are nothing that is shown.
     """
     [summary, *_] = bag.summary.of(topic)
     messages: dict[int, tuple[Ns, list[JsonValue]]] = {}
     for row in rows:
         entry = messages.setdefault(_ns(row["message"]), (_ns(row["time_ns"]), []))
         entry[1].append(_detection(row))
+    for nth, time in ((0, summary.first), (summary.count - 1, summary.last)):
+        messages.setdefault(nth, (time, []))
     records: list[Record] = []
     before, reached = -1, summary.first
-    for nth, (time, detections) in sorted(messages.items()):
-        if nth > before + 1:
-            at = summary.first if before < 0 else min(reached + 1, time)
-            records.append(record(topic, summary.type, at, {"detections": []}))
-        records.append(record(topic, summary.type, time, {"detections": detections}))
+    for nth, (time, found) in sorted(messages.items()):
+        missing = even_times(reached, time, nth - before + 1)[1:-1].tolist()
+        records += [
+            record(topic, summary.type, each, {"detections": []})
+            for each in (missing if len(missing) < _SEVERAL else (missing[0], missing[-1]))
+        ]
+        records.append(record(topic, summary.type, time, {"detections": found}))
         before, reached = nth, time
-    if before < summary.count - 1:
-        records.append(record(topic, summary.type, summary.last, {"detections": []}))
     return records
 
 

@@ -1,0 +1,134 @@
+"""A lake answers as the memories do about robots with noise, a moving map and much that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from ros2_memory.catalogue.digest import DIGEST_VERSION
+from ros2_memory.core.errors import NotShippedError
+from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from tests.support.fleets import fleet_memory
+from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots
+from tests.support.memories import recalling
+from tests.support.moving_map import BEGIN, S
+from tests.support.noisy_robots import LENGTH_S, write_noisy_robot
+from tests.unit.lake.test_questions import Robots, reply
+
+NAMES = ("attic", "hall")
+START_S = BEGIN // S
+SPOT: dict[str, object] = {"where": {"x": 3.0, "y": 1.0, "radius_m": 1.5}}
+ALL: dict[str, object] = {"start": START_S, "end": START_S + LENGTH_S}
+SEEN: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "ghost"}
+PATH_M = 0.2
+"""Of a path between two times that cut bags: at each its end, and what noise adds near it."""
+PLACE_M = 0.08
+"""Of the thinned track, and what a robot drives between two of its poses' times."""
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
+    folder = tmp_path_factory.mktemp("robots")
+    memories = {}
+    for name in NAMES:
+        bag_dir = write_noisy_robot(name, folder / name)
+        memories[name] = recalling(fleet_memory(bag_dir), bag_dir)
+    catalog = lake_in(tmp_path_factory.mktemp("lake"))
+    fill(catalog, memories)
+    engine = DuckdbEngine(memory_mb=256, threads=1)
+    of_lake = lake_robots(catalog, engine, NAMES)
+    over_lake = {name: each.memory for name, each in of_lake.items()}
+    yield Robots(fleet_of(memories, shared_map=True), fleet_of(over_lake, shared_map=True), of_lake)
+    engine.close()
+
+
+def both(robots: Robots, tool: str, given: dict[str, object]) -> tuple[Any, Any]:
+    expected, found = (reply(each, tool, given) for each in robots[:2])
+    assert "error" not in expected
+    return expected, found
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("recap", ALL),
+        ("find_things", {}),
+        ("visits", SPOT),
+        ("trajectory_summary", {**ALL, "by": "day"}),
+        ("find_matches", {**SEEN, "by": "hour"}),
+        ("find_last_match", {**SEEN, "value": "elephant"}),
+    ],
+)
+def test_what_is_folded_of_whole_bags_is_equal(
+    robots: Robots, tool: str, given: dict[str, object]
+) -> None:
+    expected, found = both(robots, tool, given)
+    assert found == expected
+
+
+def cuts() -> Iterator[dict[str, object]]:
+    """Times that cut bags at either end."""
+    draw = Random(16)
+    for nth in range(8):
+        start = draw.uniform(0, 40)
+        end = draw.uniform(start + 4, LENGTH_S)
+        yield {"start": START_S + start, "end": START_S + end, "robot": NAMES[nth % 2]}
+
+
+def test_a_recap_of_a_time_that_cuts_bags_differs_by_the_path_alone(robots: Robots) -> None:
+    kinds: set[str] = set()
+    for given in cuts():
+        expected, found = both(robots, "recap", given)
+        kinds.update(expected["counts"])
+        apart = {
+            "distance_m": PATH_M + 0.02 * expected["distance_m"],
+            "max_speed": 0.05,
+        }
+        for name, most in apart.items():
+            assert abs(found.pop(name) - expected.pop(name)) <= most, (name, given)
+        for each in (expected, found):
+            # What noise adds is not in a track that is thinned.
+            each.pop("path_sum_m", None)
+            each["notes"] = [note for note in each.get("notes", []) if "noisy" not in note]
+        assert found == expected, given
+    assert kinds >= {"errors", "failed goals", "stops", "flips", "goals", "sights of things"}
+
+
+def test_what_changed_before_a_moment_needs_the_battery_alone(robots: Robots) -> None:
+    refused = reply(robots.lake, "recap", {"around": START_S + 30.5, "robot": "hall"})
+    assert refused["error"] == NotShippedError.code
+    assert "/battery_state" in refused["detail"]
+
+
+def test_things_and_sightings_of_a_time_that_cuts_bags(robots: Robots) -> None:
+    for given in list(cuts())[:3]:
+        expected, found = both(robots, "find_matches", {**SEEN, **given, "limit": 50})
+        assert expected["sightings"]
+        for one, other in zip(expected["sightings"], found["sightings"], strict=True):
+            one.pop("place"), other.pop("place")
+            mine, its = one.pop("robot"), other.pop("robot")
+            assert all(abs(mine[axis] - its[axis]) <= PLACE_M for axis in "xy")
+        assert found == expected
+
+
+def test_events_are_known_where_digests_are_of_another_version(
+    robots: Robots, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    memories = {"hall": robots.mounted.robots["hall"].memory()}
+    with monkeypatch.context() as patched:
+        patched.setattr("ros2_memory.lake.rows.DIGEST_VERSION", DIGEST_VERSION + 1)
+        catalog = lake_in(tmp_path)
+        fill(catalog, memories)
+    engine = DuckdbEngine(memory_mb=256, threads=1)
+    of_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory
+    found = reply(fleet_of({"hall": of_lake}), "recap", {**ALL, "robot": "hall"})
+    expected = reply(robots.mounted, "recap", {**ALL, "robot": "hall"})
+    reported = ("errors", "failed goals", "flips", "goals", "sights of things")
+    assert [found["counts"].get(each) for each in reported] == [
+        expected["counts"].get(each) for each in reported
+    ]
+    engine.close()

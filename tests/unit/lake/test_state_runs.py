@@ -1,0 +1,71 @@
+"""What messages state is the same after it was packed."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.state_changes import StateLevel
+from ros2_memory.analysis.topic_events import EMPTY_STATE, State, TopicEvents, TopicEventsBuilder
+from ros2_memory.lake.memory.rows_as_messages import stated_in, states
+from ros2_memory.lake.state_runs import StateRuns, is_stated, unpacked
+
+STATES = (
+    EMPTY_STATE,
+    State(flags=(("value", True),)),
+    State(flags=(("value", False),)),
+    State(errors=("lidar: no scan",), levels=(StateLevel("status lidar", 2, "no scan"),)),
+    State(levels=(StateLevel("goal 01", 4),)),
+    State(reports=("warning of planner: no path",)),
+    State(labels=("cup",), scores=(0.25,), flags=(("held", True),)),
+    None,
+)
+MESSAGES = st.lists(
+    st.tuples(st.integers(1, 5_000_000_000), st.sampled_from(STATES)), min_size=1, max_size=30
+)
+
+
+def added(stated: list[tuple[int, State | None]]) -> TopicEvents | None:
+    builder = TopicEventsBuilder()
+    for time, state in stated:
+        if state is None:
+            builder.add_undecodable()
+        else:
+            builder.add(time, state)
+    return builder.events()
+
+
+@given(MESSAGES)
+def test_all_that_follows_from_states_is_kept(steps: list[tuple[int, State | None]]) -> None:
+    time, messages = 1_784_000_000 * 10**9, []
+    for step, state in steps:
+        time += step
+        messages.append((time, state))
+    runs = StateRuns()
+    for each in messages:
+        runs.add(*each)
+    found = [
+        (record.log_time, stated_in(record))
+        for record in states("/state", "x/msg/X", unpacked(runs.packed()))
+    ]
+    assert [state for _, state in found] == [state for _, state in messages]
+    assert [at for at, _ in found] == sorted(at for at, _ in found)
+    before, expected = added(messages), added(found)
+    assert before is not None
+    assert expected is not None
+    # Sights are told by the times of all messages, and are not asked of states alone.
+    assert (before.toggles, before.errors, before.known, before.undecodable) == (
+        expected.toggles,
+        expected.errors,
+        expected.known,
+        expected.undecodable,
+    )
+    assert before.changes == expected.changes
+
+
+def test_a_topic_that_states_nothing_more_than_what_is_in_view_has_no_states() -> None:
+    seen = added([(1, State(labels=("cup",)))])
+    assert not is_stated(seen)
+    assert is_stated(added([(1, State(flags=(("value", True),)))]))
+    assert is_stated(added([(1, None)]))
+    assert is_stated(None)
