@@ -16,7 +16,7 @@ import json
 import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from itertools import combinations
+from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 Ints: TypeAlias = NDArray[np.int64]
+Bytes: TypeAlias = NDArray[np.uint8]
 K = TypeVar("K")
 
 CELL_MM: Final = 250
@@ -581,78 +582,83 @@ def decode_joined(packed: Sequence[bytes]) -> tuple[Sights, list[int], list[str]
 
 def _decoded(packed: Sequence[bytes], which: list[int]) -> tuple[Sights, list[int], list[str]]:
     heads = _heads(packed)
-    topics: dict[str, int] = {}
-    labels: dict[str, int] = {}
-    of_topic, of_label = (
-        [np.array([names.setdefault(each, len(names)) for each in own], np.int64) for own in owns]
-        for names, owns in (
-            (topics, [head.topics for head in heads]),
-            (labels, [head.labels for head in heads]),
-        )
-    )
-    counts = np.array([[rows for rows, _ in head.shapes] for head in heads], np.int64)
-    counts = counts.reshape(len(heads), len(_TABLES))
+    counts, sizes = heads.shapes[:, :, 0], heads.shapes[:, :, 1]
+    starts, stored = heads.starts.copy(), np.frombuffer(b"".join(packed), np.uint8)
     tables: list[Ints] = []
-    starts = [head.body for head in heads]
     for at, (columns, times) in enumerate(zip(_TABLES, _TIMES, strict=True)):
-        begins = np.concatenate(([0], np.cumsum(counts[:, at])))
-        zigzag = np.zeros((len(columns), int(begins[-1])), np.int64)
-        for nth, head in enumerate(heads):
-            rows, size = head.shapes[at]
-            if rows:
-                own = zigzag[:, begins[nth] : begins[nth + 1]]
-                _fill(own, packed[nth], starts[nth], size)
-                starts[nth] += rows * len(columns) * size
-        tables.append(_summed(zigzag, begins))
-        base = np.repeat(np.array([head.base for head in heads], np.int64), counts[:, at])
+        rows = counts[:, at]
+        zigzag = _values(stored, starts, rows, sizes[:, at], len(columns))
+        tables.append(_summed(zigzag, rows))
+        starts += rows * len(columns) * sizes[:, at]
         for column in times:
+            base = np.repeat(heads.base, rows)
             tables[-1][:, column] = tables[-1][:, column] * _NS_PER_US + base
-    _renumber(tables, counts, (of_topic, of_label))
-    whole = Sights(tuple(topics), tuple(labels), tuple(tables), len(heads))
-    return whole, which, [head.frame_id for head in heads]
+    topics, labels = _Names(heads.topics), _Names(heads.labels)
+    _renumber(tables, counts, topics, labels)
+    whole = Sights((*topics.numbers,), (*labels.numbers,), tuple(tables), len(packed))
+    return whole, which, heads.frames
 
 
-def _renumber(
-    tables: Sequence[Ints], counts: Ints, names: tuple[Sequence[Ints], Sequence[Ints]]
-) -> None:
+class _Names:
+    """The names of many bags, each with its own list, numbered throughout.
+
+    Attributes:
+        of: the number of each name of each bag, one bag after the other; `first` is where each
+            bag's begin.
+    """
+
+    def __init__(self, by_bag: Sequence[Sequence[str]]) -> None:
+        every = [*chain.from_iterable(by_bag)]
+        self.numbers = {name: number for number, name in enumerate(dict.fromkeys(every))}
+        self.of = np.array([*map(self.numbers.__getitem__, every)], np.int64)
+        counts = np.array([*map(len, by_bag)], np.int64)
+        self.first: Ints = np.cumsum(counts) - counts
+
+
+def _renumber(tables: Sequence[Ints], counts: Ints, topics: _Names, labels: _Names) -> None:
     """Numbers bags, spots, looks, topics and labels of many bags throughout."""
     spot, look, hit, score, beside, unplaced = tables
 
     def each(at: int, values: Ints) -> Ints:
         return np.repeat(values, counts[:, at])
 
-    own: list[Ints] = []
-    for of_bags in names:
-        first = np.concatenate(([0], np.cumsum([len(each) for each in of_bags])[:-1]))
-        own.append(first.astype(np.int64) if of_bags else np.zeros(0, np.int64))
-    topic, label = (np.concatenate(of) if of else np.zeros(0, np.int64) for of in names)
     for at, table in ((0, spot), (1, look), (5, unplaced)):
         table[:, 0] += each(at, np.arange(len(counts)))
-        table[:, 1] = topic[table[:, 1] + each(at, own[0])]
+        table[:, 1] = topics.of[table[:, 1] + each(at, topics.first)]
     for at, table in ((0, spot), (5, unplaced)):
-        table[:, Spot.LABEL] = label[table[:, Spot.LABEL] + each(at, own[1])]
-    beside[:, Beside.LABEL] = label[beside[:, Beside.LABEL] + each(4, own[1])]
+        table[:, Spot.LABEL] = labels.of[table[:, Spot.LABEL] + each(at, labels.first)]
+    beside[:, Beside.LABEL] = labels.of[beside[:, Beside.LABEL] + each(4, labels.first)]
     spots, looks = (np.cumsum(counts[:, at]) - counts[:, at] for at in (0, 1))
     hit[:, Hit.LOOK] += np.where(hit[:, Hit.LOOK] < 0, 0, each(2, looks))
     for at, table in ((2, hit), (3, score), (4, beside)):
         table[:, 0] += each(at, spots)
 
 
-class _Head(NamedTuple):
-    """What precedes the tables in the bytes of sights; `body` is where these begin."""
+class _Heads(NamedTuple):
+    """What precedes the tables in the bytes of the sights of bags.
 
-    base: Ns
-    frame_id: str
-    topics: tuple[str, ...]
-    labels: tuple[str, ...]
-    shapes: tuple[tuple[int, int], ...]
-    body: int
+    Attributes:
+        base: the times of each bag count from this (ns).
+        shapes: of each bag and table, the number of rows, and of bytes of a number.
+        starts: where each bag's tables begin in the bytes of all bags together.
+    """
+
+    base: Ints
+    frames: list[str]
+    topics: list[list[str]]
+    labels: list[list[str]]
+    shapes: Ints
+    starts: Ints
 
 
-_WIDTHS: Final = tuple(len(each) for each in _TABLES)
+_WIDTHS: Final = np.array([len(each) for each in _TABLES], np.int64)
+_SIZES: Final = (1, 2, 4, 8)
+"""Of the numbers of a table, in bytes."""
+_FIELDS: Final = 5
+"""Base, frame, topics, labels, shapes: what precedes the tables of a bag."""
 
 
-def _heads(packed: Sequence[bytes]) -> list[_Head]:
+def _heads(packed: Sequence[bytes]) -> _Heads:
     """Decodes what precedes the tables of each.
 
     Raises:
@@ -662,32 +668,54 @@ def _heads(packed: Sequence[bytes]) -> list[_Head]:
     texts = [each[:end] for each, end in zip(packed, ends, strict=True)]
     # As one text: a call for each of thousands takes four times as long.
     decoded = json.loads(b"[" + b",".join(texts) + b"]")
-    heads: list[_Head] = []
-    for each, end, (base, frame_id, topics, labels, shapes) in zip(
-        packed, ends, decoded, strict=True
-    ):
-        if len(shapes) != len(_WIDTHS):
-            raise ValueError("not sights: tables are missing")
-        size = sum(rows * width * size for (rows, size), width in zip(shapes, _WIDTHS, strict=True))
-        if end + 1 + size != len(each):
-            raise ValueError("not sights: some of them are missing")
-        heads.append(_Head(int(base), frame_id, topics, labels, shapes, end + 1))
-    return heads
+    if len(decoded) != len(packed) or any(len(each) != _FIELDS for each in decoded):
+        raise ValueError("not sights: something else precedes the tables")
+    base, frames, topics, labels, shapes = (
+        [each[nth] for each in decoded] for nth in range(_FIELDS)
+    )
+    if any(len(each) != len(_WIDTHS) for each in shapes):
+        raise ValueError("not sights: tables are missing")
+    of_tables = np.array(shapes, np.int64).reshape(len(packed), len(_WIDTHS), 2)
+    rows, sizes = of_tables[:, :, 0], of_tables[:, :, 1]
+    if (rows < 0).any() or not np.isin(sizes, _SIZES).all():
+        raise ValueError("not sights: no table has such a shape")
+    lengths = np.array([*map(len, packed)], np.int64)
+    bodies = np.array(ends, np.int64) + 1
+    if (bodies + (rows * sizes * _WIDTHS).sum(axis=1) != lengths).any():
+        raise ValueError("not sights: some of them are missing")
+    starts = np.cumsum(lengths) - lengths + bodies
+    return _Heads(np.array(base, np.int64), frames, topics, labels, of_tables, starts)
 
 
-def _fill(table: Ints, packed: bytes, start: int, size: int) -> None:
-    """Fills a table, which has a row for each column, with zigzag numbers of so many bytes."""
-    planes = np.frombuffer(packed, np.uint8, table.size * size, start).reshape(size, table.size)
-    values = planes if size == 1 else np.ascontiguousarray(planes.T).view(f"<u{size}")
-    table[:] = values.reshape(table.shape)
+def _values(stored: Bytes, starts: Ints, rows: Ints, sizes: Ints, columns: int) -> Ints:
+    """Returns the zigzag numbers of one table of all bags, a row for each column.
+
+    Each bag has so many rows of so many columns, all first bytes first, of numbers of its own size.
+    """
+    found = np.zeros((columns, int(rows.sum())), np.int64)
+    begins = np.cumsum(rows) - rows
+    # All bags of one size at once: there are thousands, with some rows each.
+    for size in np.unique(sizes[rows > 0]).tolist():
+        of = np.flatnonzero((sizes == size) & (rows > 0))
+        n = rows[of]
+        nth = np.arange(int(n.sum())) - np.repeat(np.cumsum(n) - n, n)
+        to, step = np.repeat(begins[of], n) + nth, np.repeat(n, n)
+        at = np.repeat(starts[of], n) + nth
+        for column in found:
+            values = stored[at].astype(np.int64)
+            for plane in range(1, size):
+                values |= stored[at + plane * columns * step].astype(np.int64) << 8 * plane
+            column[to] = values
+            at += step
+    return found
 
 
-def _summed(zigzag: Ints, begins: Ints) -> Ints:
+def _summed(zigzag: Ints, counts: Ints) -> Ints:
     """Returns the rows of a table of several bags, whose steps start again with each."""
     # Summed where the numbers of a column lie together, which is several times as fast.
     sums = np.cumsum((zigzag >> 1) ^ -(zigzag & 1), axis=1)
-    before = np.concatenate((np.zeros((len(sums), 1), np.int64), sums), axis=1)[:, begins[:-1]]
-    rows: Ints = (sums - np.repeat(before, np.diff(begins), axis=1)).T
+    before = np.concatenate((np.zeros((len(sums), 1), np.int64), sums), axis=1)
+    rows: Ints = (sums - np.repeat(before[:, np.cumsum(counts) - counts], counts, axis=1)).T
     return rows
 
 

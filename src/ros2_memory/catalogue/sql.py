@@ -26,7 +26,7 @@ from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.map_digest import MapDigest
@@ -120,13 +120,23 @@ def packed_by_model(connection: sqlite3.Connection, topic: int, kind: str, plain
 def message_rows(
     connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
 ) -> list[sqlite3.Row]:
-    """Returns row id, channel, log time, publish time and payload of stored messages, in order."""
+    """Returns row id, channel, log time, publish time and payload of stored messages, in order.
+
+    Payloads as of `payloads_of`: those that are alike are one object.
+    """
     return connection.execute(
-        "SELECT bag, channel, log_time, publish_time, payloads.bytes FROM kept"
-        " JOIN payloads ON payloads.id = kept.payload"
+        "SELECT bag, channel, log_time, publish_time, payload FROM kept"
         f" WHERE topic = {_TOPIC} AND bag {_AMONG} ORDER BY bag, nth",
         (topic, json.dumps(row_ids)),
     ).fetchall()
+
+
+def payloads_of(connection: sqlite3.Connection, numbers: Collection[int]) -> dict[int, bytes]:
+    """Returns payloads by their number."""
+    rows = connection.execute(
+        f"SELECT id, bytes FROM payloads WHERE id {_AMONG}", (json.dumps([*numbers]),)
+    )
+    return dict(rows.fetchall())
 
 
 def any_is_gone(connection: sqlite3.Connection, row_ids: Sequence[int]) -> bool:

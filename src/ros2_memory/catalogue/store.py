@@ -53,6 +53,7 @@ from ros2_memory.catalogue.sql import (
     message_rows,
     model_of,
     packed_by_model,
+    payloads_of,
     range_rows,
     renew_entry,
     topic_number,
@@ -342,9 +343,12 @@ class Catalogue(CatalogueDatabase):
             holders = topic_rows(connection, "kept", topic, self.row_ids(numbers))
             found: dict[int, list[Record]] = {number: [] for number, kept in holders if kept}
             rows = message_rows(connection, topic, [*found])
+            stored = payloads_of(connection, {row[4] for row in rows})
+            channels = {each: self._channel(connection, each) for each in {row[1] for row in rows}}
             for number, channel, log_time, publish_time, payload in rows:
-                known = self._channel(connection, channel)
-                found[number].append(Record(known, log_time, publish_time, payload))
+                found[number].append(
+                    Record(channels[channel], log_time, publish_time, stored[payload])
+                )
             return {self.offset + number: tuple(records) for number, records in found.items()}
 
         return self.read(ask, {})

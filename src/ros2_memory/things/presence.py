@@ -81,8 +81,11 @@ class Cells:
                 looks[:, Look.YAW] // CELL_DECIDEG,
             )
         )
-        self._count = int(self.cell.max(initial=-1)) + 1
         order = np.argsort(self.cell, kind="stable")
+        self._by_cell = order
+        self.looks_in = np.bincount(self.cell)
+        self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
+        self._starts = np.cumsum(self.looks_in) - self.looks_in
         after, before = order[1:], order[:-1]
         goes_on = self.cell[after] == self.cell[before]
         goes_on &= self.bag[after] - self.bag[before] <= 1
@@ -91,22 +94,19 @@ class Cells:
         self._before = np.zeros(len(order), np.int64)
         self._before[after] = before
 
-    def looks_like(self, looks: Ints) -> tuple[Ints, Ints]:
-        """Returns all looks from the cells of some, in order of time, and the cell of each.
+    def looks_from(self, cells: Ints) -> Ints:
+        """Returns all looks from some cells, by cell."""
+        return self._by_cell[in_ranges(self._starts[cells], self.looks_in[cells])]
 
-        These cells are numbered from 0 on.
-        """
-        # A table of all cells: sorting the looks of a few cells takes ten times as long.
-        known = np.zeros(self._count, bool)
-        known[self.cell[looks]] = True
-        found = np.flatnonzero(known[self.cell])
-        return found, (np.cumsum(known) - 1)[self.cell[found]]
+    def looks_during(self, bags: Ints) -> Ints:
+        """Returns all looks of some bags."""
+        first = np.searchsorted(self.bag, bags)
+        return in_ranges(first, np.searchsorted(self.bag, bags, side="right") - first)
 
     def repeated_misses(self, looks: Ints, hits: Ints) -> Flags:
         """Returns which looks without a hit repeat the previous one, which had none either.
 
-        `looks` are as of `looks_like`; the one before, from the same cell, is no older than the
-        bag before.
+        The one before, from the same cell, is no older than the bag before.
         """
         seen = np.zeros(len(self.cell), bool)
         seen[looks] = hits > 0
@@ -143,6 +143,13 @@ def field_of_view(away: Floats, bearing: Floats, n: Ints) -> FieldOfView:
     return FieldOfView(far, low, high)
 
 
+def in_ranges(starts: Ints, sizes: Ints) -> Ints:
+    """Returns the numbers from each start on, so many of each, one range after another."""
+    before = np.cumsum(sizes) - sizes
+    numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
+    return numbers
+
+
 def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
     order = np.argsort(values, kind="stable")
     running = np.cumsum(n[order])
@@ -153,8 +160,11 @@ def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
 class Evidence(NamedTuple):
     """The evidence for one place: the looks at it, and those that saw the label there.
 
+    Looks are from cells that saw it at least once. Of a cell that does not see it, but for a false
+    detection once in a while, only those are here that are in a bag in which it was seen.
+
     Attributes:
-        looks: numbers of looks from cells that saw it at least once, in order of time.
+        looks: their numbers, in order of time.
         cell: of each look, numbered from 0 within the place.
         hits: how many messages of each of these looks have the label there.
         blind: hits of messages without a known pose, by bag.
@@ -190,16 +200,24 @@ def evidence_at(
     cells: Cells, view: dict[int, FieldOfView], x: float, y: float, rows: Ints
 ) -> Evidence:
     """Returns the evidence on a place (mm) from its rows of `Hit` with `SPOT` as the bag."""
-    placed = rows[rows[:, Hit.LOOK] >= 0]
+    placed = rows[:, Hit.LOOK] >= 0
     blind: dict[int, int] = {}
-    for bag, look, n in rows.tolist():
-        if look < 0:
-            blind[bag] = blind.get(bag, 0) + n
-    looks, cell = cells.looks_like(placed[:, Hit.LOOK])
+    for bag, _, n in rows[~placed].tolist():
+        blind[bag] = blind.get(bag, 0) + n
+    hit, which = np.unique(rows[placed, Hit.LOOK], return_inverse=True)
+    hits_of = np.bincount(which, rows[placed, Hit.N], len(hit)).astype(np.int64)
+    np.minimum(hits_of, cells.n[hit], out=hits_of)
+    known, cell_of = np.unique(cells.cell[hit], return_inverse=True)
+    sees = _sees(cells, known, cell_of, cells.n[hit], hits_of)
+    # From a dock, ten thousands of looks are at each place of which it once had a false detection.
+    bags = np.unique(np.concatenate((cells.bag[hit], np.array([*blind], np.int64))))
+    beside = cells.looks_during(bags)
+    beside = beside[np.isin(cells.cell[beside], known)]
+    looks = np.union1d(beside, cells.looks_from(known[sees]))
+    cell = np.searchsorted(known, cells.cell[looks])
     hits = np.zeros(len(looks), np.int64)
-    np.add.at(hits, np.searchsorted(looks, placed[:, Hit.LOOK]), placed[:, Hit.N])
-    np.minimum(hits, cells.n[looks], out=hits)
-    fair = _sees(cell, cells.n[looks], hits)[cell]
+    hits[np.searchsorted(looks, hit)] = hits_of
+    fair = sees[cell]
     seeing = looks[fair]
     away, bearing = cells.seen_at(seeing, x, y)
     covered = np.zeros(len(seeing), bool)
@@ -209,17 +227,16 @@ def evidence_at(
     return Evidence(looks, cell, hits, blind, fair)
 
 
-def _sees(cell: Ints, n: Ints, hits: Ints) -> Flags:
-    """Returns from which cells a place is seen, not only reported falsely once in a while.
+def _sees(cells: Cells, known: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
+    """Returns which cells see a place, not only report it falsely once in a while.
 
-    From a dock that faces a wall, ten thousands of messages have some false detections behind it.
+    `cell` has the number among these of each look that saw it, `n` its messages. From a dock that
+    faces a wall, ten thousands of messages have some false detections behind it.
     """
-    cells = int(cell.max(initial=-1)) + 1
-    hit = np.flatnonzero(hits)  # few of them all
-    seen, of = np.bincount(cell[hit], hits[hit], cells), np.bincount(cell, n, cells)
-    looks, hit_looks = np.bincount(cell, minlength=cells), np.bincount(cell[hit], minlength=cells)
+    seen, of = np.bincount(cell, hits, len(known)), cells.messages_in[known]
+    looks, hit_looks = cells.looks_in[known], np.bincount(cell, minlength=len(known))
     enough = (seen >= _FEWEST_HITS) | (of <= _RARE_OF * seen)
-    dense = seen >= _LEAST_RATE * np.bincount(cell[hit], n[hit], cells)
+    dense = seen >= _LEAST_RATE * np.bincount(cell, n, len(known))
     # What other cells see most of the time, a cell that sees it does not miss nearly always.
     share, weight = hit_looks / looks, np.minimum(looks, _MANY_LOOKS)
     others = weight.sum() - weight

@@ -1,0 +1,77 @@
+"""When a label was at a place: which looks are evidence."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.sights import CELL_MM, Hit, Look, Sights, no_sights
+from ros2_memory.things.presence import (
+    Cells,
+    Evidence,
+    FieldOfView,
+    chance_of_missing,
+    evidence_at,
+    stays_at,
+)
+
+_looks = st.lists(
+    st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(1, 16), st.integers(-6, 3)),
+    min_size=1,
+    max_size=60,
+)
+"""Steps to the next bag, the cell, messages, and how often these have the label."""
+
+
+@given(_looks, st.dictionaries(st.integers(0, 100), st.integers(1, 3), max_size=3))
+def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
+    given_looks: list[tuple[int, int, int, int]], unplaced: dict[int, int]
+) -> None:
+    """From where the robot mostly stands, all looks of a week are at what it once saw there."""
+    bag = 0
+    looks: list[tuple[int, ...]] = []
+    rows: list[tuple[int, int, int]] = []
+    for step, place, n, seen in given_looks:
+        bag += step
+        time = len(looks) * 1000
+        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, n, time, time + 900))
+        if seen > 0:  # few looks see it
+            rows.append((bag, len(looks) - 1, seen))
+    rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
+    cells = Cells(_sights(looks, bag + 1), np.zeros(bag + 1, np.int64))
+    hits = np.array(rows, np.int64).reshape(-1, len(Hit))
+    anywhere = {0: FieldOfView(1e9, -180.0, 180.0)}
+    found = evidence_at(cells, anywhere, 3000.0, 100.0, hits)
+
+    whole = _with_every_look(cells, found, hits)
+    left_out = np.setdiff1d(whole.looks, found.looks)
+    seen_in = {bag for bag, *_ in rows}
+    assert not seen_in & {*cells.bag[left_out].tolist()}
+    assert not {*cells.cell[found.looks[found.fair]]} & {*cells.cell[left_out]}
+    assert stays_at(cells, found) == stays_at(cells, whole)
+    for stay in stays_at(cells, found):
+        for after in (0, cells.last[len(looks) // 2]):
+            assert chance_of_missing(cells, found, stay, after) == chance_of_missing(
+                cells, whole, stay, after
+            )
+
+
+def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidence:
+    """Returns evidence with all looks from the cells that saw the place."""
+    seen_in = rows[rows[:, Hit.LOOK] >= 0, Hit.LOOK]
+    known = np.unique(cells.cell[seen_in])
+    looks = np.flatnonzero(np.isin(cells.cell, known))
+    at = np.searchsorted(looks, found.looks)
+    hits, fair = np.zeros(len(looks), np.int64), np.zeros(len(looks), np.bool_)
+    hits[at], fair[at] = found.hits, found.fair
+    np.add.at(of := np.zeros(len(cells.n), np.int64), seen_in, rows[rows[:, 1] >= 0, Hit.N])
+    assert (hits == np.minimum(of, cells.n)[looks]).all()
+    cell = np.searchsorted(known, cells.cell[looks])
+    return Evidence(looks, cell, hits, found.blind, fair)
+
+
+def _sights(looks: list[tuple[int, ...]], bags: int) -> Sights:
+    tables = list(no_sights().tables)
+    tables[1] = np.array(looks, np.int64).reshape(-1, len(Look))
+    return Sights(("/detections",), ("cup",), tuple(tables), bags)
