@@ -253,6 +253,25 @@ class SchemaExtractor:
         above = math.nan if altitude is None else altitude
         return Geodetic(latitude, longitude, above, _text(_FRAME.of(message)))
 
+    def own_path(self, path: str, type_name: str) -> str:
+        """Returns a full path in a message as one in its extracted value.
+
+        Such as `position.x` for `pose.pose.position.x` of an odometry. A path that no mapped field
+        leads to, or that begins with one of their names, is returned as it is.
+        """
+        fields, segments = self._plan(type_name).fields, tuple(path.split("."))
+        if segments[0] in fields:
+            return path
+        leading = [
+            (len(mapped), name)
+            for name, mapped in fields.items()
+            if segments[: len(mapped)] == mapped
+        ]
+        if not leading:
+            return path
+        length, name = max(leading)
+        return ".".join((name, *segments[length:]))
+
     def is_mapped(self, type_name: str) -> bool:
         """Returns whether the schema map lists a type; what any other carries its messages show."""
         return self._plan(type_name) is not _UNMAPPED

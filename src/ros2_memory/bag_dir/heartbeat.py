@@ -73,6 +73,7 @@ class Heartbeat:
         cut_short: topics whose queues hold less than 2 s, for want of `recording.queue_mb`.
         held_back: which splits are not served since `recording.exclude_when` could not be applied,
             and why, as a sentence; else None.
+        failing_rules: why rules of `recording.exclude_when` cannot be evaluated, a sentence each.
         unshipped: which bags were deleted before they were shipped, where `retention` requires
             that, since the recorder started, as a sentence; else None.
         waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
@@ -96,6 +97,7 @@ class Heartbeat:
     cut_short: tuple[str, ...] = ()
     waiting_for: str | None = None
     held_back: str | None = None
+    failing_rules: tuple[str, ...] = ()
     unshipped: str | None = None
 
     def is_live(self, now: Ns) -> bool:

@@ -402,8 +402,15 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.unshipped:
         do = "does ros2-memory ship run? raise retention.max_total_gb until it has caught up"
         yield _warning("recorder", heartbeat.unshipped, do)
-    if heartbeat.held_back:
-        do = "free the disk, or correct the rule; docs/how-to/forget.md explains each key"
+    if heartbeat.failing_rules:
+        do = (
+            "correct the rule in the file that recording.exclude_when names, and restart the "
+            "recorder: it then reads the splits that are held back; see docs/how-to/forget.md"
+        )
+        found = heartbeat.held_back or listed(heartbeat.failing_rules)
+        yield _error("recorder", found, do)
+    elif heartbeat.held_back:
+        do = "free the disk, or repair the file; docs/how-to/forget.md says what becomes of it"
         yield _warning("recorder", heartbeat.held_back, do)
     if heartbeat.last_error:
         seen = f"its last error: {heartbeat.last_error}"

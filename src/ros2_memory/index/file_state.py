@@ -58,7 +58,7 @@ RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
 """The same where it certainly was the machine's: a failed disk, or too many open files."""
 
 _ACTIVE = "still being written"
-HELD_BACK: Final = "not served until recording.exclude_when was applied to it"
+HELD_BACK: Final = "not served yet: recording.exclude_when has still to be applied"
 _ANSWERS = "still being written: its complete chunks are read"
 _NO_MESSAGE = (
     "it ends before its first message: its recorder was killed before any reached the disk"

@@ -11,6 +11,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_excluded, describe_lost, was_forgotten
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
+from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.saved_moments import newest_moments, unlisted
@@ -204,6 +205,10 @@ def bags_with_remarks(snapshot: Snapshot) -> list[BagFile]:
 
 def nothing_here(snapshot: Snapshot) -> str:
     """Returns the sentence on a bag directory in which no bag answers."""
+    held = [each for each in snapshot.active if each.reason == HELD_BACK]
+    if held:
+        splits = counted(len(held), "split")
+        return f"no bag is served yet: recording.exclude_when has still to be applied to {splits}"
     if snapshot.active:
         return "there is no closed bag yet: the first one is still being written"
     if snapshot.empty:

@@ -150,6 +150,10 @@ class Housekeeper:
         """Describes the splits that are not served for a fault, or None."""
         return None
 
+    def failing_rules(self) -> tuple[str, ...]:
+        """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
+        return ()
+
     def age_held(self) -> str | None:
         """Describes the bags that are kept although their dates make them too old, or None."""
         return None

@@ -29,6 +29,7 @@ class HeartbeatWriter:
         events: where a heartbeat that cannot be written is reported.
         age_held: describes bags that are kept though their dates make them too old, or None.
         held_back: describes splits that are not served for a fault, or None.
+        failing_rules: describes each rule of what is excluded that cannot be evaluated.
         unshipped: describes bags that were deleted though they were in no lake and had to be, or
             None.
         expected: gives the topics that are to be recorded by name.
@@ -46,9 +47,11 @@ class HeartbeatWriter:
         expected: Callable[[], Sequence[str]],
         reception: Reception,
         held_back: Callable[[], str | None] = lambda: None,
+        failing_rules: Callable[[], tuple[str, ...]] = tuple,
         unshipped: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._held_back = held_back
+        self._failing_rules = failing_rules
         self._unshipped = unshipped
         self._bag_dir = bag_dir
         self._interval_s = interval_s
@@ -106,6 +109,7 @@ class HeartbeatWriter:
             waiting_for=sessions.waiting_for if state is RecorderState.WAITING else None,
             cut_short=tuple(sorted(self._reception.cut_short)),
             held_back=self._held_back(),
+            failing_rules=self._failing_rules(),
             unshipped=self._unshipped(),
         )
 

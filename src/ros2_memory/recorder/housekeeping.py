@@ -234,6 +234,10 @@ class Housekeeping(Housekeeper):
         """Describes the splits that are not served for a fault, or None."""
         return None if self._screening is None else self._screening.problem()
 
+    def failing_rules(self) -> tuple[str, ...]:
+        """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
+        return () if self._screening is None else self._screening.failing_rules()
+
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
@@ -499,6 +503,10 @@ class BackgroundHousekeeper(Housekeeper):
     def held_back(self) -> str | None:
         """Describes the splits that are not served for a fault, or None."""
         return self._housekeeper.held_back()
+
+    def failing_rules(self) -> tuple[str, ...]:
+        """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
+        return self._housekeeper.failing_rules()
 
     def age_held(self) -> str | None:
         """Describes the bags that are kept though their dates make them too old, or None."""

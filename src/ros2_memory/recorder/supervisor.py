@@ -107,6 +107,7 @@ class Supervisor:
             self._events,
             age_held=housekeeper.age_held,
             held_back=housekeeper.held_back,
+            failing_rules=housekeeper.failing_rules,
             unshipped=housekeeper.unshipped,
             expected=expected,
             reception=self._reception,

@@ -210,6 +210,7 @@ def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
         "waiting_for": None if waits is None else _short(waits),
         "age_held": None if held is None else _short(held),
         "unshipped": None if unshipped is None else _short(unshipped),
+        "failing_rules": [_short(each) for each in heartbeat.failing_rules],
     }
     for kind, topics, most in (
         ("silent", heartbeat.silent, _MAX_TOPICS),

@@ -58,15 +58,23 @@ _UNAVAILABLE: Final = 503
 
 
 def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
-    """Returns whether the recorder records, by what `/health` shows: 200, else 503."""
+    """Returns whether the recorder records, by what `/health` shows: 200, else 503.
+
+    Also 503 while a rule of `recording.exclude_when` cannot be evaluated: nothing is served then of
+    what is recorded, or it is served against the rule.
+    """
     found = report.get("recorder")
     recorder = found if isinstance(found, dict) else {}
-    recording = recorder.get("live") is True and recorder.get("state") == "recording"
+    failing = recorder.get("failing_rules")
+    recording = (
+        recorder.get("live") is True and recorder.get("state") == "recording" and not failing
+    )
     shown: JsonObject = {"recording": recording}
     if all_of_it:
         shown["recorder"] = recorder.get("state")
         shown["recorder_alive"] = recorder.get("live", False)
         shown["waiting_for"] = recorder.get("waiting_for")
+        shown["failing_rules"] = failing or []
     return JSONResponse(shown, _OK if recording else _UNAVAILABLE)
 
 

@@ -2,7 +2,9 @@
 
 Each split is read once for what the rules' topics show in it. It is released once nothing that
 comes can reach into it any more, with its margin: mostly when the next split was read. Before that
-what falls into an excluded stretch is cut out of it.
+what falls into an excluded stretch is cut out of it. While no message has ever shown whether a rule
+holds, for want of its field, splits stay as they are and are not served: a corrected rule reads
+them.
 
 What was learned is written before the first cut, since a cut takes the messages that showed it. A
 kill in between does no harm: what is not released yet is cut again, to the same result.
@@ -15,6 +17,7 @@ import threading
 import time
 from collections import Counter
 from copy import deepcopy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
@@ -71,9 +74,15 @@ MOST_EXCLUDED: Final = 1000
 """Stretches that are remembered, the newest ones."""
 RETRY_S: Final = 30.0
 """How long until a split that could not be cut is tried again."""
+REMIND_S: Final = 600.0
+"""How long until a rule that still cannot be evaluated is logged again."""
 _SPLITS_NEAR: Final = 3
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+class _UselessRuleError(EpisodicError):
+    """A rule that was never evaluated cannot be evaluated on a split either."""
 
 
 class _Ready(NamedTuple):
@@ -124,6 +133,8 @@ class Screening:
         self._state: ScreenState | None = None
         self._problems: dict[str, str] = {}
         self._refusals: dict[str, str] = {}
+        self._evaluated: set[str] = set()
+        self._logged_s: dict[str, float] = {}
 
     def announce(self, recording: str) -> None:
         """Holds back a recording of which nothing exists yet.
@@ -151,11 +162,15 @@ class Screening:
         written = frozenset(live)
         return lambda: self._step(names, written)
 
+    def failing_rules(self) -> tuple[str, ...]:
+        """Describes each rule that cannot be evaluated at present, and why."""
+        return (*self._refusals.values(),)
+
     def problem(self) -> str | None:
         """Describes the splits that a fault or a useless rule holds back, or None."""
         known = [*self._problems.items()]
         if not known:
-            refused = "; ".join([*self._refusals.values()])
+            refused = "; ".join(self.failing_rules())
             return f"recording.exclude_when does not work: {refused}" if refused else None
         name, reason = known[-1]
         held = counted(len(known), "split is", "splits are")
@@ -174,7 +189,18 @@ class Screening:
         with self._lock:
             before = self._loaded()
             state = deepcopy(before)
-        closed = {name: self._read(name, state.recordings[name], live) for name in names}
+        closed: dict[str, list[tuple[Path, BagSummary]]] = {}
+        is_held = False
+        for name in names:
+            files, is_whole = self._read(name, state.recordings[name], live)
+            is_held |= not is_whole
+            # What a condition was in a recording that is held back may matter to later ones.
+            closed[name] = [] if is_held else files
+        self._problems = {
+            name: reason
+            for name, reason in self._problems.items()
+            if (self._bag_dir / name).exists()
+        }
         self._commit(before, state, names)
         cleared: list[tuple[_Ready, list[Excluded]]] = []
         now_s = self._monotonic()
@@ -206,8 +232,11 @@ class Screening:
 
     def _read(
         self, name: str, screen: RecordingScreen, live: Collection[str]
-    ) -> list[tuple[Path, BagSummary]]:
-        """Reads the closed files of a recording that were not; returns those not released yet."""
+    ) -> tuple[list[tuple[Path, BagSummary]], bool]:
+        """Reads the closed files of a recording that were not; returns those not released yet.
+
+        With it whether a useless rule left none of them unread.
+        """
         paths = self._files(name)
         present = {each.name for each in paths}
         screen.files = {file: step for file, step in screen.files.items() if file in present}
@@ -216,6 +245,9 @@ class Screening:
             step = screen.files.get(path.name)
             if step in {FileStep.RELEASED, FileStep.UNREADABLE}:
                 continue
+            now_s = self._monotonic()
+            if step is None and self._retry_s.get(path, now_s) > now_s:
+                return found, False
             try:
                 if step is None and self._reader.closing(path) is not Closing.CLOSED:
                     if name in live:
@@ -227,17 +259,18 @@ class Screening:
                     self._hear(path, summary, screen)
                 found.append((path, summary))
                 screen.files[path.name] = FileStep.READ
+                self._problems.pop(f"{name}/{path.name}", None)
+            except _UselessRuleError as error:
+                self._problems[f"{name}/{path.name}"] = str(error)
+                self._retry_s[path] = now_s + RETRY_S
+                return found, False
             except BagUnreachableError:
                 raise
             except BagError as error:
-                # Its content is unknown, and so is the state of the condition after it.
-                for heard in screen.heard.values():
-                    if heard and not heard[-1].holds:
-                        at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)
-                        heard.append(ConditionInterval(at, at, None))
+                _doubt(screen)
                 screen.files[path.name] = FileStep.UNREADABLE
                 self._report(path, error)
-        return found
+        return found, True
 
     def _files(self, name: str) -> list[Path]:
         """Returns the bags of a recording in the order in which they were written."""
@@ -252,17 +285,25 @@ class Screening:
 
         Raises:
             BagError: it cannot be read or rewritten.
+            _UselessRuleError: no message has shown yet whether a rule holds that excludes what is
+                not known; the state stays as it is.
         """
         if path.suffix != ".mcap" or not summary.complete:
             raise BagError(str(path), "it is not a complete MCAP file")
         if summary.empty:
             return
+        known = deepcopy(screen.heard)
         for rule in self._rules:
-            heard = screen.heard.setdefault(rule.name, [])
+            heard = known.setdefault(rule.name, [])
+            refusal: str | None = None
             for record in self._reader.records(path, (rule.topic,), TimeWindow.everything()):
-                holds = self._test(rule, record)
+                holds, refused = self._test(rule, record)
+                refusal = refused or refusal
                 latched = record.channel.latched
                 add_message(heard, record.log_time, holds, latched=latched, stale=rule.stale)
+            if refusal and rule.excludes_unknown and rule.name not in self._evaluated:
+                raise _UselessRuleError(refusal)
+        screen.heard = known
         # Latched messages may be written again with the times that they had.
         start = min((each.first for each in summary.topics if not each.latched), default=MAX_NS)
         is_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
@@ -271,26 +312,43 @@ class Screening:
         screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)
         screen.end = summary.end if screen.end is None else max(screen.end, summary.end)
 
-    def _test(self, rule: ExclusionRule, record: Record) -> bool | None:
-        """Returns whether a rule's condition holds; None where a message cannot show it."""
-        condition = rule.condition
+    def _test(self, rule: ExclusionRule, record: Record) -> tuple[bool | None, str | None]:
+        """Returns whether a rule's condition holds; None where a message cannot show it.
+
+        With it the reason, where no message of this shape can show it.
+        """
+        type_name, condition = record.channel.type, rule.condition
+        if condition.field is not None:
+            own = self._extractor.own_path(condition.field, type_name)
+            condition = replace(condition, field=own)
         try:
-            value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+            value = self._extractor.exact(self._reader.decode(record), type_name)
         except UndecodableError as error:
-            self._refusals[rule.name] = f"the rule {rule.name}: {error}"
-            return None
-        if condition.matches(value):
-            return True
-        refusal = refusal_for(condition, value) if condition.can_be_refused else None
-        if refusal is None and isinstance(condition.test, Equals):
+            self._refuse(rule, str(error))
+            return None, None
+        holds = condition.matches(value)
+        refusal = None
+        if not holds and condition.can_be_refused:
+            refusal = refusal_for(condition, value)
+        if not holds and refusal is None and isinstance(condition.test, Equals):
             is_number = any(isinstance(leaf, bool | int | float) for leaf in leaves(value))
             if isinstance(condition.test.value, bool) and not is_number:
                 refusal = "the values hold no boolean"
         if refusal is not None:
-            self._refusals[rule.name] = f"the rule {rule.name}: {rule.topic}: {refusal}"
-            return None
+            return None, self._refuse(rule, f"{rule.topic}: {refusal}")
         self._refusals.pop(rule.name, None)
-        return False
+        self._evaluated.add(rule.name)
+        return holds, None
+
+    def _refuse(self, rule: ExclusionRule, reason: str) -> str:
+        """Notes why a rule cannot be evaluated, and logs it, again every ten minutes."""
+        sentence = f"the rule {rule.name}: {reason}"
+        self._refusals[rule.name] = sentence
+        now_s = self._monotonic()
+        if now_s >= self._logged_s.get(rule.name, now_s):
+            self._logged_s[rule.name] = now_s + REMIND_S
+            _log.error("exclusion_rule_fails", rule=rule.name, reason=reason)
+        return sentence
 
     def _ready(
         self,
@@ -447,3 +505,11 @@ class Screening:
         if self._problems.get(name) != reason:
             _log.error("split_held_back", file=name, reason=reason)
         self._problems[name] = reason
+
+
+def _doubt(screen: RecordingScreen) -> None:
+    """Notes a file that cannot be read: the state of the conditions after it is unknown, too."""
+    for heard in screen.heard.values():
+        if heard and not heard[-1].holds:
+            at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)
+            heard.append(ConditionInterval(at, at, None))

@@ -14,6 +14,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.coverage import describe_excluded, unread_spans
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.file_state import HELD_BACK
+from ros2_memory.insights.status import nothing_here
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.things.find import find_things
@@ -108,6 +109,9 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     name = bags.begin(0)
     bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
     bags.split(name, words(10, 20))
+    assert nothing_here(index_of(bags).snapshot()) == (
+        "no bag is served yet: recording.exclude_when has still to be applied to 2 splits"
+    )
     bags.step()
     window = TimeWindow(T0, T0 + 30 * S)
     [excluded] = describe_excluded(bags.bag_dir, window)

@@ -128,6 +128,7 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
         "waiting_for": None,
         "age_held": None,
         "unshipped": None,
+        "failing_rules": [],
     }
 
 

@@ -105,6 +105,7 @@ async def test_health_is_json() -> None:
         ({"state": "recording", "live": False}, 503),
         ({"state": "waiting", "live": True, "waiting_for": "/clock"}, 503),
         ({"state": "paused", "live": True}, 503),
+        ({"state": "recording", "live": True, "failing_rules": ["the rule a: no field"]}, 503),
         (None, 503),
     ],
 )

@@ -7,9 +7,11 @@ import itertools
 from typing import TYPE_CHECKING
 
 import pytest
+import structlog
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
 from ros2_memory.bag_dir.state.screened_file import excluded_between, read_gate, read_screen_state
 from ros2_memory.core.errors import RecorderError
@@ -17,7 +19,7 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import rewriting
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.triggers import screening
-from tests.support.bags import McapLayout
+from tests.support.bags import McapLayout, odom
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.screened_bags import (
     LATCHED,
@@ -33,6 +35,9 @@ from tests.support.screened_bags import (
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
+    from ros2_memory.triggers.exclusion import ExclusionRule
+    from tests.support.bags import Msg
 
 VOLATILE = McapLayout(latched=frozenset())
 
@@ -94,10 +99,51 @@ class TestServing:
 
     def test_a_message_that_cannot_show_it_is_unknown_and_reported(self, tmp_path: Path) -> None:
         bags = ScreenedBags(tmp_path / "bags")
-        bags.split(bags.begin(0), [word(0, "/privacy_mode"), *words(0, 10)])
+        said = [mode(-2, value=False), word(5, "/privacy_mode")]
+        bags.split(bags.begin(0), [*said, *words(0, 10)])
         bags.end()
-        assert bags.seconds() == []
+        assert bags.seconds() == halves(0, 4)
         assert "/privacy_mode: the values hold no boolean" in (bags.screening.problem() or "")
+
+    def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected(
+        self, tmp_path: Path
+    ) -> None:
+        def rule(field: str) -> ExclusionRule:
+            condition = parse_condition("above", 5, 0.5, field)
+            return privacy(topic="/odom", condition=condition, stale=100 * S)
+
+        def driven(begin: int, stop: int) -> list[Msg]:
+            return [odom(T0 + n * S, float(n), 0.0) for n in range(begin, stop)]
+
+        bags = ScreenedBags(tmp_path / "bags", rule("pose.position.x"))
+        name = bags.begin(0)
+        bags.split(name, [*driven(0, 10), *words(0, 10)])
+        with structlog.testing.capture_logs() as logs:
+            bags.step()
+            bags.split(name, [*driven(10, 20), *words(10, 20)])
+            bags.end(name)
+            old = bags.begin(20)
+            bags.split(old, [*driven(20, 30), *words(20, 30)])
+            bags.end()
+        assert bags.served() == []
+        assert (
+            "have no field 'pose.position.x'; their fields are: "
+            in bags.screening.failing_rules()[0]
+        )
+        assert "2 splits are not served" in (bags.screening.problem() or "")
+        failed = [each for each in logs if each["event"] == "exclusion_rule_fails"]
+        # Every ten minutes; a step is a minute.
+        assert [each["log_level"] for each in failed] == ["error"]
+        bags.now_s += 600
+        with structlog.testing.capture_logs() as logs:
+            bags.step()
+        assert [each["event"] for each in logs].count("exclusion_rule_fails") == 1
+        # As the message has it, and as the schema map names it.
+        bags.rules = (rule("pose.pose.position.x"),)
+        bags.screening = bags.new()
+        bags.end()
+        assert bags.seconds() == halves(0, 5)
+        assert (bags.screening.failing_rules(), bags.screening.problem()) == ((), None)
 
     def test_a_message_that_cannot_be_decoded_is_unknown_and_reported(self, tmp_path: Path) -> None:
         bags = ScreenedBags(tmp_path / "bags")
