@@ -22,7 +22,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
-from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
+from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.state.lost_file import read_losses
 from ros2_memory.bag_dir.state.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
@@ -36,7 +36,6 @@ from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     START_SLACK_NS,
-    ns_from_unix,
     unix_rounded_up,
 )
 from ros2_memory.history.context import short_name
@@ -311,25 +310,9 @@ def describe_misdated(faults: Sequence[ClockFault]) -> str:
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
-    """Yields where nothing was recorded for more than two splits: from one bag's end to the next.
-
-    With a window, also from and to its bounds, as far as the memory spans them. Bags that a wrong
-    clock dated do not count.
-    """
-    snapshot = view.snapshot
-    if snapshot.earliest is None or snapshot.latest is None:
-        return
-    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
-    reach = None if window is None else max(window.start, snapshot.earliest)
-    # Unlike `bags`, what overlaps a window includes the bag of carried messages.
-    for bag in snapshot.bags if window is None else snapshot.timeline.overlapping(window):
-        # Carried messages do not show when something was recorded.
-        if bag.file in snapshot.dating.misdated or is_carried(bag.file):
-            continue
-        if reach is not None and bag.start - reach > longest:
-            yield reach, bag.start
-        reach = bag.end if reach is None else max(reach, bag.end)
-    if window is not None and reach is not None:
-        end = min(window.stop, snapshot.latest)
-        if end - reach > longest:
-            yield reach, end
+    """Yields where nothing was recorded, by `Snapshot.gaps`; of a window, the parts in it."""
+    asked = window or TimeWindow.everything()
+    for start, end in view.snapshot.gaps:
+        begin, stop = max(start, asked.start), min(end, asked.stop)
+        if begin < stop:
+            yield begin, stop

@@ -1,7 +1,8 @@
-"""Where bags may have a hole: a time in which no topic has a message, by their summaries alone.
+"""Where no topic has a message, by the summaries of bags alone: between bags, or perhaps in one.
 
-Within a bag each topic with a usual rate then has fewer messages than fit between its first and its
-last. From one split of a recording to the next the recorder ran on, so their times must meet.
+From one bag to the next that is a gap if it is longer than the recorded data explains. Within a bag
+with a hole each topic with a usual rate has fewer messages than fit between its first and its last.
+From one split of a recording to the next the recorder ran on, so their times must meet.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ import numpy as np
 
 from ros2_memory.analysis.clock_steps import SHORTEST_STEP_NS
 from ros2_memory.analysis.silences import usual_period
-from ros2_memory.core.timebase import NS_PER_MS, Ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
@@ -31,9 +32,47 @@ _UNSTEADY: Final = 0.01
 """A rate may differ by this share of a bag's length without anything missing."""
 _PARTS_OF_AN_OCTAVE: Final = 64
 _COVERED: Final = 0.9
+SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
+_GAP_PERIODS: Final = 3
+_GAP_SPLITS: Final = 2
+_LONGEST_LEAST_NS: Final[Ns] = 20 * NS_PER_S
 
 Rates: TypeAlias = "tuple[tuple[str, Ns], ...]"
 """Some topics, and their usual periods."""
+
+
+class Pause(NamedTuple):
+    """A time (log times of two messages) of more than `SHORTEST_GAP_NS` between bags.
+
+    `least` is how long it must be to be a gap: between two splits of a recording, in which the
+    recorder ran on, twice the longer one, or 20 s.
+    """
+
+    start: Ns
+    end: Ns
+    least: Ns = SHORTEST_GAP_NS
+
+
+def pauses_between(bags: Sequence[BagFile]) -> Iterator[Pause]:
+    """Yields the pauses between bags, which are in order of time and may overlap."""
+    before = bags[0]
+    for after in bags[1:]:
+        if after.start - before.end > SHORTEST_GAP_NS:
+            longer = max(before.end - before.start, after.end - after.start)
+            within = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS)
+            least = within if _follows(before, after) else 0
+            yield Pause(before.end, after.start, max(least, SHORTEST_GAP_NS))
+        if after.end > before.end:
+            before = after
+
+
+def gaps_of(pauses: Iterable[Pause], presences: Mapping[str, Presence]) -> list[tuple[Ns, Ns]]:
+    """Returns the pauses that are gaps: those far longer than the most frequent topic's period."""
+    periods = filter(None, map(usual_period, presences.values()))
+    least = _GAP_PERIODS * min(periods, default=0)
+    return [
+        (each.start, each.end) for each in pauses if each.end - each.start > max(each.least, least)
+    ]
 
 
 class SuspectedHole(NamedTuple):
@@ -110,8 +149,11 @@ def between(bags: Sequence[BagFile], rates: Rates) -> Iterator[SuspectedHole]:
     for before, after in pairwise(bags):
         if after.start - before.end < SHORTEST_STEP_NS:
             continue
-        one, other = split_of(before.file), split_of(after.file)
-        if one is None or other is None or one[0] != other[0]:
-            continue
-        if other[1] == one[1] + 1 and _is_cut(before, after, rates):
+        if _follows(before, after) and _is_cut(before, after, rates):
             yield SuspectedHole(before.end, after.start)
+
+
+def _follows(before: BagFile, after: BagFile) -> bool:
+    """Returns whether a bag is the next split of the same recording."""
+    one, other = split_of(before.file), split_of(after.file)
+    return one is not None and other == (one[0], one[1] + 1)

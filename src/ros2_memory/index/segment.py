@@ -15,7 +15,7 @@ import numpy as np
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import bags_with_holes, between
+from ros2_memory.index.holes import bags_with_holes, between, pauses_between
 from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow
-    from ros2_memory.index.holes import Rates, SuspectedHole
+    from ros2_memory.index.holes import Pause, Rates, SuspectedHole
     from ros2_memory.index.split_order import Series, SplitRange
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -294,6 +294,11 @@ class Segment:
             known = rates, (*bags_with_holes(self.bags, rates), *between(self.bags, rates))
             self._suspected = known
         return known[1]
+
+    @cached_property
+    def pauses(self) -> tuple[Pause, ...]:
+        """Where nothing was recorded between the bags, as far as that is noteworthy."""
+        return tuple(pauses_between(self.bags))
 
     @cached_property
     def silent(self) -> frozenset[str]:

@@ -17,7 +17,7 @@ from ros2_memory.analysis.silences import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
-from ros2_memory.index.holes import between, rates_of
+from ros2_memory.index.holes import SHORTEST_GAP_NS, between, gaps_of, pauses_between, rates_of
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
-    from ros2_memory.index.holes import SuspectedHole
+    from ros2_memory.index.holes import Pause, SuspectedHole
 
 _MAX_PLACED: Final = 500
 
@@ -150,6 +150,31 @@ class Snapshot:
                     begin = start
                 reach = end if reach is None else max(reach, end)
         return begin
+
+    @cached_property
+    def gaps(self) -> Sequence[tuple[Ns, Ns]]:
+        """Where nothing was recorded: from the last message before to the first after, in order.
+
+        Longer than a second and three periods of the most frequent topic; between two splits of a
+        recording, in which the recorder ran on, also than twice the longer one (at most 20 s).
+        Carried messages and bags that a wrong clock dated do not count.
+        """
+        found: list[Pause] = []
+        newest: BagFile | None = None
+        for part in self._dated:
+            if newest is not None:
+                # Bags of other parts may last into this one.
+                found += pauses_between([newest, part.bags[0]])
+                found += (
+                    each._replace(start=max(each.start, newest.end))
+                    for each in part.pauses
+                    if each.end - newest.end > SHORTEST_GAP_NS
+                )
+            else:
+                found += part.pauses
+            last = max(part.bags, key=lambda bag: bag.end)
+            newest = last if newest is None or last.end > newest.end else newest
+        return gaps_of(found, self._presences)
 
     @cached_property
     def suspected_holes(self) -> tuple[SuspectedHole, ...]:

@@ -1,0 +1,84 @@
+"""Where nothing was recorded, by the summaries of bags."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+
+
+def bag(file: str, times: Sequence[float], topic: str = "/odom") -> BagFile:
+    """A bag with a message of one topic at each of these seconds."""
+    first, last = BEGIN + round(times[0] * S), BEGIN + round(times[-1] * S)
+    topics = (TopicSummary(topic, "std_msgs/msg/Bool", "cdr", len(times), first, last),)
+    return BagFile(f"/bags/{file}.mcap", 1, 1, BagState.CLOSED, BagSummary(topics), first, last)
+
+
+def every(period: float, begin: float, stop: float) -> list[float]:
+    return [begin + n * period for n in range(round((stop - begin) / period) + 1)]
+
+
+def gaps(bags: Iterable[BagFile]) -> list[tuple[float, float]]:
+    return [
+        ((start - BEGIN) / S, (end - BEGIN) / S) for start, end in Snapshot(Timeline.of(bags)).gaps
+    ]
+
+
+def test_a_second_between_two_recordings_is_a_gap_whatever_the_splits_last() -> None:
+    one, other = bag("a/a_0", every(0.1, 0, 60)), bag("b/b_0", every(0.1, 65.5, 90))
+    assert gaps([one, other]) == [(60.0, 65.5)]
+    assert gaps([one, bag("b/b_0", every(0.1, 60.9, 90))]) == []
+
+
+def test_what_is_published_seldom_leaves_no_gap() -> None:
+    seldom = [bag("a/a_0", every(5, 0, 60)), bag("b/b_0", every(5, 70, 130))]
+    assert gaps(seldom) == []
+    assert gaps([*seldom, bag("c/c_0", every(5, 150, 200))]) == [(130.0, 150.0)]
+
+
+def test_from_one_split_to_the_next_the_recorder_ran_on() -> None:
+    splits = [bag("a/a_0", [0, 1, 5]), bag("a/a_1", [14, 15, 20]), bag("a/a_2", [43, 49])]
+    assert gaps(splits) == [(20.0, 43.0)]
+    # A split between them is missing.
+    assert gaps([splits[0], bag("a/a_2", [14, 15, 20])]) == [(5.0, 14.0)]
+
+
+def test_bags_that_a_wrong_clock_dated_and_carried_messages_leave_none() -> None:
+    recorded = [bag(f"a/a_{n}", every(0.1, 10 * n, 10 * n + 9.9)) for n in range(6)]
+    carried = bag("latched/carried", [-500], "/tf_static")
+    assert gaps([carried, *recorded]) == []
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 400), st.integers(2, 60), st.booleans()), min_size=1, max_size=12
+    )
+)
+def test_gaps_are_where_none_of_the_recordings_has_a_message(
+    drawn: list[tuple[int, int, bool]],
+) -> None:
+    """Recordings that overlap, lie apart, or lie in each other; cut into two splits, or not."""
+    bags: list[BagFile] = []
+    heard: set[float] = set()
+    for number, (begin, length, cut) in enumerate(drawn):
+        times = every(0.25, begin, begin + length)
+        heard |= {*times}
+        parts = [times[: len(times) // 2], times[len(times) // 2 :]] if cut else [times]
+        bags += (bag(f"r{number}/r{number}_{n}", part) for n, part in enumerate(parts))
+    in_order = sorted(heard)
+    assert gaps(bags) == [
+        (before, after) for before, after in pairwise(in_order) if after - before > 1
+    ]
