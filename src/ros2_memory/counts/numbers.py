@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ros2_memory.counts.bins import By
     from ros2_memory.counts.field_numbers import FieldNumbers, Numbers, NumberTable
     from ros2_memory.history.bag_fold import Share
-    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.results import BinColumn, Bins
@@ -144,26 +143,12 @@ def _counted_in(
         end = max(each.last for each in group.bags)
         piece = bisect_right(edges, begin)
         if group.is_inside and (piece == len(edges) or end < edges[piece]):
-            add(piece, _count(view, topic, group), begin, end)
+            add(piece, view.count_in(topic, group), begin, end)
             continue
         for piece, times in groupby(group.times(), key=partial(bisect_right, edges)):
             here = [*times]
             add(piece, len(here), here[0], here[-1])
     return [*found.values()]
-
-
-def _count(view: View, topic: str, group: Group) -> int:
-    """Returns how many messages a whole group holds; remembered where that takes reading."""
-    if len(group.bags) == 1 or group.may_be_relatched:
-        return group.count()
-    question = f"count {topic}"
-    known = view.bags.cached_answer(question, group.bags, int) if group.is_whole else None
-    if known is None:
-        with view.notes.isolated():
-            known = group.count()
-            if group.is_whole:
-                view.bags.cache_answer(question, group.bags, str(known))
-    return known
 
 
 def _add_numbers(view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]) -> None:

@@ -27,7 +27,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import deduplicate_forward
+from ros2_memory.history.duplicates import bag_overlaps, deduplicate_forward
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.messages.to_json import evenly
@@ -35,6 +35,7 @@ from ros2_memory.messages.to_json import evenly
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Sessions
@@ -81,7 +82,7 @@ class View:
         except where recordings overlap or latched messages may have been received again.
         """
         groups = groups_of(self.stream, topic, window)
-        sizes = [group.count() for group in groups]
+        sizes = [self.count_in(topic, group) for group in groups]
         indices = evenly(sum(sizes), at_most)
         chosen: list[StoredMessage] = []
         begin = 0
@@ -90,6 +91,26 @@ class View:
             chosen.extend(group.fetch([index - begin for index in inside]))
             begin += size
         return sum(sizes), chosen
+
+    def count_in(self, topic: str, group: Group) -> int:
+        """Returns how many messages of the window a group of the topic's bags holds.
+
+        Where whole recordings overlap it is what their bags hold, less what the catalogue counted
+        twice: only what it does not know is read.
+        """
+        if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
+            return group.count()
+        files = {each.bag.file for each in group.bags}
+        count = sum(known.count for each in group.bags for known in each.bag.summary.of(topic))
+        for span in bag_overlaps(group.bags):
+            window = TimeWindow(*span)
+            if not files.issuperset(
+                each.bag.file for each in self.stream.overlapping_bags([topic], window)
+            ):
+                return group.count()
+            for stored, once in self._overlap_census(topic, window).values():
+                count -= stored.count - once.count
+        return count
 
     def census(self, topic: str) -> dict[str, Census]:
         """Returns what is recorded of a topic under each of its types, each message counted once.

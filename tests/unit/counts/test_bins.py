@@ -19,9 +19,11 @@ from ros2_memory.counts.field_numbers import store_shared_ranges
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
+from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.view import TimeRange, View
-from ros2_memory.queries import trajectory_summary
+from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import examples
@@ -238,6 +240,8 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
         if seed % 2:
             for topic in ("/odom", "/battery_state"):
                 store_shared_ranges(View(known, Call()), topic, TimeWindow.everything())
+        for each in (memory, known, known):
+            assert all(counted == read for counted, read in _counts_by_group(each))
         start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
         questions: list[tuple[str, dict[str, object]]] = [
             ("find_matches", {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}),
@@ -275,6 +279,39 @@ def test_fields_of_recordings_that_overlap_are_stored_before_they_are_asked_abou
     with monkeypatch.context() as patch:
         patch.setattr(segment_fold, "READING_S", -1.0)
         assert ask(known) == answer
+
+
+def test_messages_of_recordings_that_overlap_are_counted_by_what_the_topic_list_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(3):
+        begin = BEGIN + number * 10 * S
+        moves = [odom(begin + at * S, number * 10.0 + at, 0.0) for at in range(13)]
+        write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", moves)
+    plain = memory_of(tmp_path, limits=LATEST)
+    known = recalling(plain, tmp_path)
+
+    def ask(memory: Memory) -> Bins:
+        return count_range(memory, Call(), "/odom", everything(), "day")
+
+    answer = ask(plain)
+    assert whole(answer, "count") == 33
+    list_recorded_topics(known, Call())
+    with monkeypatch.context() as patch:
+        patch.delattr(MergedStream, "merged")
+        assert ask(known) == answer
+
+
+def _counts_by_group(memory: Memory) -> Iterator[tuple[int, int]]:
+    """How many messages each whole group holds, as they are counted, and as they are read."""
+    view = View(memory, Call())
+    for topic in view.snapshot.timeline.topics():
+        for group in groups_of(view.stream, topic, TimeWindow.everything()):
+            if group.is_whole:
+                counted = view.count_in(topic, group)
+                read = sum(1 for _ in group.messages())
+                if view.notes.complete:
+                    yield counted, read
 
 
 def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:
