@@ -77,6 +77,11 @@ class Contains:
         meant = _meaning(self.needle)
         return isinstance(meant, int | float) and not isinstance(meant, bool)
 
+    @property
+    def is_on_texts(self) -> bool:
+        """Whether no boolean matches."""
+        return self._boolean is None
+
     def matches(self, value: JsonValue) -> bool:
         """Returns whether a string of the value contains the needle, or a boolean equals it."""
         for leaf in leaves(value):
@@ -143,6 +148,11 @@ class Equals:
             return None
         least, most = min(self._numbers), max(self._numbers)
         return rounded(least, up=False), rounded(most, up=True)
+
+    @property
+    def is_on_texts(self) -> bool:
+        """Whether no boolean and no number matches."""
+        return self._boolean is None and not self._numbers
 
     def is_leaf(self, leaf: JsonValue) -> bool:
         """Returns whether this leaf is equal."""
@@ -285,6 +295,16 @@ class Condition:
         if isinstance(self.test, Equals):
             return self.test.number_bounds
         return None
+
+    @property
+    def is_on_texts_alone(self) -> bool:
+        """Whether a value matches if one of its texts does, and not otherwise."""
+        test = self.test
+        if self.field is not None or self.min_score > 0:
+            return False
+        if isinstance(test, Contains):
+            return test.is_on_texts
+        return isinstance(test, Equals) and test.is_on_texts
 
     @property
     def place(self) -> NearPosition | None:

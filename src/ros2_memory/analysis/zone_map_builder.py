@@ -22,6 +22,8 @@ from ros2_memory.analysis.zone_map import (
 from ros2_memory.core.timebase import unix_from_ns
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
 
@@ -50,10 +52,10 @@ class ZoneMapBuilder:
         """Takes a message whose value is not known: nothing can be ruled out any more."""
         self._open = True
 
-    def add(self, value: JsonValue) -> None:
-        """Takes the exact value of one message."""
+    def add(self, value: JsonValue) -> Sequence[str]:
+        """Takes the exact value of one message; returns its texts, unless nothing is ruled out."""
         if self._open:
-            return
+            return ()
         texts: list[str] = []
         booleans: list[bool] = []
         numbers: list[int | float] = []
@@ -69,6 +71,7 @@ class ZoneMapBuilder:
                 if math.isfinite(x) and math.isfinite(y):
                     low_z, high_z = (z, z) if math.isfinite(z) else (math.inf, -math.inf)
                     self._add_box(Box(x, x, y, y, low_z, high_z))
+        return texts
 
     def add_rows(self, template: PayloadTemplate, rows: Bytes) -> None:
         """Takes many messages of a template, the first of which was added as a value."""

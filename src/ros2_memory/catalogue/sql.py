@@ -23,6 +23,7 @@ from ros2_memory.catalogue.database import ROW_ID_BITS
 from ros2_memory.catalogue.field_columns import encode_field_ranges
 from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
+from ros2_memory.catalogue.text_runs import encode_text_runs
 
 if TYPE_CHECKING:
     import sqlite3
@@ -51,12 +52,14 @@ RELATCHED: Final = "relatched"
 TRACK: Final = "track"
 SIGHTS: Final = "sights"
 RANGES: Final = "ranges"
+TEXTS: Final = "texts"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
     ZONE_MAP: "held",
     POSES: "held",
     RANGES: "held",
+    TEXTS: "held",
     STANDSTILLS: "tales",
     STORY: "tales",
     TRACK: "maps",
@@ -237,10 +240,10 @@ def map_rows(
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:
     number, bag = key
-    edges, poses = topic.edges, topic.poses
+    edges, poses, texts = topic.edges, topic.poses, topic.texts
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 11)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 12)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
@@ -252,6 +255,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
             *_ranges(connection, number, topic),
             packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),
             poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
+            texts and packed_by_model(connection, number, TEXTS, encode_text_runs(texts)),
         ),
     )
 

@@ -42,6 +42,7 @@ from ros2_memory.catalogue.sql import (
     SIGHTS,
     STANDSTILLS,
     STORY,
+    TEXTS,
     TRACK,
     UNDECODABLE,
     ZONE_MAP,
@@ -59,6 +60,7 @@ from ros2_memory.catalogue.sql import (
     topic_number,
     topic_rows,
 )
+from ros2_memory.catalogue.text_runs import decode_text_runs
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import BagFile, BagState
@@ -79,6 +81,7 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.digest_config import DigestConfig
     from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
+    from ros2_memory.catalogue.text_runs import TextRuns
     from ros2_memory.core.timebase import Ns
 
 FOLDER: Final = ".episodic"
@@ -204,7 +207,7 @@ class Catalogue(CatalogueDatabase):
         found: dict[BagKey, int] = self.read(ask, {})
         return [found.get(key) for key in keys]
 
-    # Each of the next seven reads one topic of some entries. Entries that hold none of the topic,
+    # Each of the next eight reads one topic of some entries. Entries that hold none of the topic,
     # and those that were deleted meanwhile, are left out.
 
     def zone_maps(self, topic: str, numbers: Sequence[int]) -> dict[int, ZoneMap]:
@@ -226,6 +229,10 @@ class Catalogue(CatalogueDatabase):
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""
         return self._packed_of_topic(topic, numbers, STORY, decode_topic_events, NO_EVENTS)
+
+    def text_runs(self, topic: str, numbers: Sequence[int]) -> dict[int, TextRuns]:
+        """Returns which texts each message of the topic has; not where they are too many."""
+        return self._packed_of_topic(topic, numbers, TEXTS, decode_text_runs)
 
     def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
         """Returns the frame edges of the topic; not where they are not all known."""

@@ -372,7 +372,7 @@ class CandidateBags:
         known = {} if digests is None else digests.numbers
         possible: Collection[int] = ()
         if digests is not None and known:
-            possible = self._possible(digests, topic)
+            possible = possible_entries(digests, topic, self._condition)
             if digests.whole and not possible:
                 self.ruled_out = True
                 return
@@ -385,23 +385,23 @@ class CandidateBags:
             else:
                 self.ruled_out = True
 
-    def _possible(self, digests: SegmentDigests, topic: str) -> Collection[int]:
-        """Returns the numbers of the entries that can contain a match."""
-        place = self._condition.place
-        if place is not None:
-            return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
-        if not self._condition.can_match(digests.zone_map(topic)):
-            return ()
-        bounds = self._condition.bounds
-        if bounds is not None and self._condition.field is not None:
-            field = field_named(self._condition.field)
-            return digests.field_bounds(topic, field).between(*bounds)
 
-        def possible() -> set[int]:
-            maps = digests.zone_maps(topic)
-            return {number for number, each in maps.items() if self._condition.can_match(each)}
+def possible_entries(digests: SegmentDigests, topic: str, condition: Condition) -> Collection[int]:
+    """Returns the numbers of the entries that can contain a match."""
+    place = condition.place
+    if place is not None:
+        return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
+    if not condition.can_match(digests.zone_map(topic)):
+        return ()
+    bounds = condition.bounds
+    if bounds is not None and condition.field is not None:
+        return digests.field_bounds(topic, field_named(condition.field)).between(*bounds)
 
-        return digests.derived(f"possible {topic} {self._condition!r}", possible)
+    def possible() -> set[int]:
+        maps = digests.zone_maps(topic)
+        return {number for number, each in maps.items() if condition.can_match(each)}
+
+    return digests.derived(f"possible {topic} {condition!r}", possible)
 
 
 def _search_window(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:

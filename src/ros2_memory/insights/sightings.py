@@ -27,6 +27,7 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
 )
+from ros2_memory.counts.sighting_runs import known_sightings
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import (
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
+    from ros2_memory.counts.sighting_runs import KnownSightings
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
@@ -127,7 +129,16 @@ def find_matches(
     scope = Scope(view, window, where, during)
     goals = goals_asked(view, matching_topics(view, topic), condition, scope)
     if goals is None:
-        _collect(view, topic, condition, scope, collected)
+        search = ReverseSearch(view, topic, condition)
+        known = None
+        if not scope.is_bounded:
+            known = known_sightings(
+                view, search, condition, window, limit, oldest_first=oldest_first
+            )
+        if known is None:
+            _collect(view, search, scope, collected)
+        else:
+            collected.take(known)
     searched = window
     if collected.cut and collected.selected:
         searched = TimeWindow(collected.selected[-1].first, window.stop)
@@ -194,25 +205,22 @@ def read_sightings(
     if goals is not None:
         return [(each.first, each.last) for each in reversed(goals)], None
     found = _Sightings(MAX_COUNTED, oldest_first=True)
-    _collect(view, pattern, condition, scope, found)
+    _collect(view, ReverseSearch(view, pattern, condition), scope, found)
     if found.count > MAX_COUNTED:
         view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
     spans = [(each.first, each.newest.time) for each in found.selected]
     return spans, spans[0][0] if found.cut and spans else None
 
 
-def _collect(
-    view: View, pattern: str, condition: Condition, scope: Scope, found: _Sightings
-) -> None:
+def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings) -> None:
     """Collects the matches in a window, newest first, until there are enough.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
-        NoDataError: there is no such topic, or none of its messages can be decoded.
+        NoDataError: none of the topics' messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
     window = scope.window
-    search = ReverseSearch(view, pattern, condition)
     candidates = search.candidates(window.stop)
     before = window.stop
     try:
@@ -298,6 +306,16 @@ class _Sightings:
             matches.first = matches.reach = found.time
             matches.messages += 1
             self._open.move_to_end(topic)
+
+    def take(self, known: KnownSightings) -> None:
+        """Takes the sightings that were asked for, in order, in place of single matches."""
+        found = [
+            _Matches(each.newest, each.first, each.first, each.messages, begun=True)
+            for each in known.sightings
+        ]
+        self._kept.extend(reversed(found) if self._oldest_first else found)
+        self.cut = known.total is None
+        self.count = len(found) + 1 if known.total is None else known.total
 
     def skip(self, found: StoredMessage) -> None:
         """Adds a message that cannot be decoded: no match, but it ends no sighting either."""

@@ -23,6 +23,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import Deadline, unix_from_ns
+from ros2_memory.counts.sighting_runs import store_shared_texts
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -431,6 +432,9 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
         write_history(bag_dir, draw)
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
         memory = recalling(replace(plain), bag_dir, part=part)
+        if seed % 2:
+            for topic in ("/vision/a", "/dock"):
+                store_shared_texts(View(memory, Call()), topic, TimeWindow.everything())
         for topic, kind, value in ASKED:
             try:
                 expected = grouped(plain, topic, kind, value)
