@@ -7,7 +7,8 @@ With T0 the clock's time (whole milliseconds) at the start and tick k at t = k /
   header stamps are T0 + t exactly.
 - `/tf_static` once, latched: laser and camera in base_link.
 - `/cmd_vel` (geometry_msgs/Twist) every second tick.
-- `/bumper` (std_msgs/Bool) twice a second, true while 25 <= t < 26.
+- `/bumper` (std_msgs/Bool) twice a second, true while 25 <= t < 26; told by SIGUSR1, for the
+  second that begins with its next message instead.
 - `/battery_state` (sensor_msgs/BatteryState) once a second: percentage 0.8 - 0.001 t.
 - `/vision/scene/scene_objects` (ros2_vision_interfaces/VisionDetectionArray) once a second:
   "table" always, "cup" for 5 <= t < 30, "scissors" for 12 <= t < 18.
@@ -89,6 +90,7 @@ class Messages:
 
     def __init__(self, t0: int) -> None:
         self._t0 = t0
+        self.bumps_s = 25.0
 
     def payload(self, topic: str, t: float) -> bytes:
         """The message published on `topic` t seconds after T0, as CDR."""
@@ -99,7 +101,7 @@ class Messages:
             "/tf": self._transform,
             "/tf_static": self._sensors,
             "/cmd_vel": self._command,
-            "/bumper": lambda t: _of("std_msgs/msg/Bool", data=25.0 <= t < 26.0),
+            "/bumper": lambda t: _of("std_msgs/msg/Bool", data=0.0 <= t - self.bumps_s < 1.0),
             "/battery_state": self._battery,
             "/vision/scene/scene_objects": self._detections,
         }
@@ -221,6 +223,7 @@ class Robot:
         self._node = rclpy.create_node("robot", enable_rosout=False, start_parameter_services=False)
         self._truth = truth
         self._stop = False
+        self._bump = False
         self._matched = [(0, 0)]
         self._late_s = 0.0
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
@@ -237,6 +240,9 @@ class Robot:
 
     def stop(self, *_: object) -> None:
         self._stop = True
+
+    def bump(self, *_: object) -> None:
+        self._bump = True
 
     def await_subscribers(self, count: int) -> None:
         """Returns when every topic but the latched one has so many, or at a signal."""
@@ -260,6 +266,9 @@ class Robot:
             if first.get_subscription_count() != self._matched[-1][1]:
                 self._matched.append((time.time_ns(), first.get_subscription_count()))
                 self._tell(t0, published, tick)
+            if self._bump:
+                self._bump = False
+                messages.bumps_s = math.ceil(tick / hz * 2) / 2
             for topic, out in self._publishers.items():
                 if is_due(topic, tick, hz):
                     out.publish(messages.payload(topic, tick / hz))
@@ -299,6 +308,7 @@ def main() -> None:
     robot = Robot(given.topics, given.best_effort, given.truth)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, robot.stop)
+    signal.signal(signal.SIGUSR1, robot.bump)
     robot.await_subscribers(given.subscribers)
     robot.drive(given.hz, given.duration)
     rclpy.shutdown()

@@ -214,6 +214,10 @@ class Robot:
         self.process.send_signal(signal.SIGINT)
         return self.finish()
 
+    def bump(self) -> None:
+        """It bumps into something, now instead of at its own time."""
+        self.process.send_signal(signal.SIGUSR1)
+
     def _truth(self) -> dict[str, Any]:
         truth: dict[str, Any] = json.loads(self.truth_file.read_text())
         return truth
