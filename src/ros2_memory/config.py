@@ -45,6 +45,7 @@ from ros2_memory.config_errors import (
     validated,
 )
 from ros2_memory.config_sources import (
+    GROUPS,
     INTERFACES_VARIABLE,
     Sources,
     expand_home,
@@ -604,6 +605,21 @@ def load_explained(
         Settings, data, config_dir=folder, source=sources, raw=raw, adapters=_NODES
     )
     return settings, sources
+
+
+def is_deployment_chosen(
+    overrides: Sequence[str] = (), env: Mapping[str, str] | None = None
+) -> bool:
+    """Returns whether someone chose a configuration directory, or an option of a group.
+
+    It composes nothing.
+
+    Raises:
+        ConfigError: a variable or an override is refused.
+    """
+    given = given_variables(os.environ if env is None else env)
+    parsed = parse_overrides(overrides, given, config_dir(given))
+    return "MEMORY_CONFIG_DIR" in given or any(each.key in GROUPS for each in parsed)
 
 
 def plain_values(settings: Settings) -> dict[str, JsonValue]:

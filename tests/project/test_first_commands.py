@@ -44,6 +44,8 @@ MANAGED: Final = (
 OF_THE_NETWORK: Final = re.compile(
     r"(https?|no)_proxy|(SSL|PIP|REQUESTS)_\w*(CERT|BUNDLE)\w*", re.IGNORECASE
 )
+SPARING: Final = {"PIP_NO_COMPILE": "1"}
+"""Python compiles what is imported; pip would compile all modules of all packages."""
 BOUND_S: Final = 600
 
 
@@ -79,7 +81,7 @@ def ran(script: str, clone: Path, programs: Path) -> subprocess.CompletedProcess
     return subprocess.run(
         ["/bin/bash", "-c", script],
         cwd=clone,
-        env={**network, "HOME": str(home), "PATH": f"{programs}:/usr/bin:/bin"},
+        env={**network, **SPARING, "HOME": str(home), "PATH": f"{programs}:/usr/bin:/bin"},
         capture_output=True,
         text=True,
         timeout=BOUND_S,

@@ -17,6 +17,8 @@ from xdist.scheduler import LoadScopeScheduling
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from xdist.workermanage import WorkerController
+
 TESTS: Final = Path(__file__).parents[1]
 GROUPS: Final[Mapping[str, Sequence[str]]] = {
     "live": ("integration/test_live_*.py",),
@@ -97,6 +99,15 @@ class Groups(LoadScopeScheduling):
 
     def _split_scope(self, nodeid: str) -> str:
         return group_of(_file(nodeid)) or nodeid
+
+    def mark_test_complete(
+        self, node: WorkerController, item_index: int, duration: float = 0
+    ) -> None:
+        """Forgets what is done: after each test all that its worker ever had would be counted."""
+        scope = self._split_scope(self.registered_collections[node][item_index])
+        super().mark_test_complete(node, item_index, duration)
+        if all(self.assigned_work[node][scope].values()):
+            del self.assigned_work[node][scope]
 
 
 def _file(nodeid: str) -> str:

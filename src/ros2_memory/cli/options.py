@@ -23,7 +23,12 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.state.own_recordings import folders_with_bags
 from ros2_memory.cli.output import with_local_times
-from ros2_memory.config import NullRecorderNode, Settings, load_explained
+from ros2_memory.config import (
+    NullRecorderNode,
+    Settings,
+    is_deployment_chosen,
+    load_explained,
+)
 from ros2_memory.config_sources import GROUPS, Sources, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
@@ -176,11 +181,17 @@ def load_to_look(
     if recording is not None:
         chosen.append(f"data.recording={quoted(recording)}")
     named = bag_dir if path is None else path
-    settings, sources = load_with_sources(named, [*overrides, *chosen])
+    given = [*overrides, *chosen]
+    is_chosen = is_deployment_chosen(overrides)
+    if named is not None and not is_chosen:
+        # To compose it takes a tenth of a second: once, where nothing else is to be known first.
+        return load_for(named, given if _is_recorded_now(named) else [*_LOOKING, *given])
+    settings = load_for(named, given)
     by_words = any(each.partition("=")[0] in GROUPS for each in overrides)
-    if by_words or not _is_of_others(settings, sources, named, is_path=path is not None):
+    of_path = None if path is None else named
+    if by_words or not _is_of_others(settings, of_path, is_chosen=is_chosen):
         return settings
-    return load_for(named, [*_LOOKING, *overrides, *chosen])
+    return load_for(named, [*_LOOKING, *given])
 
 
 def _path_and_settings(words: Sequence[str]) -> tuple[Path | None, list[str]]:
@@ -228,21 +239,22 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
     return real.parent, real.name
 
 
-def _is_of_others(
-    settings: Settings, sources: Sources, named: Path | None, *, is_path: bool
-) -> bool:
+def _is_of_others(settings: Settings, path: Path | None, *, is_chosen: bool) -> bool:
     """Returns whether another deployment recorded the bags."""
     bag_dir = settings.recording.bag_dir
-    own_files = bool(os.environ.get("MEMORY_CONFIG_DIR"))
-    is_chosen = own_files or any(each.key in GROUPS for each in sources.overrides)
-    if named is None or (is_chosen and not is_path):
+    if path is None:
         if is_chosen or has_recorded(bag_dir) or not bag_dir.is_dir():
             return False
         return next(folders_with_bags(bag_dir), None) is not None
-    if is_chosen and named.absolute() == load_for(None, None).recording.bag_dir.absolute():
+    if path.absolute() == load_for(None, None).recording.bag_dir.absolute():
         return False
-    heartbeat = read_heartbeat(bag_dir).heartbeat
-    return heartbeat is None or not heartbeat.is_live(WallClock().now())
+    return not _is_recorded_now(bag_dir)
+
+
+def _is_recorded_now(bag_dir: Path) -> bool:
+    """Returns whether a recorder is at work there."""
+    heartbeat = read_heartbeat(bag_dir.absolute()).heartbeat
+    return heartbeat is not None and heartbeat.is_live(WallClock().now())
 
 
 def require_recorder(settings: Settings) -> None:
