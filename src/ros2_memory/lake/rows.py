@@ -27,7 +27,7 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.insights.topic_events import toggled
-from ros2_memory.lake.state_runs import KIND, StateRuns, is_stated
+from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, EmptyRuns, StateRuns, is_stated
 from ros2_memory.lake.tables import TABLES, microseconds, topic_key
 from ros2_memory.messages.detections import detections_of
 
@@ -368,6 +368,7 @@ class _BagRows:
             for topic, found in events.items()
             if topic not in whole and is_stated(found)
         }
+        empty = {topic: EmptyRuns() for topic in seen}
         topics = tuple(sorted({*seen, *whole, *states}))
         if not topics:
             return
@@ -382,12 +383,17 @@ class _BagRows:
             if topic in seen and value is None:
                 self._undecodable += 1
             elif topic in seen and value is not None:
-                self._rows["sightings"] += self._sightings(record, nth, value, robot)
+                found = [*self._sightings(record, nth, value, robot)]
+                self._rows["sightings"] += found
+                if not found:
+                    empty[topic].add(nth, record.log_time)
             if topic in states:
                 state = None if value is None else state_of(value.shown, record.channel.type)
                 states[topic].add(record.log_time, state)
         for topic, runs in states.items():
             self._add_digest(topic, KIND, runs.packed())
+        for topic, nothing in empty.items():
+            self._add_digest(topic, EMPTY_KIND, nothing.packed())
 
     def _decoded(self, record: Record) -> _Decoded | None:
         try:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 KIND: Final = "states"
 """Of digests in a lake."""
+EMPTY_KIND: Final = "empty"
+"""Likewise: where a detector had nothing to report."""
 _UNDECODABLE: Final = -1
 
 
@@ -47,6 +49,49 @@ class StateRun(NamedTuple):
     first: Ns
     last: Ns
     messages: int
+
+
+class EmptyRun(NamedTuple):
+    """Messages in a row without a detection; `nth` is the number of the first in its bag."""
+
+    nth: int
+    first: Ns
+    last: Ns
+    messages: int
+
+
+class EmptyRuns:
+    """Takes the messages of one detector in a bag that have no detection, in log-time order."""
+
+    def __init__(self) -> None:
+        self._runs: list[EmptyRun] = []
+
+    def add(self, nth: int, time: Ns) -> None:
+        """Takes the next of them, the `nth` message of the topic."""
+        before = self._runs[-1] if self._runs else None
+        if before is not None and before.nth + before.messages == nth:
+            self._runs[-1] = before._replace(last=time, messages=before.messages + 1)
+        else:
+            self._runs.append(EmptyRun(nth, time, time, 1))
+
+    def packed(self) -> bytes:
+        """Returns them as bytes; times are since the end of the run before."""
+        found: list[tuple[int, Ns, Ns, int]] = []
+        end = 0
+        for nth, first, last, messages in self._runs:
+            found.append((nth, first - end, last - first, messages))
+            end = last
+        return json.dumps(found, separators=(",", ":")).encode()
+
+
+def unpacked_empty(packed: bytes) -> Iterator[EmptyRun]:
+    """Yields the runs without a detection that were packed, in order."""
+    found: list[tuple[int, Ns, Ns, int]] = json.loads(packed)
+    end = 0
+    for nth, since, length, messages in found:
+        first = end + since
+        end = first + length
+        yield EmptyRun(nth, first, end, messages)
 
 
 def is_stated(events: TopicEvents | None) -> bool:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import os
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date, timedelta
 from pathlib import Path
@@ -15,56 +12,17 @@ from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.tables import TABLES, Row, open_tables, to_arrow
 
 DAY = date(2026, 11, 20)
 ODD = ("it's", 'a "cup"', "back\\slash", "$label", "%_", "x'; SELECT 1 --", "ß 茶")
-LONG = os.environ.get("EPISODIC_LONG") == "1"
-HAS_RAY = all(importlib.util.find_spec(each) for each in ("daft", "ray"))
 
 
 def seen(label: str, second: int, score: float | None = 0.5) -> Row:
     at = second * 10**9
     where = (1.0, 2.0, None, None, None, None)
     return ("/seen", "seen", "T", at, at // 1000, 0, label, score, "map", *where)
-
-
-def duckdb_engine() -> Iterator[LakeEngine]:
-    engine = DuckdbEngine(memory_mb=256, threads=1)
-    yield engine
-    engine.close()
-
-
-def ray_engine() -> Iterator[LakeEngine]:
-    """On two nodes, each with one processor."""
-    import ray  # noqa: PLC0415 - not installed everywhere
-    from ray.cluster_utils import Cluster  # noqa: PLC0415 - not installed everywhere
-
-    from ros2_memory.lake.engines.ray_engine import RayEngine  # noqa: PLC0415
-
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
-    cluster.add_node(num_cpus=1)
-    yield RayEngine(cluster.address)
-    ray.shutdown()
-    cluster.shutdown()
-
-
-RAY = pytest.mark.skipif(
-    not (LONG and HAS_RAY), reason="starts a cluster: EPISODIC_LONG=1, with the extra ray"
-)
-
-
-@pytest.fixture(
-    scope="module",
-    params=[
-        pytest.param(duckdb_engine, id="duckdb"),
-        pytest.param(ray_engine, id="ray", marks=RAY),
-    ],
-)
-def engine(request: pytest.FixtureRequest) -> Iterator[LakeEngine]:
-    yield from request.param()
 
 
 @pytest.fixture(scope="module")

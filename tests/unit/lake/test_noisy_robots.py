@@ -11,13 +11,13 @@ import pytest
 
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.core.errors import NotShippedError
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.engines.base import LakeEngine
 from tests.support.fleets import fleet_memory
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots
 from tests.support.memories import recalling
 from tests.support.moving_map import BEGIN, S
 from tests.support.noisy_robots import LENGTH_S, write_noisy_robot
-from tests.unit.lake.test_questions import Robots, reply
+from tests.unit.lake.test_questions import Robots, asked_both_ways, reply
 
 NAMES = ("attic", "hall")
 START_S = BEGIN // S
@@ -31,7 +31,7 @@ PLACE_M = 0.08
 
 
 @pytest.fixture(scope="module")
-def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
+def robots(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Robots:
     folder = tmp_path_factory.mktemp("robots")
     memories = {}
     for name in NAMES:
@@ -39,11 +39,7 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
         memories[name] = recalling(fleet_memory(bag_dir), bag_dir)
     catalog = lake_in(tmp_path_factory.mktemp("lake"))
     fill(catalog, memories)
-    engine = DuckdbEngine(memory_mb=256, threads=1)
-    of_lake = lake_robots(catalog, engine, NAMES)
-    over_lake = {name: each.memory for name, each in of_lake.items()}
-    yield Robots(fleet_of(memories, shared_map=True), fleet_of(over_lake, shared_map=True), of_lake)
-    engine.close()
+    return asked_both_ways(memories, lake_robots(catalog, engine, NAMES))
 
 
 def both(robots: Robots, tool: str, given: dict[str, object]) -> tuple[Any, Any]:
@@ -72,10 +68,13 @@ def test_what_is_folded_of_whole_bags_is_equal(
 
 def cuts() -> Iterator[dict[str, object]]:
     """Times that cut bags at either end."""
+    # Between two messages of the detector, the second of which has no detection.
+    times = [(22.328, 48.935)]
     draw = Random(16)
-    for nth in range(8):
+    for _ in range(7):
         start = draw.uniform(0, 40)
-        end = draw.uniform(start + 4, LENGTH_S)
+        times.append((start, draw.uniform(start + 4, LENGTH_S)))
+    for nth, (start, end) in enumerate(times):
         yield {"start": START_S + start, "end": START_S + end, "robot": NAMES[nth % 2]}
 
 
@@ -116,14 +115,13 @@ def test_things_and_sightings_of_a_time_that_cuts_bags(robots: Robots) -> None:
 
 
 def test_events_are_known_where_digests_are_of_another_version(
-    robots: Robots, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    robots: Robots, engine: LakeEngine, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     memories = {"hall": robots.mounted.robots["hall"].memory()}
     with monkeypatch.context() as patched:
         patched.setattr("ros2_memory.lake.rows.DIGEST_VERSION", DIGEST_VERSION + 1)
         catalog = lake_in(tmp_path)
         fill(catalog, memories)
-    engine = DuckdbEngine(memory_mb=256, threads=1)
     of_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory
     found = reply(fleet_of({"hall": of_lake}), "recap", {**ALL, "robot": "hall"})
     expected = reply(robots.mounted, "recap", {**ALL, "robot": "hall"})
@@ -131,4 +129,3 @@ def test_events_are_known_where_digests_are_of_another_version(
     assert [found["counts"].get(each) for each in reported] == [
         expected["counts"].get(each) for each in reported
     ]
-    engine.close()

@@ -6,7 +6,6 @@ The oracle is a fleet of these memories over the same bags.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from ros2_memory.core.timebase import NS_PER_S, iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
@@ -69,15 +68,18 @@ def memories(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Memory]:
 
 @pytest.fixture(scope="module")
 def robots(
-    memories: dict[str, Memory], tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Robots]:
+    memories: dict[str, Memory], engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory
+) -> Robots:
     catalog = lake_in(tmp_path_factory.mktemp("lake"))
     fill(catalog, memories)
-    engine = DuckdbEngine(memory_mb=256, threads=1)
-    of_lake = lake_robots(catalog, engine, NAMES)
+    return asked_both_ways(memories, lake_robots(catalog, engine, [*memories]))
+
+
+def asked_both_ways(memories: dict[str, Memory], of_lake: dict[str, LakeRobot]) -> Robots:
     over_lake = {name: each.memory for name, each in of_lake.items()}
-    yield Robots(fleet_of(memories, shared_map=True), fleet_of(over_lake, shared_map=True), of_lake)
-    engine.close()
+    return Robots(
+        fleet_of(memories, shared_map=True), fleet_of(over_lake, shared_map=True), of_lake
+    )
 
 
 def reply(fleet: Fleet, name: str, given: dict[str, object]) -> Any:
@@ -145,11 +147,10 @@ def test_what_the_lake_does_not_hold_is_refused_with_the_remedy(robots: Robots) 
 
 
 def test_chosen_messages_answer_as_those_of_the_bags(
-    memories: dict[str, Memory], tmp_path: Path
+    memories: dict[str, Memory], engine: LakeEngine, tmp_path: Path
 ) -> None:
     catalog = lake_in(tmp_path)
     fill(catalog, {"hall": memories["hall"]}, ("/is_docked", SEEN))
-    engine = DuckdbEngine(memory_mb=256, threads=1)
     over_lake = fleet_of({"hall": lake_robots(catalog, engine, ["hall"])["hall"].memory})
     mounted = fleet_of({"hall": memories["hall"]})
     docked = {"topic": "/is_docked", "condition_type": "equals", "value": True}
@@ -163,7 +164,6 @@ def test_chosen_messages_answer_as_those_of_the_bags(
         found, expected = (reply(each, tool, given) for each in (over_lake, mounted))
         assert "error" not in expected
         assert rounded(found) == rounded(expected), tool
-    engine.close()
 
 
 def mixed(robots: Robots, *, is_mounted: bool) -> Fleet:

@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.state_changes import StateLevel
 from ros2_memory.analysis.topic_events import EMPTY_STATE, State, TopicEvents, TopicEventsBuilder
 from ros2_memory.lake.memory.rows_as_messages import stated_in, states
-from ros2_memory.lake.state_runs import StateRuns, is_stated, unpacked
+from ros2_memory.lake.state_runs import (
+    EmptyRuns,
+    StateRuns,
+    is_stated,
+    unpacked,
+    unpacked_empty,
+)
 
 STATES = (
     EMPTY_STATE,
@@ -61,6 +67,24 @@ def test_all_that_follows_from_states_is_kept(steps: list[tuple[int, State | Non
         expected.undecodable,
     )
     assert before.changes == expected.changes
+
+
+@given(st.lists(st.tuples(st.integers(0, 10**9), st.booleans()), max_size=30))
+def test_runs_without_a_detection_begin_and_end_with_a_message(
+    steps: list[tuple[int, bool]],
+) -> None:
+    time, times, runs = 1_784_000_000 * 10**9, list[int](), EmptyRuns()
+    for nth, (step, has_detection) in enumerate(steps):
+        time += step
+        times.append(time)
+        if not has_detection:
+            runs.add(nth, time)
+    found = [*unpacked_empty(runs.packed())]
+    inside = [each.nth + more for each in found for more in range(each.messages)]
+    assert inside == [nth for nth, (_, has_detection) in enumerate(steps) if not has_detection]
+    for each in found:
+        assert each.first == times[each.nth]
+        assert each.last == times[each.nth + each.messages - 1]
 
 
 def test_a_topic_that_states_nothing_more_than_what_is_in_view_has_no_states() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections import Counter, OrderedDict
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.state_changes import has_levels
@@ -19,7 +20,7 @@ from ros2_memory.lake.memory.rows_as_messages import (
     message,
     states,
 )
-from ros2_memory.lake.state_runs import KIND, StateRun, unpacked
+from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, StateRun, unpacked, unpacked_empty
 from ros2_memory.lake.tables import topic_key
 from ros2_memory.storage.base import BagReader, Closing
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.lake.memory.index import LakeBag, LakeIndex
     from ros2_memory.storage.base import Channel, Record
 
-    DayOfSightings = tuple[pa.Table, Mapping[str, int], Mapping[str, int]]
+    DayOfSightings = tuple[pa.Table, Mapping[str, int], Mapping[str, int], Mapping[str, bytes]]
 
 _MOST_DAYS: Final = 8
 """Days of detections of a topic that stay in memory: a search goes through most of their bags."""
@@ -45,6 +46,9 @@ _MOST_READ: Final = 256
 _SIGHTINGS: Final = (
     "SELECT bag_id, time_ns, message, label, score, frame_id, x, y, z FROM sightings"
     " WHERE topic_key = $key AND topic = $topic ORDER BY bag_id, time_ns, message"
+)
+_EMPTY: Final = (
+    "SELECT bag_id, packed FROM digests WHERE topic_key = $key AND topic = $topic AND kind = $kind"
 )
 _MESSAGES: Final = (
     "SELECT type, time_ns, publish_ns, value FROM messages"
@@ -209,7 +213,9 @@ class LakeReader(BagReader):
             if whole:
                 return whole
         if self._index.is_detector(topic):
-            return detections(bag, topic, self._sightings(here, topic))
+            rows, packed = self._sightings(here, topic)
+            empty = None if packed is None else unpacked_empty(packed)
+            return detections(bag, topic, rows, empty)
         if topic == self._index.pose_topic:
             return self._tracks(bag, here).poses(topic)
         if topic in self._tf_topics:
@@ -240,25 +246,29 @@ class LakeReader(BagReader):
                 count = min(each.count, _MOST_EMPTY)
                 yield StateRun(EMPTY_STATE, each.first, each.last, count)
 
-    def _sightings(self, bag: LakeBag, topic: str) -> Sequence[Mapping[str, JsonValue]]:
+    def _sightings(
+        self, bag: LakeBag, topic: str
+    ) -> tuple[Sequence[Mapping[str, JsonValue]], bytes | None]:
+        """Returns the detections of a bag, and where there was none, which is packed."""
         key = self._index.version, topic, bag.day
         with self._lock:
             known = self._days.get(key)
         if known is None:
             asked = {"key": topic_key(topic), "topic": topic}
-            table = self._lake.select(
-                _SIGHTINGS, ["sightings"], asked, robots=[self._robot], days=(bag.day, bag.day)
-            )
+            of_day = partial(self._lake.select, robots=[self._robot], days=(bag.day, bag.day))
+            table = of_day(_SIGHTINGS, ["sightings"], asked)
+            empty = of_day(_EMPTY, ["digests"], {**asked, "kind": EMPTY_KIND})
+            packed = zip(empty["bag_id"].to_pylist(), empty["packed"].to_pylist(), strict=True)
             names = table["bag_id"].to_pylist()
             begins: Mapping[str, int] = {name: at for at, name in reversed([*enumerate(names)])}
-            known = table, begins, Counter(names)
+            known = table, begins, Counter(names), dict(packed)
             with self._lock:
                 self._days[key] = known
                 if len(self._days) > _MOST_DAYS:
                     self._days.popitem(last=False)
         begin, count = known[1].get(bag.bag_id, 0), known[2].get(bag.bag_id, 0)
         rows: Sequence[Mapping[str, JsonValue]] = known[0].slice(begin, count).to_pylist()
-        return rows
+        return rows, known[3].get(bag.bag_id)
 
     def _tracks(self, bag: BagFile, here: LakeBag) -> Tracks:
         topic = self._index.pose_topic

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.lake.state_runs import state_of_lists
+from ros2_memory.lake.state_runs import EmptyRun, state_of_lists
 from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.topic_events import State
+    from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.state_runs import StateRun
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
 
 _STATED: Final = "stated"
 """The encoding of messages of which only what they state is known."""
-_SEVERAL: Final = 3
 
 
 def channel(topic: str, type_name: str) -> Channel:
@@ -70,30 +71,39 @@ def stated_in(record: Record) -> State | None:
     return state_of_lists(json.loads(record.payload)) if is_known else None
 
 
-def detections(bag: BagFile, topic: str, rows: Sequence[Row]) -> Sequence[Record]:
-    """Returns the messages with detections, and of those without between any two at most two.
+def detections(
+    bag: BagFile, topic: str, rows: Sequence[Row], empty: Iterable[EmptyRun] | None
+) -> Sequence[Record]:
+    """Returns the messages with detections, and those that end sightings without any.
 
-    These are the first and the last, as if messages were equally far apart there. They end
-    sightings, and are nothing that is shown.
+    Of messages in a row without a detection (`empty`) that is the first and the last. Where they
+    are not known, messages are taken to be equally far apart between those that have detections.
     """
     [summary, *_] = bag.summary.of(topic)
     messages: dict[int, tuple[Ns, list[JsonValue]]] = {}
     for row in rows:
         entry = messages.setdefault(_ns(row["message"]), (_ns(row["time_ns"]), []))
         entry[1].append(_detection(row))
-    for nth, time in ((0, summary.first), (summary.count - 1, summary.last)):
-        messages.setdefault(nth, (time, []))
-    records: list[Record] = []
-    before, reached = -1, summary.first
-    for nth, (time, found) in sorted(messages.items()):
+    if empty is None:
+        empty = [*_gaps(summary, {nth: time for nth, (time, _) in messages.items()})]
+    for run in empty:
+        messages[run.nth] = run.first, []
+        messages[run.nth + run.messages - 1] = run.last, []
+    return [
+        record(topic, summary.type, time, {"detections": found})
+        for _, (time, found) in sorted(messages.items())
+    ]
+
+
+def _gaps(summary: TopicSummary, known: Mapping[int, Ns]) -> Iterator[EmptyRun]:
+    """Yields the runs of messages that are not known, with times equally far apart."""
+    times = {-1: summary.first, **known, summary.count: summary.last}
+    for (before, reached), (nth, time) in pairwise(sorted(times.items())):
         missing = even_times(reached, time, nth - before + 1)[1:-1].tolist()
-        records += [
-            record(topic, summary.type, each, {"detections": []})
-            for each in (missing if len(missing) < _SEVERAL else (missing[0], missing[-1]))
-        ]
-        records.append(record(topic, summary.type, time, {"detections": found}))
-        before, reached = nth, time
-    return records
+        if missing:
+            first = summary.first if before < 0 else missing[0]
+            last = summary.last if nth == summary.count else missing[-1]
+            yield EmptyRun(before + 1, first, max(first, last), len(missing))
 
 
 def _detection(row: Row) -> JsonValue:
