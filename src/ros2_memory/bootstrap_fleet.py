@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bootstrap import build_memory, places_of, query_settings_of, shared_parts
-from ros2_memory.config import NullRecorderNode
+from ros2_memory.config import NullRecorderNode, is_robot_name
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.timebase import WallClock
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from ros2_memory.config import Settings
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory
+    from ros2_memory.lake.files import Lake
+    from ros2_memory.lake.memory.robot import LakeRobot
 
 ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
@@ -49,38 +51,64 @@ def build_fleet(settings: Settings) -> Fleet | None:
     robots = []
     for name, bag_dir in fleet.robots.items():
         own = robot_settings(settings, name)
-        has_places = fleet.shared_map or own.data.places_file != settings.data.places_file
+        has_places = _has_places(settings, own)
         if has_places:
             # Here, so that a file that is refused keeps the server from starting.
             places_of(own)
         build = partial(_memory_of, own, shared, has_places=has_places)
-        source = None
-        if lake is not None:
-            from ros2_memory.lake.memory.robot import LakeRobot
-
-            limits = query_settings_of(own)
-            source = LakeRobot(
-                lake,
-                name,
-                WallClock(),
-                limits if has_places else replace(limits, places=()),
-                shared.extractor,
-                refresh_s=LAKE_REFRESH_S,
-            )
+        source = None if lake is None else _source_of(lake, name, settings, own, shared)
         is_mounted = lake is None or bag_dir.is_dir()
         robots.append(Robot(name, bag_dir, build, lake=source, is_mounted=is_mounted))
+    if lake is not None:
+        for name in lake.robots():
+            if name in fleet.robots or not is_robot_name(name):
+                continue
+            source = _source_of(lake, name, settings, robot_settings(settings, name), shared)
+            robots.append(
+                Robot(name, Path(name), partial(_lake_of, source), lake=source, is_mounted=False)
+            )
     return Fleet(robots, WallClock(), shared_map=fleet.shared_map)
 
 
+def _has_places(settings: Settings, own: Settings) -> bool:
+    """Returns whether named places are those of one robot's map."""
+    return settings.fleet.shared_map or own.data.places_file != settings.data.places_file
+
+
+def _source_of(
+    lake: Lake, name: str, settings: Settings, own: Settings, shared: SharedParts
+) -> LakeRobot:
+    """Returns what a lake has of a robot."""
+    from ros2_memory.lake.memory.robot import LakeRobot
+
+    limits = query_settings_of(own)
+    return LakeRobot(
+        lake,
+        name,
+        WallClock(),
+        limits if _has_places(settings, own) else replace(limits, places=()),
+        shared.extractor,
+        refresh_s=LAKE_REFRESH_S,
+    )
+
+
+def _lake_of(source: LakeRobot) -> Memory:
+    return source.memory
+
+
 def robot_settings(settings: Settings, name: str) -> Settings:
-    """Returns the settings of one robot of a fleet, as if a server had it alone."""
+    """Returns the settings of one robot of a fleet, as if a server had it alone.
+
+    Of a robot that only a lake knows they name no bag directory of its own.
+    """
     fleet, data = settings.fleet, settings.data
+    bag_dir = fleet.robots.get(name, settings.recording.bag_dir)
     if fleet.places is not None:
         own = Path(fleet.places.replace("*", name))
         data = replace(data, places_file=own) if own.is_file() else data
     return replace(
         settings,
-        recording=replace(settings.recording, bag_dir=fleet.robots[name]),
+        recording=replace(settings.recording, bag_dir=bag_dir),
         data=data,
         fleet=replace(fleet, robots={}, tokens={}),
     )

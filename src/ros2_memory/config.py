@@ -110,8 +110,13 @@ def _dot_path(path: str) -> str:
     return path
 
 
+def is_robot_name(name: str) -> bool:
+    """Returns whether a robot of a fleet may have a name: it could be no path."""
+    return bool(re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name)) and ".." not in name
+
+
 def _robot_name(name: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", name) or ".." in name:
+    if not is_robot_name(name):
         raise ValueError(
             f"must name each robot by up to 64 letters, digits, '-', '_' and '.', not {name[:80]!r}"
         )

@@ -184,6 +184,7 @@ def _parts_of_fleet(
     robots = {
         each: build_backfill(robot_settings(settings, name), each.memory())
         for name, each in fleet.robots.items()
+        if name in settings.fleet.robots  # of others there is no bag here
     }
     reports = {
         each.name: Health(each.memory(), package_version(), backfill)
@@ -192,7 +193,7 @@ def _parts_of_fleet(
     return _Parts(
         build_server(settings, memory, telemetry, fleet=fleet),
         FleetHealth(reports, package_version()),
-        partial(_fleet_in_background, robots, settings.reader.index_refresh_s, overrides),
+        partial(_fleet_in_background, fleet, robots, settings.reader.index_refresh_s, overrides),
         None,
     )
 
@@ -256,7 +257,7 @@ async def _in_background(
 
 
 async def _fleet_in_background(
-    robots: Mapping[Robot, Backfill], every_s: float, overrides: Sequence[str]
+    fleet: Fleet, robots: Mapping[Robot, Backfill], every_s: float, overrides: Sequence[str]
 ) -> None:
     """Keeps the indexes fresh and the catalogues full, until it is cancelled."""
     import anyio
@@ -271,7 +272,7 @@ async def _fleet_in_background(
         for each, backfill in robots.items()
     ]
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(keep_fleet_fresh, [*robots], every_s)
+        tasks.start_soon(keep_fleet_fresh, [*fleet.robots.values()], every_s)
         tasks.start_soon(keep_all_backfilled, fillers, every_s)
 
 
@@ -288,8 +289,10 @@ async def keep_fleet_fresh(robots: Sequence[Robot], every_s: float) -> None:
     limiter = anyio.CapacityLimiter(2 * len(robots))
     async with anyio.create_task_group() as tasks:
         for each in robots:
-            tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
-            if (shipped := each.lake_memory) is not None:
+            shipped = each.lake_memory
+            if each.memory() is not shipped:
+                tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
+            if shipped is not None:
                 # Sooner than a question would have to look itself.
                 tasks.start_soon(keep_fresh, shipped, LAKE_REFRESH_S / 2, limiter)
 

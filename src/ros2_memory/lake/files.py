@@ -73,6 +73,18 @@ class Lake:
             snapshot = None if table is None else table.current_snapshot()
             return 0 if snapshot is None else snapshot.snapshot_id
 
+    def robots(self) -> list[str]:
+        """Returns the names of all robots that have bags, in order; no file of rows is read.
+
+        Raises:
+            RefusedError: the lake cannot be read.
+        """
+        with self._lock, self._translated("looking into the lake"):
+            table = self._table("bags")
+            tasks = () if table is None else table.scan().plan_files()
+            # Partitioned by robot and day.
+            return sorted({str(task.file.partition[0]) for task in tasks})
+
     def select(
         self,
         sql: str,

@@ -11,7 +11,8 @@ import pytest
 
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.config import load_settings
-from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.history.context import Call
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.fleets import SEEN
 from tests.support.lakes import robot_bags, ship, write_bag
@@ -42,6 +43,26 @@ def test_a_robot_whose_bags_are_gone_is_answered_from_the_lake(tmp_path: Path) -
     assert found["notes"][-1].startswith("from the lake, which has what was shipped: ")
     assert fleet.robots["attic"].is_mounted
     assert not fleet.robots["hall"].is_mounted
+
+
+def test_a_robot_that_only_the_lake_knows_is_asked_unless_a_token_forbids_it(
+    tmp_path: Path,
+) -> None:
+    names = ("attic", "cellar", "hall")
+    for name in names:
+        write_bag(tmp_path / name, 0)
+    ship(tmp_path / "lake", [robot_bags(name, tmp_path / name) for name in names])
+    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert fleet is not None
+    assert [*fleet.robots] == ["hall", "attic", "cellar"]
+    found = reply(fleet, "find_last_match", CUP)
+    assert {row["robot_name"] for row in found["matches"]} == set(names)
+    told = reply(fleet, "data_time_range", {"robot": "cellar"})
+    assert "error" not in told
+    limited = Call(robots=frozenset({"hall"}))
+    assert [each.name for each in fleet.allowed(limited)] == ["hall"]
+    with pytest.raises(InvalidArgumentsError, match='there is no robot "cellar"'):
+        fleet.named("cellar", limited)
 
 
 async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: Path) -> None:
