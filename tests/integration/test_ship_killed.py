@@ -118,7 +118,7 @@ def check(folder: Path, bags: int) -> None:
             table: [row for row in found if row["robot"] == name] for table, found in rows.items()
         }
         expected = Counter(f"n{bag * 100 + nth}" for bag in range(bags) for nth in range(3))
-        assert Counter(json.loads(row["value"])["value"] for row in here["messages"]) == expected
+        assert Counter(dict(row["texts"])["value"] for row in here["messages"]) == expected
         ids = {row["bag_id"] for row in here["bags"]}
         assert len(here["bags"]) == len(ids) == bags
         assert Counter(row["bag_id"] for row in here["sightings"]) == dict.fromkeys(ids, 1)

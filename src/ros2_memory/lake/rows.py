@@ -29,6 +29,7 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.insights.topic_events import toggled
 from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, EmptyRuns, StateRuns, is_stated
 from ros2_memory.lake.tables import TABLES, microseconds, topic_key
+from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from ros2_memory.lake.tables import Row
     from ros2_memory.storage.base import Record
 
-ROWS_VERSION: Final = 2
+ROWS_VERSION: Final = 3
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 _BLOCK: Final = 1 << 20
 _NO_SCORE: Final = -1
@@ -425,11 +426,12 @@ class _BagRows:
 
     def _message(self, record: Record, nth: int) -> Row:
         memory, channel, time = self._memory, record.channel, record.log_time
-        value = reason = None
+        columns: Sequence[object] = [None] * (len(MAPS) + 1)
+        reason = None
         try:
             message = memory.reader.decode(record)
-            shown = memory.extractor.exact(message, channel.type)
-            value = json.dumps(shown, ensure_ascii=False, separators=(",", ":"))
+            value = taken_apart(memory.extractor.exact(message, channel.type))
+            columns = [value.rest, *([*each.items()] for each in value[1:])]
         except UndecodableError as error:
             reason = error.reason
         return (
@@ -440,8 +442,9 @@ class _BagRows:
             microseconds(time),
             record.publish_time,
             nth,
-            value,
+            columns[0],
             reason,
+            *columns[1:],
         )
 
 

@@ -11,7 +11,8 @@ epoch, exact; `time` is the same as a timestamp of microseconds, for people and 
     sightings   a row for each detection of each message
     things      a row for each place where a detector saw a label in the bag
     events      standstills, sudden stops, toggles, errors, and labels in view, of the bag alone
-    messages    a row for each message of the topics that are chosen for it
+    messages    a row for each message of the topics that are chosen for it: scalars in maps by
+                their dot-paths, JSON for the rest
 
 New columns are added at the end, and old lakes get them when they are opened.
 """
@@ -35,6 +36,7 @@ from pyiceberg.types import (
     DoubleType,
     IcebergType,
     LongType,
+    MapType,
     NestedField,
     StringType,
     TimestamptzType,
@@ -49,13 +51,31 @@ if TYPE_CHECKING:
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
-    Kind = Literal["text", "long", "double", "bool", "bytes", "date", "time"]
+    Kind = Literal[
+        "text",
+        "long",
+        "double",
+        "bool",
+        "bytes",
+        "date",
+        "time",
+        "texts",
+        "longs",
+        "doubles",
+        "bools",
+    ]
 
 NAMESPACE: Final = "ros2_memory"
 
 _NS_PER_US: Final = 1_000
 _ROW_GROUP: Final = 1 << 17
 """Rows of a row group, so that engines skip those of other topics and labels."""
+
+
+def _map(field_id: int, kind: IcebergType) -> MapType:
+    return MapType(field_id, StringType(), field_id + 1, kind, value_required=False)
+
+
 _TYPES: Final[Mapping[Kind, tuple[IcebergType, pa.DataType]]] = {
     "text": (StringType(), pa.large_string()),
     "long": (LongType(), pa.int64()),
@@ -64,7 +84,12 @@ _TYPES: Final[Mapping[Kind, tuple[IcebergType, pa.DataType]]] = {
     "bytes": (BinaryType(), pa.large_binary()),
     "date": (DateType(), pa.date32()),
     "time": (TimestamptzType(), pa.timestamp("us", tz="UTC")),
+    "texts": (_map(101, StringType()), pa.map_(pa.large_string(), pa.large_string())),
+    "longs": (_map(103, LongType()), pa.map_(pa.large_string(), pa.int64())),
+    "doubles": (_map(105, DoubleType()), pa.map_(pa.large_string(), pa.float64())),
+    "bools": (_map(107, BooleanType()), pa.map_(pa.large_string(), pa.bool_())),
 }
+"""The last four are maps from texts; their fields have ids that no column has."""
 _KEYS: Final[Mapping[str, Kind]] = {"robot": "text", "bag_id": "text", "day": "date"}
 """Columns of all tables; a row has a value for each."""
 _PROPERTIES: Final = {
@@ -256,6 +281,10 @@ TABLES: Final[Mapping[str, LakeTable]] = {
                 "message": "long",
                 "value": "text",
                 "undecodable": "text",
+                "flags": "bools",
+                "integers": "longs",
+                "numbers": "doubles",
+                "texts": "texts",
             },
             ("topic_key", "time_ns"),
         ),
@@ -301,11 +330,16 @@ def _array(values: Sequence[object], kind: pa.DataType) -> pa.Array:
         return pa.array(values, kind)
     except UnicodeEncodeError:
         # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
-        plain = (
-            each.encode("utf-8", "backslashreplace").decode() if isinstance(each, str) else each
-            for each in values
-        )
-        return pa.array(list(plain), kind)
+        return pa.array([*map(_encodable, values)], kind)
+
+
+def _encodable(value: object) -> object:
+    """Returns a text, or the names and values of a map, as UTF-8 can have them."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, list | tuple):
+        return type(value)(map(_encodable, value))
+    return value
 
 
 def open_tables(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import date, timedelta
+from itertools import islice
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -11,9 +14,12 @@ import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.model import JsonValue
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.tables import TABLES, Row, open_tables, to_arrow
+from ros2_memory.lake.memory.rows_as_messages import message
+from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables, to_arrow
+from ros2_memory.lake.typed_values import MAPS, taken_apart
 
 DAY = date(2026, 11, 20)
 ODD = ("it's", 'a "cup"', "back\\slash", "$label", "%_", "x'; SELECT 1 --", "ß 茶")
@@ -119,3 +125,29 @@ def test_threads_ask_at_once(lake: Lake) -> None:
 
     with ThreadPoolExecutor(4) as pool:
         assert [*pool.map(count, ODD * 2)] == [[6]] * len(ODD) * 2
+
+
+def test_rows_of_before_a_column_came_are_read_beside_those_that_have_it(
+    engine: LakeEngine, tmp_path: Path
+) -> None:
+    uri = f"sqlite:///{tmp_path}/lake.sqlite"
+    catalog = SqlCatalog("lake", uri=uri, warehouse=tmp_path.as_uri())
+    now = TABLES["messages"]
+    before = replace(now, columns=dict(islice(now.columns.items(), len(now.columns) - len(MAPS))))
+    catalog.create_namespace(NAMESPACE)
+    table = catalog.create_table(
+        f"{NAMESPACE}.messages", before.schema(), partition_spec=before.partition()
+    )
+    old: Row = ("/a", "a", "T", 1, 0, 1, 0, '{"x":1,"on":null}', None)
+    table.append(to_arrow(before, "hall", DAY, {"one": [old]}))
+    value: JsonValue = {"x": 2, "on": True, "y": 0.5, "name": "ß", "list": [1]}
+    apart = taken_apart(value)
+    new: Row = (*old[:7], apart.rest, None, *([*each.items()] for each in apart[1:]))
+    open_tables(catalog, ["messages"])["messages"].append(
+        to_arrow(now, "hall", DAY, {"two": [new]})
+    )
+    columns = ", ".join(("type", "time_ns", "publish_ns", "value", *MAPS))
+    sql = f"SELECT {columns} FROM messages ORDER BY bag_id"  # noqa: S608 - of constants
+    rows = Lake(catalog, engine).select(sql, ["messages"]).to_pylist()
+    found = [json.loads(message("/a", row).payload) for row in rows]
+    assert found == [{"x": 1, "on": None}, value]

@@ -107,7 +107,7 @@ def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy
     gone = forget(lake, tombstone())
     assert (gone.bags, gone.kept_by) == (1, ())
     assert files_with(lake, MARKER) == []
-    assert len(lake_column(lake, "messages", "value")) == 3
+    assert len(lake_column(lake, "messages", "texts")) == 3
     shutil.copy(late, kept)
     done = ship_with_tombstones(lake, bag_dir)
     assert done.bags == 0
@@ -186,7 +186,7 @@ def test_topics_are_forgotten_only_in_bags_that_hold_them(tmp_path: Path) -> Non
     assert forget(lake, Tombstone("hall", start, start + NS_PER_S, (seen,))).bags == 1
     assert files_with(lake, MARKER) == []
     assert len(lake_column(lake, "bags", "bag_id")) == 1
-    assert len(lake_column(lake, "messages", "value")) == 1
+    assert len(lake_column(lake, "messages", "texts")) == 1
 
 
 def test_where_the_robot_cannot_write_it_down_the_lake_keeps_it_and_the_command_is_named(
@@ -295,7 +295,7 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
         assert {path for path in lake.rglob("*") if path.is_file()} == files
         assert expire(where, tables, now + DAY_NS, DAY_NS) > 10
     assert foreign.exists()
-    assert len(lake_column(lake, "messages", "value")) == 2
+    assert len(lake_column(lake, "messages", "texts")) == 2
 
 
 def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) -> None:
@@ -304,7 +304,7 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) ->
         write_bag(bag_dir, number)
     ship(lake, [robot_bags("hall", bag_dir)], most_bags=1)
     before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
-    values = lake_column(lake, "messages", "value")
+    values = lake_column(lake, "messages", "texts")
     where = location(lake)
     with where.opened() as catalog:
         tables = where.tables(catalog, TABLES)
@@ -313,7 +313,7 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) ->
         assert len([*tables["messages"].refresh().scan().plan_files()]) == 1
         assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
-    assert lake_column(lake, "messages", "value") == values
+    assert lake_column(lake, "messages", "texts") == values
 
 
 def test_a_damaged_tombstone_keeps_everything_from_being_shipped(tmp_path: Path) -> None:

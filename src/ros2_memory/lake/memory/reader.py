@@ -22,6 +22,7 @@ from ros2_memory.lake.memory.rows_as_messages import (
 )
 from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, StateRun, unpacked, unpacked_empty
 from ros2_memory.lake.tables import topic_key
+from ros2_memory.lake.typed_values import MAPS
 from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ _EMPTY: Final = (
     "SELECT bag_id, packed FROM digests WHERE topic_key = $key AND topic = $topic AND kind = $kind"
 )
 _MESSAGES: Final = (
-    "SELECT type, time_ns, publish_ns, value FROM messages"
+    f"SELECT type, time_ns, publish_ns, value, {', '.join(MAPS)} FROM messages"  # noqa: S608
     " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns, message"
 )
 _POSES: Final = (

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.lake.state_runs import EmptyRun, state_of_lists
+from ros2_memory.lake.typed_values import MAPS, put_together
 from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
@@ -43,9 +44,17 @@ def record(topic: str, type_name: str, time: Ns, value: JsonValue, published: Ns
 def message(topic: str, row: Row) -> Record:
     """Returns a message of a row of `messages`; without a payload where it was undecodable."""
     text = row["value"]
-    value: JsonValue = json.loads(text) if isinstance(text, str) else None
+    scalars = {path: each for name in MAPS for path, each in _items(row.get(name))}
+    value = put_together(text, scalars) if isinstance(text, str) else None
     found = record(topic, str(row["type"]), _ns(row["time_ns"]), value, _ns(row["publish_ns"]))
     return found if isinstance(text, str) else found._replace(payload=b"")
+
+
+def _items(column: object) -> Iterator[tuple[str, JsonValue]]:
+    """Yields what a column of maps has in one row, which is null in rows of older versions."""
+    for each in column if isinstance(column, list) else ():
+        key, value = each.values() if isinstance(each, dict) else each
+        yield key, value
 
 
 def states(topic: str, type_name: str, runs: Iterable[StateRun]) -> Iterator[Record]:
