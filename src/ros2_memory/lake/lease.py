@@ -1,7 +1,8 @@
-"""One writer for one lake: a lock that the system releases when its holder dies.
+"""One writer for one lake: a lock that the system releases when its holder dies, and a lease.
 
-The lock is a file in the lake's state directory. Two machines that write one lake must share that
-directory, on a file system that supports locks.
+The lock is a file in the lake's state directory, on a file system that supports locks. For those
+with another state directory there is a lease in the warehouse, whose holder renews its term: a
+state directory that has it goes on at once, another one when the term is over.
 """
 
 from __future__ import annotations
@@ -10,16 +11,30 @@ import fcntl
 import json
 import os
 import socket
+import uuid
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
+from pyiceberg.io import load_file_io
+
+from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.core.errors import LakeError
+from ros2_memory.core.timebase import NS_PER_S, iso_local
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from pyiceberg.io import FileIO
+
+    from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.lake.warehouse import LakeLocation
+
 LEASE_FILE: Final = "writer.lock"
+TERM_NS: Final[Ns] = 600 * NS_PER_S
+"""How long the lease in the warehouse holds: longer than any commit takes."""
+_RENEWED_NS: Final = TERM_NS // 4
+_ID_FILE: Final = "writer.id"
 _FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_TEXT: Final = 1000
 
@@ -81,6 +96,118 @@ def holder_of(state_dir: Path) -> str | None:
         return None
     finally:
         os.close(descriptor)
+
+
+class WarehouseLease:
+    """A lease in the warehouse of a lake, for those who do not share its state directory.
+
+    A store has no locks, so two that take it at the same moment may both have it, until either
+    looks at it before its next commit; of two commits at once a table takes only one.
+
+    Args:
+        location: the lake.
+        clock: the wall clock, which must not differ between machines by as much as the term.
+    """
+
+    def __init__(self, location: LakeLocation, clock: Clock) -> None:
+        self._location = location
+        self._clock = clock
+        self._file = f"{location.warehouse}/{location.namespace}/writer.json"
+        self._id = _id_in(location.state_dir)
+        self._until: Ns = 0
+
+    def renew(self) -> None:
+        """Takes the lease, or prolongs it where a quarter of its term is over.
+
+        Raises:
+            LakeError: another state directory has it, or the warehouse cannot be reached.
+        """
+        now = self._clock.now()
+        if self._until - now > TERM_NS - _RENEWED_NS:
+            return
+        self._until = 0
+        with self._location.translated("taking the lease of the lake"):
+            self._require_mine(now)
+            self._write(now + TERM_NS)
+            self._require_mine(now)
+        self._until = now + TERM_NS
+
+    def confirm(self) -> None:
+        """Looks whether the lease is still held, and renews it: before each commit.
+
+        Raises:
+            LakeError: as `renew`.
+        """
+        with self._location.translated("looking at the lease of the lake"):
+            self._require_mine(self._clock.now())
+        self.renew()
+
+    def release(self) -> None:
+        """Ends the lease, if it is held; one that cannot be ended is over with its term."""
+        if self._until:
+            with suppress(LakeError), self._location.translated("ending the lease of the lake"):
+                self._require_mine(self._clock.now())
+                self._write(0)
+
+    def _require_mine(self, now: Ns) -> None:
+        held = self._read()
+        until = held.get("until")
+        if held.get("id") != self._id and isinstance(until, int) and until > now:
+            raise LakeError(
+                f"process {held.get('pid')} on {held.get('host')} writes into this lake, with "
+                f"another lake.state_dir, until {iso_local(until)}: a lake has one writer, and one "
+                "state_dir"
+            )
+
+    def _read(self) -> dict[str, object]:
+        given = self._store().new_input(self._file)
+        if not given.exists():
+            return {}
+        with given.open() as stream:
+            text = stream.read(_MAX_TEXT)
+        try:
+            value: object = json.loads(text)
+        except ValueError:
+            return {}
+        return value if isinstance(value, dict) else {}
+
+    def _write(self, until: Ns) -> None:
+        held = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
+        with self._store().new_output(self._file).create(overwrite=True) as stream:
+            stream.write(json.dumps(held).encode())
+
+    def _store(self) -> FileIO:
+        return load_file_io({**self._location.properties, **self._location.secrets}, self._file)
+
+
+def _id_in(state_dir: Path) -> str:
+    """Returns the id of a state directory, which is made with the first call.
+
+    Raises:
+        LakeError: it cannot be read or written.
+    """
+    path = state_dir / _ID_FILE
+    try:
+        if not path.exists():
+            write_durably(path, uuid.uuid4().hex)
+        return path.read_text(encoding="utf-8").strip()
+    except OSError as error:
+        raise LakeError(f"{path} cannot be read or written: {error.strerror}") from error
+
+
+@contextmanager
+def leased(location: LakeLocation, clock: Clock) -> Iterator[WarehouseLease]:
+    """Holds the lease of a lake, whose lock the caller holds.
+
+    Raises:
+        LakeError: another state directory has it, or the warehouse cannot be reached.
+    """
+    lease = WarehouseLease(location, clock)
+    lease.renew()
+    try:
+        yield lease
+    finally:
+        lease.release()
 
 
 def _holder(descriptor: int) -> str:

@@ -32,6 +32,7 @@ from ros2_memory.core.timebase import WallClock, ns_from_unix
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ros2_memory.lake.lease import WarehouseLease
     from ros2_memory.lake.shipper import RobotBags, Shipper
     from ros2_memory.lake.warehouse import LakeLocation
 
@@ -69,18 +70,18 @@ def ship(
     window = _window_of(forget, start, end)
     location, robots = lake_location(settings), build_robots(settings)
     # The extra is there: `lake_location` has checked that.
-    from ros2_memory.lake.lease import writing_alone  # noqa: PLC0415
+    from ros2_memory.lake.lease import leased, writing_alone  # noqa: PLC0415
 
     shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
     pace = _Pace(settings.lake.commit_interval_s)
-    with writing_alone(location.state_dir):
+    with writing_alone(location.state_dir), leased(location, WallClock()) as lease:
         if forget is not None and window is not None:
             _forget(location, forget, window, as_json=as_json)
             return
         if not once:
-            _ship_on(settings, location, robots, pace)
-        with _shipper(settings, location, robots, pace) as shipper:
+            _ship_on(settings, location, robots, pace, lease)
+        with _shipper(settings, location, robots, pace, lease) as shipper:
             done = shipper.run()
             shipper.keep_up(ns_from_unix(settings.lake.grace_h * 3600))
     if as_json:
@@ -175,12 +176,24 @@ def _wait(seconds: float) -> None:
 
 @contextmanager
 def _shipper(
-    settings: Settings, location: "LakeLocation", robots: "Sequence[RobotBags]", pace: _Pace
+    settings: Settings,
+    location: "LakeLocation",
+    robots: "Sequence[RobotBags]",
+    pace: _Pace,
+    lease: "WarehouseLease",
 ) -> "Iterator[Shipper]":
     from ros2_memory.lake.forgetting import forget_in_lake  # noqa: PLC0415 - as in `ship`
     from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
     from ros2_memory.lake.tables import TABLES  # noqa: PLC0415
     from ros2_memory.lake.tombstones import read_tombstones  # noqa: PLC0415
+
+    def alive() -> None:
+        notify(WATCHDOG)
+        lease.renew()
+
+    def pause() -> None:
+        pace()
+        lease.confirm()
 
     with location.opened() as catalog:
         tables = location.tables(catalog, TABLES)
@@ -195,13 +208,17 @@ def _shipper(
             WallClock(),
             messages=settings.lake.messages,
             tombstones=tombstones,
-            pause=pace,
-            alive=lambda: notify(WATCHDOG),
+            pause=pause,
+            alive=alive,
         )
 
 
 def _ship_on(
-    settings: Settings, location: "LakeLocation", robots: "Sequence[RobotBags]", pace: _Pace
+    settings: Settings,
+    location: "LakeLocation",
+    robots: "Sequence[RobotBags]",
+    pace: _Pace,
+    lease: "WarehouseLease",
 ) -> NoReturn:
     """Ships until the process is stopped; a lake that fails is tried again."""
     notify(READY)
@@ -211,8 +228,10 @@ def _ship_on(
     grace = ns_from_unix(settings.lake.grace_h * 3600)
     while True:
         try:
-            with _shipper(settings, location, robots, pace) as shipper:
+            lease.renew()
+            with _shipper(settings, location, robots, pace, lease) as shipper:
                 while True:
+                    lease.renew()
                     problems = shipper.run().problems
                     if time.monotonic() - kept_up_s >= _UPKEEP_S:
                         shipper.keep_up(grace)
