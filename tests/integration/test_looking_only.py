@@ -8,7 +8,6 @@ import os
 import shutil
 import sqlite3
 import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import closing, redirect_stderr, redirect_stdout
 from typing import TYPE_CHECKING, Final
@@ -23,12 +22,13 @@ from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.integration.test_retention_process import state
 from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.forked_commands import forked_commands
 from tests.support.housekeepers import recorded_before
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import T0, ask_everything, write_run
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 COMMANDS: Final = {
@@ -71,8 +71,14 @@ def strangers(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with forked_commands(tmp_path_factory.mktemp("commands")) as folder:
+        yield folder
+
+
 @pytest.fixture
-def env(tmp_path: Path) -> dict[str, str]:
+def env(tmp_path: Path, commands: Path) -> dict[str, str]:
     """The shipped defaults, and a `ros2` that leaves a log with every run, as the real one does."""
     programs = tmp_path / "bin"
     programs.mkdir()
@@ -80,13 +86,13 @@ def env(tmp_path: Path) -> dict[str, str]:
     ros2.write_text('#!/bin/sh\nmkdir -p "$ROS_LOG_DIR" && date > "$ROS_LOG_DIR/ros2.log"\n')
     ros2.chmod(0o755)
     kept = {name: text for name, text in os.environ.items() if not name.startswith("MEMORY_")}
-    path = f"{programs}:{os.environ['PATH']}"
+    path = f"{programs}:{commands}:{os.environ['PATH']}"
     return {**kept, "PATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
 
 
 def run(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "ros2_memory.cli", *command],
+        ["ros2-memory", *command],
         env={**env, "MEMORY_BAG_DIR": str(bag_dir)},
         capture_output=True,
         text=True,
@@ -96,7 +102,7 @@ def run(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.Complet
 
 
 def run_here(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    """As `run`, without a program's start, which takes most of its time."""
+    """As `run`, in this process."""
     out, err = io.StringIO(), io.StringIO()
     here = {**env, "MEMORY_BAG_DIR": str(bag_dir)}
     with patch.dict(os.environ, here, clear=True), redirect_stdout(out), redirect_stderr(err):
