@@ -49,6 +49,7 @@ class PlayedRecorder(Child):
     topics: tuple[str, ...] = TOPICS
     heard: tuple[str, ...] = TOPICS
     status: int | None = None
+    ends_with: int = 0
     lines: list[str] = field(default_factory=list)
     asked_to_end: int = 0
     splits: int = 0
@@ -71,7 +72,7 @@ class PlayedRecorder(Child):
             if self.directory.is_dir():
                 self._write(finish=True)
                 (self.directory / "metadata.yaml").write_text("{}")
-            self.status = 0
+            self.status = self.ends_with
         return self.status
 
     def die(self, status: int = -9) -> None:
@@ -248,6 +249,7 @@ class PlayedHousekeeper(Housekeeper):
         self.failed: dict[str, str] = {}
         self.recorded: list[tuple[tuple[str, ...], int, float]] = []
         self.held: str | None = None
+        self.restarts: list[tuple[int, str]] = []
 
     def make_room(self, free_bytes_wanted: int) -> None:
         self.asked.append(f"room {free_bytes_wanted}")
@@ -262,6 +264,9 @@ class PlayedHousekeeper(Housekeeper):
 
     def keep_moments(self) -> None:
         self.moments_kept += 1
+
+    def note_restart(self, first: int, how: str) -> None:
+        self.restarts.append((first, how))
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.bag_dir.state.lost_file import read_losses
+from ros2_memory.bag_dir.state.lost_file import INTERRUPTIONS, read_losses
 from ros2_memory.bag_dir.state.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
     DOUBTS,
@@ -35,7 +35,10 @@ from ros2_memory.core.spans import united
 from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
     START_SLACK_NS,
+    unix_from_ns,
     unix_rounded_up,
 )
 from ros2_memory.history.context import short_name
@@ -72,7 +75,11 @@ def note_unread(
     ]
     bag_dir = view.memory.index.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
-        for sentence in (*describe_lost(bag_dir, window), *describe_excluded(bag_dir, window)):
+        for sentence in (
+            *describe_interrupted(view.snapshot, bag_dir, window),
+            *describe_lost(bag_dir, window),
+            *describe_excluded(bag_dir, window),
+        ):
             view.notes.add(sentence)
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
@@ -85,17 +92,36 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on messages known to be missing in a window, and one on deleted ones."""
     losses = read_losses(bag_dir, window.start, window.stop)
     for forgotten, what in (
-        (False, "lost before they were recorded, or never published"),
+        (False, "lost before {they} recorded, or never published"),
         (True, "deleted by request"),
     ):
         topics: dict[str, int] = {}
         for loss in losses:
-            if (loss.by == "forgotten") == forgotten:
+            if (loss.by == "forgotten") == forgotten and not loss.interrupts:
                 topics[loss.topic] = topics.get(loss.topic, 0) + loss.lost
         if topics:
             most = sorted(topics, key=lambda topic: (-topics[topic], topic))
             named = listed([f"{topic} ({topics[topic]})" for topic in most])
-            yield f"{counted(sum(topics.values()), 'message')} {what}: {named}"
+            lost = sum(topics.values())
+            they = "it was" if lost == 1 else "they were"
+            yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
+
+
+def describe_interrupted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence for each way in which recordings ended unexpectedly before a gap.
+
+    Only gaps that overlap the window.
+    """
+    known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
+    found: dict[str, list[str]] = {}
+    for start, end in snapshot.gaps if known else ():
+        cause = next((each for each in known if each.start < end and start < each.stop), None)
+        if cause is not None and window.overlaps(start, end):
+            span = f"{unix_text(start)} to {unix_text(end)} ({unix_from_ns(end - start):.3g} s)"
+            found.setdefault(cause.by, []).append(span)
+    for by, spans in found.items():
+        named = listed(spans[-MAX_NAMED:], len(spans))
+        yield f"nothing was recorded from {named}, because {INTERRUPTIONS[by]}"
 
 
 def was_forgotten(bag_dir: Path, topic: str, window: TimeWindow) -> bool:

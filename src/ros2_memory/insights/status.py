@@ -8,7 +8,12 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.coverage import describe_excluded, describe_lost, was_forgotten
+from ros2_memory.history.coverage import (
+    describe_excluded,
+    describe_interrupted,
+    describe_lost,
+    was_forgotten,
+)
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.file_state import HELD_BACK
@@ -74,6 +79,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         problems=(
             *problems_of(snapshot, heartbeat, wall),
             *missing_data(view),
+            *describe_interrupted(snapshot, memory.index.bag_dir, TimeWindow.everything()),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
         notes=(

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
+    from ros2_memory.bag_dir.state.lost_file import Interruption
+    from ros2_memory.core.timebase import Ns
+
 
 class Recorder(ABC):
     """Records the robot's topics into the bag directory until it is stopped.
@@ -119,8 +122,11 @@ class Housekeeper:
             monotonic_s: the monotonic clock, in seconds.
         """
 
-    def note_restart(self) -> None:
-        """Records that a recording ended unexpectedly and another one begins."""
+    def note_restart(self, first: Ns, how: Interruption) -> None:
+        """Records that a recording ended unexpectedly, and another one begins.
+
+        It last grew at the wall time `first`; `how` is a key of `INTERRUPTIONS`.
+        """
 
     def announce(self, recording: str) -> None:
         """Records that a recording is about to start; no file of it exists yet.

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
+from ros2_memory.bag_dir.state.lost_file import EVERY_TOPIC, Loss, append_losses
 from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
@@ -41,7 +42,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Clock
+    from ros2_memory.bag_dir.state.lost_file import Interruption
+    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
@@ -149,6 +151,10 @@ class Housekeeping(Housekeeper):
         """
         if self._triggers is not None:
             self._triggers.note_unclean_end()
+        last = read_heartbeat(self._bag_dir).heartbeat
+        if last is not None and last.state is RecorderState.RECORDING:
+            now = self._clock.now()
+            self._note_interruption(min(last.updated, now), now, "unclean")
         named = _named(self._bag_dir)
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
@@ -206,11 +212,18 @@ class Housekeeping(Housekeeper):
                 if restarted:
                     self._look(snapshot)
 
-    def note_restart(self) -> None:
-        """Records that a recording ended unexpectedly and another one begins."""
+    def note_restart(self, first: Ns, how: Interruption) -> None:
+        """Records that a recording ended unexpectedly, and another one begins."""
+        now = self._clock.now()
         if self._triggers is not None:
-            now = self._clock.now()
             self._triggers.note_restart(now, now)
+        self._note_interruption(min(first, now), now, how)
+
+    def _note_interruption(self, first: Ns, now: Ns, how: Interruption) -> None:
+        try:
+            append_losses(self._bag_dir, [Loss(EVERY_TOPIC, first, now + 1, 0, how)])
+        except OSError as error:
+            _log.warning("losses_not_written", reason=error.strerror or str(error))
 
     def announce(self, recording: str) -> None:
         """Holds a recording back until it is screened, where something is to be excluded.
@@ -473,9 +486,9 @@ class BackgroundHousekeeper(Housekeeper):
         """Counts the time for which these recordings are written."""
         self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
 
-    def note_restart(self) -> None:
-        """Records that a recording ended unexpectedly and another one begins."""
-        self._housekeeper.note_restart()
+    def note_restart(self, first: Ns, how: Interruption) -> None:
+        """Records that a recording ended unexpectedly, and another one begins."""
+        self._housekeeper.note_restart(first, how)
 
     def announce(self, recording: str) -> None:
         """Records at once that a recording is about to start."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
@@ -155,6 +156,19 @@ def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: st
         )
     topics = counted(len(subscribed), "topic")
     return f"nothing has been recorded, although {topics} are subscribed to; {advice}"
+
+
+def describe_death(status: int, last_output: str) -> str:
+    """Describes a `ros2 bag record` that ended by itself.
+
+    `status` is its exit code, or minus the number of the signal that killed it.
+    """
+    if status >= 0:
+        ended = f"ended by itself with status {status}"
+    else:
+        known = {each.value: each.name for each in signal.Signals}
+        ended = f"was killed ({known.get(-status, f'signal {-status}')})"
+    return f"ros2 bag record {ended}: {last_output}" if last_output else f"ros2 bag record {ended}"
 
 
 def describe_silent_topics(

@@ -182,6 +182,7 @@ class RecordingSession:
         self.state = SessionState.STARTING
         self.is_listed = False
         self.has_recorded = False
+        self.grew_at = began.wall
         self.subscribed: set[str] = set()
         self.of_unknown_type: set[str] = set()
         self._reported: set[tuple[str | None, str]] = set()
@@ -194,7 +195,7 @@ class RecordingSession:
 
     @property
     def last_output(self) -> str:
-        """The end of what the child printed, for a report on its death."""
+        """The end of what the child printed besides information, for a report on its death."""
         return " | ".join(self._last_lines)[-600:]
 
     def age_s(self, now: ClockReading) -> float:
@@ -216,7 +217,7 @@ class RecordingSession:
         lines: list[Line] = []
         for raw in self.child.take_lines():
             line = parse_line(raw)
-            if line.text:
+            if line.text and "[INFO]" not in raw:
                 self._last_lines.append(line.text)
             if line.kind is LineKind.READY:
                 if not self.has_recorded:

@@ -5,6 +5,7 @@ This module does each step; `supervisor` decides when. Nothing here waits, excep
 
 from __future__ import annotations
 
+import signal
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -22,6 +23,7 @@ from ros2_memory.recorder.handover.recovery import settle_handover
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.policies import (
     WAITING_S,
+    describe_death,
     describe_silent_topics,
     describe_waiting,
 )
@@ -34,7 +36,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from ros2_memory.bag_dir.state.lost_file import Interruption
     from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child
@@ -114,6 +118,7 @@ class RecordingSessions:
         self.restarts = 0
         self.waiting_for: str | None = None
         self._silent_since_s: float | None = None
+        self._interruptions: list[tuple[Ns, Interruption]] = []
 
     @property
     def bytes_written(self) -> int:
@@ -216,12 +221,21 @@ class RecordingSessions:
             self._replace_current()
         return deaths
 
+    def take_interruptions(self) -> list[tuple[Ns, Interruption]]:
+        """Returns the recordings that ended unexpectedly since the last call.
+
+        When each last grew (wall time), and how it ended.
+        """
+        taken, self._interruptions = self._interruptions, []
+        return taken
+
     def end_unready(self, now: ClockReading) -> bool:
         """Ends the current session if it does not begin to record; returns whether it did."""
         current = self.current
         if current is None or current.is_recording or current.age_s(now) < READY_TIMEOUT_S:
             return False
-        sentence = f"ros2 bag record does not begin to record: {current.last_output}"
+        said = current.last_output or "it prints no reason"
+        sentence = f"ros2 bag record does not begin to record: {said}"
         self._events.fail("recorder_not_ready", sentence, recording=current.name)
         self.restarts += 1
         current.end()
@@ -236,6 +250,8 @@ class RecordingSessions:
             if session.state is SessionState.ENDING and session.child.end() is not None
         ]
         for session in ended:
+            if session.has_recorded and session.child.exit_status() == -signal.SIGKILL:
+                self._report_hang(session)
             self._finalize(session, now)
         if ended:
             self.settle_handovers()
@@ -289,7 +305,10 @@ class RecordingSessions:
 
     def _observe(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         self._report_output(session)
+        before = session.splits.bytes_written
         changes = session.splits.observe(now.monotonic_s)
+        if session.splits.bytes_written > before:
+            session.grew_at = now.wall
         for name in changes.closed:
             self._events.info("split_closed", recording=session.name, file=name)
             self._reception.learn(session.name, session.splits.directory / name)
@@ -376,10 +395,19 @@ class RecordingSessions:
     def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
         self._report_output(session)
         lived_s = session.age_s(now)
-        status = session.child.exit_status()
-        sentence = f"ros2 bag record ended by itself with status {status}: {session.last_output}"
+        sentence = describe_death(session.child.exit_status() or 0, session.last_output)
         self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
         self.restarts += 1
+        self._interruptions.append((session.grew_at, "died"))
+
+    def _report_hang(self, session: RecordingSession) -> None:
+        sentence = (
+            f"the ros2 bag record of {session.name} hung: it did not end when it was asked to, and "
+            "was killed (SIGKILL); what it had not written yet is lost"
+        )
+        self._events.fail("recorder_hung", sentence, recording=session.name)
+        self.restarts += 1
+        self._interruptions.append((session.grew_at, "hung"))
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""

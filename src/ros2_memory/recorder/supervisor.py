@@ -243,8 +243,10 @@ class Supervisor:
 
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
-        for _ in range(self._sessions.handle_exits(now)):
-            self._housekeeper.note_restart()
+        deaths = self._sessions.handle_exits(now)
+        for first, how in self._sessions.take_interruptions():
+            self._housekeeper.note_restart(first, how)
+        for _ in range(deaths):
             self._postpone("rotate", self._rotation_backoff.failed(), now)
             self._postpone("restart", self._backoff.failed(), now)
         if self._sessions.end_unready(now):

@@ -92,6 +92,21 @@ def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole
     )
 
 
+def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Path) -> None:
+    for name, seconds in (("a", range(20)), ("b", range(37, 50)), ("c", range(60, 70))):
+        (tmp_path / name).mkdir()
+        messages = [odom(BEGIN + t * S // 2, 0.0, 0.0, 0.0) for t in seconds]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 36 * S))
+    beating(tmp_path, RecorderState.RECORDING, 35)
+    assert shown(memory, tmp_path)["trust"] == "nothing is known to be missing"
+    append_losses(tmp_path, [Loss("*", BEGIN + 9 * S, BEGIN + 24 * S, 0, "hung")])
+    assert shown(memory, tmp_path)["trust"] == (
+        f"nothing was recorded from {BEGIN // S + 9}.500000 to {BEGIN // S + 18}.500000 (9 s), "
+        "because ros2 bag record hung"
+    )
+
+
 @pytest.mark.parametrize(("start", "lost"), [(0, 4), (12, 0)])
 def test_an_answer_notes_what_was_lost_in_its_window_alone(
     tmp_path: Path, start: int, lost: int

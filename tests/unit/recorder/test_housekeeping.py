@@ -10,9 +10,11 @@ import structlog
 import zstandard
 
 from ros2_memory import queries
+from ros2_memory.bag_dir.state.lost_file import read_losses
 from ros2_memory.bag_dir.state.shipped_file import Receipt, append_receipts
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.recorder.base import Housekeeper
@@ -27,6 +29,7 @@ from tests.support.housekeepers import (
     keeper_of,
     later,
     reader_of_both,
+    recorded_before,
     recording_now,
     size_of,
 )
@@ -536,3 +539,15 @@ class TestRemoval:
         (tmp_path / "metadata.yaml").write_text("x")
         remove_emptied(tmp_path, tmp_path)
         assert (tmp_path / "metadata.yaml").exists()
+
+
+@pytest.mark.parametrize(("unclean", "found"), [(True, ["unclean"]), (False, [])])
+def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
+    tmp_path: Path, unclean: bool, found: list[str]
+) -> None:
+    if unclean:
+        recording_now(tmp_path, OWN)
+    else:
+        recorded_before(tmp_path)
+    keeper_of(tmp_path).repair()
+    assert [each.by for each in read_losses(tmp_path, 0, MAX_NS)] == found

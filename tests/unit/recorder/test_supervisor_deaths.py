@@ -12,6 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.storage.base import Closing
 from tests.support.simulated_recorders import (
@@ -62,9 +63,25 @@ class TestDeath:
             world.run(3)
         (died,) = events(logs, "recorder_died")
         assert died["log_level"] == "error"
-        assert "status -6" in str(died["reason"])
+        assert "was killed (SIGABRT)" in str(died["reason"])
         assert "terminate called" in str(died["reason"])
         assert world.heartbeat()["last_error"] == died["reason"]
+
+    def test_one_that_hangs_and_must_be_killed_counts_as_a_restart(self, tmp_path: Path) -> None:
+        house = PlayedHousekeeper()
+        world = World(tmp_path, housekeeper=house)
+        world.supervisor.start()
+        world.run(12)
+        hung = world.recorders[0]
+        hung.deaf, hung.ends_with = True, -9
+        stopped = world.wall
+        with capture_logs() as logs:
+            world.run(40)
+        assert len(events(logs, "recorder_hung")) == 1
+        assert world.heartbeat()["restarts"] == 1
+        [(first, how)] = house.restarts
+        assert how == "hung"
+        assert stopped - 6 * NS_PER_S < first <= stopped + NS_PER_S
 
     def test_one_that_does_not_begin_is_given_up_and_another_is_started(
         self, tmp_path: Path

@@ -180,7 +180,7 @@ class TestOtherKinds:
         robot.begin(T0)
         robot.split(seconds(0, 10))
         robot.clock.at = T0 + 9 * S
-        robot.house.note_restart()
+        robot.house.note_restart(T0 + 8 * S, "died")
         robot.house.keep_moments()
         assert robot.spans() == [(4, 12)]
 

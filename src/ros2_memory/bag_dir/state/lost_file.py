@@ -1,8 +1,9 @@
 """`.episodic/lost.jsonl`: messages that were published and are in no bag, as far as is known.
 
-The recorder appends a line for each hole that it finds in a topic, and `ros2-memory forget` one for
-each that it makes into the middle of bags; the query server reads them, for
-the notes of answers. Lines of other versions, and a last line that a crash cut short, are ignored.
+The recorder appends a line for each hole that it finds in a topic, and for each end of a recording
+that it did not ask for; `ros2-memory forget` one for each hole that it makes into the middle of
+bags. The query server reads them, for the notes of answers. Lines of other versions, and a last
+line that a crash cut short, are ignored.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, Literal
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 from pydantic import TypeAdapter
 
@@ -26,6 +28,18 @@ if TYPE_CHECKING:
 
 MOST_BYTES: Final = 1 << 20
 """A longer file loses its older half."""
+EVERY_TOPIC: Final = "*"
+"""Stands for the topics of a recording that ended unexpectedly."""
+INTERRUPTIONS: Final = MappingProxyType(
+    {
+        "died": "ros2 bag record died",
+        "hung": "ros2 bag record hung",
+        "unclean": "the recorder ended without a shutdown",
+    }
+)
+"""How a recording may end unexpectedly, and the words for it."""
+Interruption: TypeAlias = Literal["died", "hung", "unclean"]
+"""A key of `INTERRUPTIONS`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +48,20 @@ class Loss:
 
     `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
     may never have been published either), or rosbag2's own count; or they were deleted by request.
+    The unexpected end of a recording is of `EVERY_TOPIC`, from when it last grew to when that was
+    noticed, with a key of `INTERRUPTIONS`. How many messages it cost is not known, and `lost` 0.
     """
 
     topic: str
     start: Int64
     stop: Int64
     lost: Count
-    by: Literal["counter", "stamps", "rosbag2", "forgotten"]
+    by: Literal["counter", "stamps", "rosbag2", "forgotten", "died", "hung", "unclean"]
+
+    @property
+    def interrupts(self) -> bool:
+        """Whether this is the unexpected end of a recording."""
+        return self.by in INTERRUPTIONS
 
 
 _LOSS: Final = TypeAdapter(Loss)
