@@ -177,6 +177,11 @@ def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[s
     return labels
 
 
+def _listed(value: object) -> object:
+    """Takes one path for a list of one."""
+    return [value] if isinstance(value, str) and value else value
+
+
 Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
 Flag: TypeAlias = Annotated[bool, Field(strict=True)]
 Metres: TypeAlias = Annotated[float, Field(allow_inf_nan=False)]
@@ -413,7 +418,7 @@ class Ros2BagNode(AdapterNode):
     use_sim_time: Flag
     queue_mb: Mebibytes
     min_free_gb: Tolerance
-    setup_files: tuple[AnyPath, ...]
+    setup_files: Annotated[tuple[AnyPath, ...], BeforeValidator(_listed)]
     latched_topics: tuple[Text, ...]
     repeat_latched: tuple[Text, ...]
     chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]

@@ -34,7 +34,15 @@ _RULES: Final = {
     "path_type": "must be a path",
     "path_not_directory": "must be an existing folder",
     "string_too_short": "must not be empty",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
 }
+
+
+_NOT_RECORDING: Final = (
+    "recorder=none records nothing, so it is not allowed; leave it out, or choose what records: "
+    "unset MEMORY_DEPLOYMENT if it is replay or query_only"
+)
 
 
 class OpenSecretError(ValueError):
@@ -141,8 +149,10 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
     """Returns what is wrong, and what is allowed instead."""
     kind, context = fault["type"], fault.get("ctx", {})
     if kind == "unexpected_keyword_argument":
-        known = ", ".join(_known_keys(model, fault, nodes))
-        return f"{key}: unknown key; use one of: {known}"
+        keys = _known_keys(model, fault, nodes)
+        is_recorder = key.startswith("recorder.") and keys == ["_target_"]
+        wrong = _NOT_RECORDING if is_recorder else f"unknown key; use one of: {', '.join(keys)}"
+        return f"{key}: {wrong}"
     if kind in {"missing", "union_tag_not_found"}:
         return f"{key}: missing; give it a value"
     if kind in {"dataclass_type", "model_attributes_type", "dict_type"}:
@@ -154,6 +164,8 @@ def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, ty
         return f"{key}: {_shown(refused)} is not allowed; use one of: {allowed}"
     rule = _RULES.get(kind) or re.sub(r"^(Input|String|Value) should ", "must ", fault["msg"])
     rule = rule.removeprefix("Value error, ")
+    if kind == "float_type" and key.endswith("_gb"):
+        rule = "must be a number in GB, such as 2"
     if isinstance(context.get("error"), OpenSecretError):
         return f"{key}: its value is not allowed, and not shown; {rule}"
     return f"{key}: {_shown(fault['input'])} is not allowed; {rule}"

@@ -215,9 +215,11 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:
+        is_cut = text.count("[") != text.count("]") or text.count("{") != text.count("}")
+        spaces = "; if it has a space, it needs quotes as a whole" if is_cut else ""
         raise ConfigError(
             f"{text!r} is not an override ({reason_of(error)}; set {source}); write key=value, "
-            "such as server.port=9300, and key='value' where special characters are in it"
+            f"such as server.port=9300, and key='value' where special characters are in it{spaces}"
         ) from error
     key = override.key_or_group
     is_group = key in options

@@ -40,6 +40,7 @@ LEVELS: Final = {
     "exception": "error",
     "fail": "error",
     "fail_once": "error",
+    "remark": "warning",
 }
 VARIES: Final = {"used_gb", "size_gb", "growth_gb_per_day", "full_in_days", "keeps_days"}
 """Sizes depend on the compressor's version by some bytes, so they are shown and not compared."""
@@ -260,7 +261,7 @@ def _events_of(tree: ast.AST) -> Iterator[Event]:
         loggers = [each for each in choices if each.attr in LEVELS and _is_log(each.value)]
         for method in loggers:
             own = [word.arg for word in node.keywords if word.arg]
-            given = ["reason"] if method.attr in {"warn", "fail", "fail_once"} else []
+            given = ["reason"] if method.attr in {"warn", "remark", "fail", "fail_once"} else []
             traced = ["exception"] if method.attr == "exception" else []
             yield Event(first.value, LEVELS[method.attr], (*given, *own, *traced))
 

@@ -96,7 +96,7 @@ def test_the_readme_that_pypi_shows_proves_whose_the_package_is() -> None:
 
 def test_every_variable_is_one_that_the_programs_read() -> None:
     example = (ROOT / ".env.example").read_text(encoding="utf-8")
-    known = set(re.findall(r"^([A-Z_]+)=", example, re.MULTILINE))
+    known = set(re.findall(r"^#([A-Z_]+)=", example, re.MULTILINE))
     assert {variable["name"] for variable in PACKAGE["environmentVariables"]} <= known
 
 

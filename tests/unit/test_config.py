@@ -211,7 +211,7 @@ class TestEnvironment:
     @pytest.mark.parametrize(
         ("name", "value", "fragments"),
         [
-            ("MCP_PORT", "http", ["server.port", "'http'", "valid integer"]),
+            ("MCP_PORT", "http", ["server.port", "'http'", "must be a whole number"]),
             ("MCP_PORT", "70000", ["server.port", "70000", "65535"]),
             ("MCP_TRANSPORT", "http", ["server.transport", "'http'", "stdio, sse"]),
             ("MEMORY_DEPLOYMENT", "moon", ["'moon'", "local, query_only, replay, robot"]),
@@ -220,7 +220,7 @@ class TestEnvironment:
             ("ROS_VISION_INTERFACES_PATH", "~nobody-here/x", ["existing folder"]),
             ("MEMORY_CONFIG_DIR", "/no/such", ["'/no/such'", "config.yaml"]),
             ("MEMORY_CONFIG_OVERRIDES", "'server.port=1", ["'server.port=1", "quotation"]),
-            ("MEMORY_CONFIG_OVERRIDES", "server.port=x", ["server.port", "'x'", "integer"]),
+            ("MEMORY_CONFIG_OVERRIDES", "server.port=x", ["server.port", "'x'", "whole number"]),
             ("MEMORY_CONFIG_OVERRIDES", "recorder=fast", ["'fast'", "none, ros2bag"]),
         ],
     )

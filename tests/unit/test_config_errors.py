@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.config import exit_on_config_error, load_settings
+from ros2_memory.config import Ros2BagNode, exit_on_config_error, load_settings
 from tests.support.config_folders import copied, edit, refusal
 
 
@@ -35,8 +35,8 @@ class TestRefusals:
             ("logging.format=xml", ["'xml'", "json, pretty"]),
             ("recording.split_duration_s=-10", ["recording.split_duration_s: -10", "than 0"]),
             ("recording.split_duration_s=0", ["recording.split_duration_s: 0", "than 0"]),
-            ("recording.split_duration_s=2.5", ["2.5", "valid integer"]),
-            ("recording.split_duration_s='10'", ["'10'", "valid integer"]),
+            ("recording.split_duration_s=2.5", ["2.5", "must be a whole number"]),
+            ("recording.split_duration_s='10'", ["'10'", "must be a whole number"]),
             ("recording.clear_on_startup=perhaps", ["'perhaps'", "boolean"]),
             ("recording.bag_dir=''", ["recording.bag_dir: ''", "must name a path"]),
             ("recording.bag_dir=7", ["recording.bag_dir: 7", "must be a path"]),
@@ -50,6 +50,8 @@ class TestRefusals:
             ("reader.index_refresh_s=0", ["reader.index_refresh_s: 0", "than 0"]),
             ("retention.max_age_h=inf", ["retention.max_age_h: inf", "finite"]),
             ("retention.max_total_gb=0", ["retention.max_total_gb: 0", "than 0"]),
+            ("retention.max_total_gb='2GB'", ["'2GB'", "must be a number in GB, such as 2"]),
+            ("recorder.setup_files=[/a", ["is not an override", "needs quotes as a whole"]),
             ("server.call_timeout_s=-1", ["server.call_timeout_s: -1", "than 0"]),
             ("server.max_reply_chars=10", ["server.max_reply_chars: 10", "1000"]),
             ("server.port=-1", ["server.port: -1", "equal to 0"]),
@@ -101,6 +103,17 @@ class TestRefusals:
     def test_come_once_for_a_value_that_an_adapter_repeats(self, override: str) -> None:
         assert refusal(override).splitlines() == [refusal(override)]
         assert refusal(override).startswith("reader.")
+
+    @pytest.mark.parametrize("preset", ["replay", "query_only"])
+    def test_settings_of_a_recorder_where_none_records(self, preset: str) -> None:
+        message = refusal("recorder.setup_files=[/opt/ros/x/setup.bash]", MEMORY_DEPLOYMENT=preset)
+        assert "recorder.setup_files: recorder=none records nothing" in message
+        assert "unset MEMORY_DEPLOYMENT" in message
+
+    def test_one_setup_file_is_a_list_of_one(self) -> None:
+        recorder = load_settings(["recorder.setup_files=/x/setup.bash"], {}).recorder
+        assert isinstance(recorder, Ros2BagNode)
+        assert recorder.setup_files == (Path("/x/setup.bash"),)
 
     def test_long_values_are_cut(self) -> None:
         message = refusal(f"data.now={'x' * 500}")

@@ -2,7 +2,8 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -18,8 +19,9 @@ from ros2_memory.cli.options import (
     print_line,
     reported_errors,
 )
-from ros2_memory.config import Settings, plain_values
+from ros2_memory.config import plain_values
 from ros2_memory.config_sources import GROUPS, Sources
+from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.model import JsonValue
 
 _MASK: Final = "********"
@@ -39,39 +41,64 @@ def config_show(
 ) -> None:
     """Show the configuration as YAML, composed of files, environment and arguments; no secrets.
 
-    A comment shows whether the server has a token, never the token itself.
+    Names of sections or keys, such as server or server.port, show those alone. A comment shows
+    whether the server has a token, never the token itself.
     """
-    settings, source = load_with_sources(bag_dir, overrides)
+    given = overrides or []
+    named = [each for each in given if re.fullmatch(r"[a-z_][\w.]*", each)]
+    settings, source = load_with_sources(bag_dir, [each for each in given if each not in named])
+    values = _chosen(dict(_keys(plain_values(settings))), named)
     if as_json:
-        values = dict(_keys(plain_values(settings)))
         rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}
         print_line(json.dumps(rows if sources else values))
         return
     if sources:
-        for line in _lines_with_sources(settings, source):
+        for line in _lines_with_sources(values, source, with_groups=not named):
             print_line(line)
         return
     sections: dict[str, dict[str, JsonValue]] = {}
-    for key, value in _keys(plain_values(settings)):
+    for key, value in values.items():
         section, _, name = key.partition(".")
         sections.setdefault(section, {})[name] = value
     print_line(yaml.safe_dump(sections, sort_keys=False, allow_unicode=True).rstrip())
-    for name in ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
+    for name in () if named else ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
         if os.environ.get(name):
             print_line(f"# {name} is set: {_MASK}")
 
 
-def _lines_with_sources(settings: Settings, source: Sources) -> Iterator[str]:
+def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[str, JsonValue]:
+    """Returns the keys that are named, or are of a section that is; all where none is.
+
+    Raises:
+        ConfigError: there is no such section or key.
+    """
+    for name in named:
+        if not any(f"{key}.".startswith(f"{name}.") for key in values):
+            sections = ", ".join(dict.fromkeys(key.partition(".")[0] for key in values))
+            raise ConfigError(
+                f"{name}: there is no such section or key; the sections are {sections} "
+                "(to change a setting, write key=value)"
+            )
+    return {
+        key: value
+        for key, value in values.items()
+        if not named or any(f"{key}.".startswith(f"{name}.") for name in named)
+    }
+
+
+def _lines_with_sources(
+    values: Mapping[str, JsonValue], source: Sources, *, with_groups: bool
+) -> Iterator[str]:
     """Yields a line for each group's choice and for each key: its name, who set it, its value.
 
     A key of a group that only takes over another key's value names that one as its source.
     """
     yield f"# files are those of {source.folder}"
     rows: list[tuple[str, str, str]] = []
-    for group in GROUPS:
+    for group in GROUPS if with_groups else ():
         option, who = source.choice(group)
         rows.append((group, _shortened_source(who, source.folder), option or "null"))
-    for key, value in _keys(plain_values(settings)):
+    for key, value in values.items():
         who = _shortened_source(source(key), source.folder)
         rows.append((key, who, value if isinstance(value, str) else json.dumps(value)))
     key_width, source_width = (max(len(row[column]) for row in rows) for column in (0, 1))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import os
 import signal
 import sys
 import time
@@ -36,7 +37,7 @@ from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.clear import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.config import Settings
@@ -68,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         settings = load_settings(overrides)
         configure_logging(settings.logging.level, settings.logging.format)
         if isinstance(settings.recorder, NullRecorderNode):
-            _log.info("nothing_to_record", reason="recorder=none: bags come from elsewhere")
+            _log.info("nothing_to_record", reason=_nothing_to_record(os.environ))
             return 0
         try:
             _return_freed_memory()
@@ -85,6 +86,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _nothing_to_record(env: Mapping[str, str]) -> str:
+    preset = env.get("MEMORY_DEPLOYMENT")
+    if not preset:
+        return "recorder=none: bags come from elsewhere"
+    return (
+        f"MEMORY_DEPLOYMENT={preset} records nothing (recorder=none): unset it, or set another, "
+        "such as robot"
+    )
+
+
 def _return_freed_memory() -> None:
     """Has the C library give back what is freed; by default it keeps some MB for each thread."""
     with suppress(OSError, AttributeError):  # another C library
@@ -96,6 +107,14 @@ def _return_freed_memory() -> None:
 def _record(settings: Settings) -> None:
     # Nothing is deleted before the list of topics and the environment proved fit for recording.
     load_topics(settings.recording.topics_file)
+    recording = settings.recording
+    if recording.split_duration_s > recording.session_duration_s:
+        _log.warning(
+            "split_longer_than_session",
+            reason=f"recording.split_duration_s ({recording.split_duration_s}) is longer than "
+            f"recording.session_duration_s ({recording.session_duration_s:g}), which ends splits "
+            "earlier",
+        )
     bag_dir = settings.recording.bag_dir.absolute()
     reader = build_reader(settings, cache_mb=CACHE_MB)
     reader = BagDirReader(reader, bag_dir, every_message=True)

@@ -52,6 +52,10 @@ class EventLog:
         self.last_error = sentence
         _log.warning(event, reason=sentence, **values)
 
+    def remark(self, event: str, sentence: str, **values: object) -> None:
+        """Logs a warning about the robot, which is no fault of the recorder."""
+        _log.warning(event, reason=sentence, **values)
+
     def fail(self, event: str, sentence: str, **values: object) -> None:
         """Logs a fault that keeps something from being recorded."""
         self.last_error = sentence

@@ -34,6 +34,10 @@ class HeartbeatWriter:
             None.
         expected: gives the topics that are to be recorded by name.
         reception: knows what was lost.
+
+    Attributes:
+        offered: the topics that some publisher has offered since the start.
+        gone: those that none offers any more; silent in the heartbeat, too.
     """
 
     def __init__(
@@ -60,7 +64,8 @@ class HeartbeatWriter:
         self._age_held = age_held
         self._expected = expected
         self._reception = reception
-        self._offered = set[str]()
+        self.offered = set[str]()
+        self.gone = frozenset[str]()
         self._state = RecorderState.STOPPED
         self._since = clock.now()
         self._written: Heartbeat | None = None
@@ -99,11 +104,11 @@ class HeartbeatWriter:
             since=self._since,
             bytes_written=sessions.bytes_written,
             subscribed=tuple(sorted(subscribed)),
-            silent=tuple(sorted(silent)),
+            silent=tuple(sorted(silent | self.gone)),
             last_error=self._events.last_error,
             interval_s=self._interval_s,
             restarts=sessions.restarts,
-            missing=self._missing(sessions),
+            missing=self.missing(sessions),
             age_held=self._age_held(),
             lost=self._reception.lost_in_last_hour(now),
             waiting_for=sessions.waiting_for if state is RecorderState.WAITING else None,
@@ -113,13 +118,13 @@ class HeartbeatWriter:
             unshipped=self._unshipped(),
         )
 
-    def _missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
+    def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
         """Returns the topics that no publisher has offered; none before a recorder has looked."""
         for session in sessions.running:
-            self._offered |= session.subscribed | session.splits.received
+            self.offered |= session.subscribed | session.splits.received
         if not any(session.has_recorded for session in sessions.running):
             return ()
-        return tuple(sorted({*self._expected()} - self._offered))
+        return tuple(sorted({*self._expected()} - self.offered))
 
     def _write(self, heartbeat: Heartbeat) -> None:
         self._written = _without_amounts(heartbeat)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.recorder.process.command import MESSAGES_LOST
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -19,6 +20,8 @@ SILENT_SPLITS: Final = 3
 """Splits without growth after which a robot counts as silent."""
 WAITING_S: Final = 30.0
 """A recorder that has recorded nothing for so long, and for a split, waits for something."""
+OWN_TOPICS: Final = frozenset({"/rosout", "/parameter_events", MESSAGES_LOST})
+"""Topics that each recorder publishes itself: they do not show that it hears the robot."""
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""
 SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
@@ -148,14 +151,14 @@ def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: st
             "nothing has been recorded: recording.use_sim_time is on, and nothing is written "
             "before /clock arrives"
         )
-    if not subscribed:
+    if not {*subscribed} - OWN_TOPICS:
         return (
-            "nothing has been recorded: no publisher offers any of the listed topics in this "
-            "ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and topics.yaml with the "
-            "robot's"
+            "nothing has been recorded of the robot: no publisher offers any of the listed topics "
+            "in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and topics.yaml with "
+            "the robot's"
         )
-    topics = counted(len(subscribed), "topic")
-    return f"nothing has been recorded, although {topics} are subscribed to; {advice}"
+    topics = counted(len({*subscribed} - OWN_TOPICS), "topic is", "topics are")
+    return f"nothing has been recorded, although {topics} subscribed to; {advice}"
 
 
 def describe_death(status: int, last_output: str) -> str:

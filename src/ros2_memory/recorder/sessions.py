@@ -22,6 +22,7 @@ from ros2_memory.recorder.handover.plan import (
 from ros2_memory.recorder.handover.recovery import settle_handover
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.policies import (
+    OWN_TOPICS,
     WAITING_S,
     describe_death,
     describe_silent_topics,
@@ -33,7 +34,7 @@ from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.state.lost_file import Interruption
@@ -79,6 +80,7 @@ class RecordingSessions:
         events: where everything is reported.
         own: the list of recordings that were made here.
         reception: measures closed splits, and receives the publishers that were refused.
+        expected: returns the topics that are to be recorded by their names.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
@@ -98,6 +100,7 @@ class RecordingSessions:
         *,
         own: OwnRecordings,
         reception: Reception,
+        expected: Callable[[], Sequence[str]] = tuple,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
@@ -105,6 +108,7 @@ class RecordingSessions:
         self._announce = announce
         self._own = own
         self._reception = reception
+        self._expected = expected
         self._reader = reader
         self._events = events
         self.current: RecordingSession | None = None
@@ -174,7 +178,7 @@ class RecordingSessions:
 
         What was heard once is silent later, and not waited for.
         """
-        if any(each.splits.messages or each.splits.bytes_written for each in self.running):
+        if any(map(self._hears, self.running)):
             self._silent_since_s = None
         since_s, current = self._silent_since_s, self.current
         patience_s = max(WAITING_S, self._orders.split_duration_s)
@@ -186,6 +190,13 @@ class RecordingSessions:
             current.subscribed, simulated=self._orders.simulated, advice=self._orders.advice()
         )
         self._events.fail_once("recording_waits", "", self.waiting_for, recording=current.name)
+
+    def _hears(self, session: RecordingSession) -> bool:
+        """Returns whether a session has recorded something that may be of the robot."""
+        splits = session.splits
+        if session.subscribed | splits.received <= OWN_TOPICS and {*self._expected()} - OWN_TOPICS:
+            return False
+        return bool(splits.messages or splits.bytes_written)
 
     def advance_handover(self, now: ClockReading) -> Step:
         """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
@@ -338,8 +349,11 @@ class RecordingSessions:
     def _complete(self, handover: HandoverTransfer, now: ClockReading) -> None:
         if handover.missing:
             missing = ", ".join(sorted(handover.missing))
-            self._events.warn(
-                "rotated_without", f"not subscribed by the new recorder in time: {missing}"
+            self._events.remark(
+                "rotated_without",
+                f"the new recording does not subscribe to {missing} yet: their publishers have "
+                "gone, or were not discovered in time",
+                recording=handover.new.name,
             )
         handover.complete(now)
         self._completed[handover.old.name] = handover

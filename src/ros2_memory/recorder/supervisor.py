@@ -16,7 +16,9 @@ from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
 from ros2_memory.recorder.policies import (
+    OWN_TOPICS,
     SET_BACK_NS,
+    WAITING_S,
     Backoff,
     SilenceWatch,
     SpaceAction,
@@ -120,6 +122,7 @@ class Supervisor:
             self._events,
             own=own or OwnRecordings(orders.bag_dir),
             reception=self._reception,
+            expected=expected,
         )
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
@@ -128,6 +131,7 @@ class Supervisor:
         self._rotate_now = False
         self._expected = expected
         self._unknown = frozenset[str]()
+        self._not_offered = frozenset[str]()
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
@@ -204,6 +208,7 @@ class Supervisor:
             "rotation": self._check_rotation,
             "restart": self._check_restart,
             "types": self._check_types,
+            "offers": self._check_offers,
             "reap": self._sessions.collect_ended,
             "recorded": self._note_recorded,
             "house": self._apply_retention,
@@ -374,6 +379,32 @@ class Supervisor:
                 "selects, others of the same type are not recorded either",
                 recording=current.name,
             )
+
+    def _check_offers(self, now: ClockReading) -> None:
+        """Names topics that no publisher offers: none did since the start, or none does any more.
+
+        Each is named once; one that comes back may be named again.
+        """
+        current = self._sessions.current
+        if current is None or current.age_s(now) < WAITING_S or self._sessions.handover is not None:
+            return
+        missing = frozenset(self._heartbeat.missing(self._sessions)) - current.of_unknown_type
+        if new := missing - self._not_offered:
+            self._events.remark(
+                "topic_not_offered",
+                f"no publisher offers {', '.join(sorted(new))}: recorded as soon as one does; "
+                "compare topics.yaml with the robot's topics",
+                topics=sorted(new),
+            )
+        self._not_offered |= missing
+        gone = frozenset(self._heartbeat.offered - current.subscribed - OWN_TOPICS)
+        if new := gone - self._heartbeat.gone:
+            self._events.remark(
+                "topic_silent",
+                f"no publisher offers {', '.join(sorted(new))} any more",
+                topics=sorted(new),
+            )
+        self._heartbeat.gone = gone
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)

@@ -216,6 +216,16 @@ class TestConfig:
         assert shown["recording"]["bag_dir"] == str(bag_dir)
         assert shown["storage"]["_target_"].startswith("ros2_memory.")
 
+    def test_a_section_or_a_key_alone(self, capsys: Capture) -> None:
+        assert cli.main(["config", "show", "server", "data.now", "server.port=9300"]) == 0
+        shown = yaml.safe_load(capsys.readouterr().out)
+        assert (shown["server"]["port"], [*shown["data"]]) == (9300, ["now"])
+        assert [*shown] == ["data", "server"]
+        assert cli.main(["config", "show", "serve"]) == 2
+        assert (
+            "serve: there is no such section or key; the sections are " in capsys.readouterr().err
+        )
+
     def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
         monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
         assert cli.main(["config", "show"]) == 0

@@ -133,7 +133,8 @@ class TestRotation:
             world.run(12)
         assert world.recorders[0].status == 0
         (said,) = events(logs, "rotated_without")
-        assert str(said["reason"]).endswith("/door")
+        assert "does not subscribe to /door yet" in str(said["reason"])
+        assert world.heartbeat()["last_error"] is None
         world.supervisor.stop()
         assert_each_counts_once(world)
 

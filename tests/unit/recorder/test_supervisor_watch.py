@@ -176,6 +176,28 @@ class TestHeartbeat:
         assert world.heartbeat()["interval_s"] == 5.0
 
 
+class TestOffers:
+    def test_a_topic_that_nobody_offers_is_named_once(self, tmp_path: Path) -> None:
+        world = World(tmp_path, expected=("/bumper", "/lidar"))
+        world.supervisor.start()
+        with capture_logs() as logs:
+            world.run(29)
+            assert not events(logs, "topic_not_offered")
+            world.run(60)
+        assert [each["topics"] for each in events(logs, "topic_not_offered")] == [["/lidar"]]
+
+    def test_nodes_that_have_gone_are_reported_until_they_come_back(self, tmp_path: Path) -> None:
+        world = World(tmp_path, subscribe_timeout_s=6)
+        world.supervisor.start()
+        world.run(12)
+        world.silent, world.defaults = True, {"topics": ()}
+        with capture_logs() as logs:
+            world.run(90)
+        (said,) = events(logs, "topic_silent")
+        assert said["topics"] == ["/bumper", "/door"]
+        assert world.heartbeat()["silent"] == ["/bumper", "/door"]
+
+
 class TestWaiting:
     def test_a_recorder_that_never_received_anything_says_what_it_waits_for(
         self, tmp_path: Path
@@ -195,6 +217,15 @@ class TestWaiting:
         world.silent = False
         world.run(10)
         assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
+
+    def test_its_own_log_is_no_sign_of_the_robot(self, tmp_path: Path) -> None:
+        world = World(tmp_path, expected=("/rosout", "/odom"))
+        world.defaults = {"topics": ("/rosout",), "heard": ("/rosout",)}
+        world.supervisor.start()
+        world.run(40)
+        beat = world.heartbeat()
+        assert beat["state"] == "waiting"
+        assert "no publisher offers any of the listed topics" in beat["waiting_for"]
 
     def test_what_fell_silent_later_is_not_waited_for(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20)

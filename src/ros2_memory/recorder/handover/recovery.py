@@ -65,7 +65,12 @@ def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str]
             ):
                 recover_handover(directory, bag_dir / handover.next, reader)
                 compare_recordings(directory, bag_dir / handover.next, reader, running)
-            if handover.previous is not None and handover.compared is False:
+            # Retention may have deleted the one before, and then there is nothing to compare.
+            if (
+                handover.previous is not None
+                and handover.compared is False
+                and _is_folder(bag_dir / handover.previous)
+            ):
                 compare_recordings(bag_dir / handover.previous, directory, reader, running)
         except RecorderError as error:
             _log.error("handover_not_settled", recording=directory.name, reason=str(error))

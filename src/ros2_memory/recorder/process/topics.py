@@ -5,18 +5,21 @@
       - /vision/*/detections_meta
       - /drive/_action/status
       - /set_mode/_service_event
+    exclude:
+      - /vision/debug/detections_meta
 
 An entry is a fully qualified topic name, or a glob: `*` matches one or more characters other than
 `/`, inside one part of the name. Names follow the ROS 2 design article "Topic and Service name
 mapping to DDS". Events of a service are recorded where the distribution can (Jazzy and later), and
-the service publishes them (service introspection).
+the service publishes them (service introspection). What `exclude` lists, in the same form, is not
+recorded; without it everything that `topics` selects is.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 import yaml
 
@@ -39,11 +42,12 @@ class TopicSelection:
     """The entries of `topics.yaml`, each once, in the order of the file."""
 
     entries: tuple[str, ...]
+    excluded: tuple[str, ...] = ()
 
     @property
     def exact(self) -> tuple[str, ...]:
         """The entries that are names, not globs."""
-        return tuple(entry for entry in self.entries if "*" not in entry)
+        return tuple(entry for entry in self.entries if "*" not in entry and self.matches(entry))
 
     @property
     def hidden(self) -> bool:
@@ -65,7 +69,11 @@ class TopicSelection:
         Only in this form does every distribution from Humble to Rolling accept topics, and only
         with it does the recorder never stop discovering.
         """
-        return f"^({'|'.join(_pattern(entry) for entry in self.entries)})$"
+        selected = "|".join(_pattern(entry) for entry in self.entries)
+        if not self.excluded:
+            return f"^({selected})$"
+        # Not every distribution has an option for it, and their names for it differ.
+        return f"^(?!({'|'.join(_pattern(entry) for entry in self.excluded)})$)({selected})$"
 
     def matches(self, topic: str) -> bool:
         """Whether the topic is recorded."""
@@ -79,12 +87,14 @@ def load_topics(path: Path) -> TopicSelection:
         ConfigError: the file is missing, is not such a list, lists nothing, or an entry is no
             topic name; the message names the file, the entry and the reason.
     """
-    entries = _entries(path)
-    for entry in entries:
+    entries, excluded = _entries(path)
+    for entry in (*entries, *excluded):
         reason = _fault(entry)
         if reason is not None:
             raise ConfigError(f"{path}: {entry!r} cannot be recorded: {reason}")
-    selection = TopicSelection(tuple(dict.fromkeys(str(entry) for entry in entries)))
+    selection = TopicSelection(
+        *(tuple(dict.fromkeys(map(str, each))) for each in (entries, excluded))
+    )
     if len(selection.regex) > MAX_REGEX:
         raise ConfigError(
             f"{path}: {len(selection.entries)} topics make a pattern of more than {MAX_REGEX} "
@@ -93,7 +103,8 @@ def load_topics(path: Path) -> TopicSelection:
     return selection
 
 
-def _entries(path: Path) -> list[object]:
+def _entries(path: Path) -> tuple[list[object], list[object]]:
+    """Returns what the file lists to be recorded, and what not to be."""
     try:
         content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -103,14 +114,19 @@ def _entries(path: Path) -> list[object]:
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: it is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict) or list(content) != ["topics"]:
-        raise ConfigError(f"{path}: it must hold one key, topics, and below it a list of topics")
+    if not isinstance(content, dict) or {*content} - {"exclude"} != {"topics"}:
+        raise ConfigError(
+            f"{path}: it must hold the key topics, and below it a list of topics; beside it, if "
+            "anything, exclude with such a list"
+        )
     listed: object = content["topics"]
+    excluded: object = content.get("exclude") or []
     if listed is None or listed == []:
         raise ConfigError(f"{path}: no topic is listed, so nothing would be recorded; list some")
-    if not isinstance(listed, list):
-        raise ConfigError(f"{path}: topics must be a list, one topic to a line: - /odom")
-    return listed
+    for name, each in (("topics", listed), ("exclude", excluded)):
+        if not isinstance(each, list):
+            raise ConfigError(f"{path}: {name} must be a list, one topic to a line: - /odom")
+    return cast("list[object]", listed), cast("list[object]", excluded)
 
 
 def _fault(entry: object) -> str | None:

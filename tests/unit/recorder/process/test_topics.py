@@ -139,9 +139,9 @@ def test_an_invalid_name_is_refused_with_file_entry_and_reason(
         ("topics: /odom", "must be a list"),
         ("topics: [3]", "3 cannot be recorded: an entry must be text"),
         ("topics: [~]", "None cannot be recorded: an entry must be text"),
-        ("- /odom", "one key, topics"),
-        ("", "one key, topics"),
-        ("topics: [/odom]\ntopic: [/tf]", "one key, topics"),
+        ("- /odom", "the key topics"),
+        ("", "the key topics"),
+        ("topics: [/odom]\ntopic: [/tf]", "the key topics"),
         ("topics: [/odom", "it is not YAML"),
     ],
 )
@@ -169,3 +169,19 @@ def test_more_topics_than_a_pattern_can_hold_are_refused(tmp_path: Path) -> None
 
 def test_the_pattern_is_a_regular_expression() -> None:
     re.compile(TopicSelection(("/a*b/c", "/*")).regex)
+
+
+def test_what_is_excluded_is_not_selected_by_a_glob(tmp_path: Path) -> None:
+    path = tmp_path / "topics.yaml"
+    path.write_text(
+        "topics: [/vision/*/meta, /odom, /bump]\nexclude: [/vision/debug_*/meta, /bump]"
+    )
+    topics = load_topics(path)
+    assert topics.exact == ("/odom",)
+    assert topics.matches("/vision/scene/meta")
+    assert topics.matches("/odom")
+    assert not topics.matches("/vision/debug_1/meta")
+    assert topics.matches("/vision/debug_1b/x/meta") is False
+    path.write_text("topics: [/odom]\nexclude: [odom]")
+    with pytest.raises(ConfigError, match="fully qualified"):
+        load_topics(path)
