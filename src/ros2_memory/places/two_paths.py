@@ -6,6 +6,7 @@ start again between the two.
 
 from __future__ import annotations
 
+from statistics import median
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -114,10 +115,12 @@ def _farthest(own: _Steps, other: _Steps, region: Region | None) -> FarPoint | N
             for some in np.array_split(points, len(points) // 256 + 1)
         ]
     )
-    tried = np.argsort(-near, kind="stable")[:_CANDIDATES].tolist()
-    away_m, nth = max(((_away(points[nth], other), nth) for nth in tried), key=lambda each: each[0])
+    tried = np.argsort(-near, kind="stable")[:_CANDIDATES]
+    away = _away(points[tried], other)
+    farthest = int(np.argmax(away))
+    nth = int(tried[farthest])
     x, y = points[nth].tolist()
-    return FarPoint(x, y, int(times[nth]), away_m)
+    return FarPoint(x, y, int(times[nth]), away[farthest])
 
 
 def _sampled(steps: _Steps) -> tuple[Floats, Times]:
@@ -138,20 +141,29 @@ def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
     size = _STEP_M
     while True:
         cells = np.floor(points / size).astype(np.int64)
-        _, first = np.unique(cells, axis=0, return_index=True)
+        # As `np.unique` by rows, which takes several times as long.
+        order = np.lexsort((cells[:, 1], cells[:, 0]))
+        row = cells[order]
+        first = order[np.append([True], (row[1:] != row[:-1]).any(axis=1))]
         if len(first) <= _MOST_CELLS:
             first.sort()
             return points[first], times[first]
         size *= 2
 
 
-def _away(point: Floats, steps: _Steps) -> float:
-    """Returns how far (m) a point is from the nearest step."""
-    along = steps.end - steps.begin
-    size = (along * along).sum(axis=1)
-    share = ((point - steps.begin) * along).sum(axis=1) / np.where(size > 0, size, 1.0)
-    nearest = steps.begin + np.clip(share, 0.0, 1.0)[:, None] * along
-    return float(np.hypot(*(nearest - point).T).min())
+def _away(points: Floats, steps: _Steps) -> list[float]:
+    """Returns how far (m) each of some points is from the nearest step."""
+    along, begin = steps.end - steps.begin, steps.begin
+    (along_x, along_y), (begin_x, begin_y) = along.T.copy(), begin.T.copy()
+    size = along_x * along_x + along_y * along_y
+    whole = np.where(size > 0, size, 1.0)
+    found = []
+    for x, y in points.tolist():
+        share = (x - begin_x) * along_x + (y - begin_y) * along_y
+        share = np.clip(share / whole, 0.0, 1.0)
+        away_x, away_y = begin_x + share * along_x - x, begin_y + share * along_y - y
+        found.append(float(np.hypot(away_x, away_y).min()))
+    return found
 
 
 def placed_standstills(
@@ -164,14 +176,14 @@ def placed_standstills(
     if not len(track.times):
         return
     since = track.times[0]
+    times = (track.times - since).astype(np.float64)
     for start, stop in spans:
         at = np.linspace(start, stop, _SAMPLES_OF_STAND).astype(np.int64)
         at = at[_is_known(track, at)]
         if not len(at):
             continue
         x, y = (
-            float(np.median(np.interp(at - since, track.times - since, column)))
-            for column in (track.x, track.y)
+            median(np.interp(at - since, times, column).tolist()) for column in (track.x, track.y)
         )
         if region is None or region.contains(x, y):
             yield PlacedStandstill(x, y, start, stop - start)
