@@ -111,11 +111,21 @@ class SegmentDigests:
         return self._cached(self._zone_map, topic, lambda: united(self.zone_maps(topic).values()))
 
     def zone_maps(self, topic: str) -> Mapping[int, ZoneMap]:
-        """Returns what can be in the messages of the topic, for each entry that has the topic."""
-        numbers = self._entries_with(topic)
+        """Returns what can be in the messages of the topic, for each entry that has the topic.
+
+        They are many, so only those that were asked for last are cached: those of all entries
+        together are asked for first, then each.
+        """
+        last = self._cache.last_zone_maps
+        if last is not None and last[0]() is self and last[1] == topic:
+            return last[2]
+        numbers, failures = self._entries_with(topic), self.catalogue.failures
         known = self.catalogue.zone_maps(topic, numbers)
         # Where the catalogue failed since the entries were found, nothing is ruled out.
-        return {number: known.get(number, UNBOUNDED) for number in numbers}
+        found = {number: known.get(number, UNBOUNDED) for number in numbers}
+        if self.catalogue.failures == failures:
+            self._cache.last_zone_maps = ref(self), topic, found
+        return found
 
     def boxes(self, topic: str) -> Boxes:
         """Returns the boxes of the zone maps; cached, since they are small and often asked for."""
@@ -223,11 +233,16 @@ class SegmentDigests:
 
 
 class DigestCache:
-    """Caches the catalogue's entries, by segment. Thread-safe."""
+    """Caches the catalogue's entries, by segment. Thread-safe.
+
+    Attributes:
+        last_zone_maps: those that were asked for last, with their segment and topic.
+    """
 
     def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
         self.catalogue = catalogue
         self.bag_dir = bag_dir
+        self.last_zone_maps: tuple[ref[SegmentDigests], str, Mapping[int, ZoneMap]] | None = None
         self._lock = threading.Lock()
         self._with_messages: OrderedDict[SegmentDigests, None] = OrderedDict()
         self._derived: OrderedDict[tuple[ref[SegmentDigests], str], None] = OrderedDict()
