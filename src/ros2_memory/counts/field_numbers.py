@@ -45,6 +45,8 @@ _Sample: TypeAlias = tuple[list[float], ...]
 """The numbers of each field in one message."""
 
 _MOST_AT_ONCE: Final = 1024
+_ONE_BY_ONE: Final = 64
+"""Groups of several bags that are looked up one by one; then all are read."""
 
 
 class FieldNumbers(NamedTuple):
@@ -98,6 +100,7 @@ class FieldReader:
         self._fields = tuple(fields)
         self.failures: list[UndecodableError] = []
         self._shared: dict[tuple[int, ...], Digested[Numbers]] | None = None
+        self._asked = 0
         self._decoder = BulkDecoder(self._decode, self._template, self._apply)
 
     def over(self, window: TimeWindow, edges: Sequence[Ns]) -> Folded[NumberTable]:
@@ -124,16 +127,27 @@ class FieldReader:
         """Returns the numbers of recordings that overlap, by what `store_shared_ranges` stored."""
         if group.may_be_relatched or len(group.bags) < 2:
             return None
-        numbers = self._view.bags.entry_numbers(group.bags)
+        bags, question = self._view.bags, f"{_SHARED.name} {self._topic}"
+        entries = bags.entry_numbers(group.bags)
+        if entries is None:
+            return None
+        key = tuple(entries)
+        self._asked += 1
+        # Where few are asked for, as at the ends of a window, the others need not be decoded.
+        if self._shared is None and self._asked <= _ONE_BY_ONE:
+            answer = bags.cached_answer(question, group.bags, str)
+            return None if answer is None else self._of_answers({key: answer}).get(key)
         if self._shared is None:
-            self._shared = self._all_shared()
-        return None if numbers is None else self._shared.get(tuple(numbers))
+            self._shared = self._of_answers(bags.cached_answers(question))
+        return self._shared.get(key)
 
-    def _all_shared(self) -> dict[tuple[int, ...], Digested[Numbers]]:
+    def _of_answers(
+        self, answers: Mapping[tuple[int, ...], str]
+    ) -> dict[tuple[int, ...], Digested[Numbers]]:
         keys: list[tuple[int, ...]] = []
         spans: list[Span] = []
         rows: list[tuple[int, str, bytes]] = []
-        for key, answer in self._view.bags.cached_answers(f"{_SHARED.name} {self._topic}").items():
+        for key, answer in answers.items():
             try:
                 packed, first, last = json.loads(answer)
                 text, ranges = _SHARED.decode(bytes.fromhex(packed))

@@ -182,7 +182,7 @@ class _Runs:
         """Yields the sightings, the oldest first."""
         open_run: _Run | None = None
         last = 0
-        for met in (each for share in self._shares() for each in self._met(share)):
+        for met in chain.from_iterable(map(self._met, self._shares())):
             for nth, (begin, end) in enumerate(met.runs()):
                 run = _Run((met, begin), (met, end), end - begin + 1)
                 if open_run is not None:
@@ -202,7 +202,8 @@ class _Runs:
         """Yields the sightings, the newest first."""
         open_run: _Run | None = None
         first = 0
-        for met in (each for share in reversed(self._shares()) for each in self._met(share)[::-1]):
+        newest_first = partial(self._met, newest_first=True)
+        for met in chain.from_iterable(map(newest_first, reversed(self._shares()))):
             for nth, (begin, end) in enumerate([*met.runs()][::-1]):
                 run = _Run((met, begin), (met, end), end - begin + 1)
                 if open_run is not None:
@@ -239,14 +240,14 @@ class _Runs:
                 known.append(found)
         return known[0]
 
-    def _met(self, share: Share) -> list[_Met]:
-        """Returns the groups of a share with a message in the window, in order."""
+    def _met(self, share: Share, *, newest_first: bool = False) -> Iterator[_Met]:
+        """Yields the groups of a share with a message in the window, in order."""
         stored = StoredDigests(self._view, self._topic, _TEXT_RUNS, share.inside(self._window))
-        found = (
-            self._of_group(each, stored)
-            for each in share.groups(self._view, self._topic, self._window)
-        )
-        return [each for each in found if each is not None]
+        groups = share.groups(self._view, self._topic, self._window)
+        for each in reversed(groups) if newest_first else groups:
+            met = self._of_group(each, stored)
+            if met is not None:
+                yield met
 
     def _of_group(self, group: Group, stored: StoredDigests[TextRuns]) -> _Met | None:
         if group.is_whole:

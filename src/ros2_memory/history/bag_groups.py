@@ -10,6 +10,7 @@ answer that is joined from digests does not depend on what the catalogue knows.
 from __future__ import annotations
 
 import json
+from bisect import bisect_left
 from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar, cast
@@ -94,24 +95,23 @@ class Group:
             return sum(1 for _ in self.messages())
         if len(self.bags) == 1 and self.is_inside:
             return sum(each.count for each in self.bags[0].bag.summary.of(self._topic))
-        return len(self._positions())
+        return len(self._log_times())
 
     def times(self) -> list[Ns]:
         """Returns the log times of the messages of the window, in order."""
         if self._has_duplicates:
             return [each.time for each in self.messages()]
-        return [each.time for each in self._positions()]
+        return [*self._log_times()]
 
     def fetch(self, indices: Sequence[int]) -> Iterator[StoredMessage]:
         """Yields the messages at these indices of the group, which must ascend."""
         if not indices:
             return
-        wanted = set(indices)
         if self._has_duplicates:
+            wanted = set(indices)
             yield from (each for index, each in enumerate(self.messages()) if index in wanted)
             return
-        # Fewer than were counted, where a bag was deleted since.
-        chosen = (each for index, each in enumerate(self._positions()) if index in wanted)
+        chosen = self._chosen(indices)
         bags = self._stream.bags
         # Any number of messages may bear one log time: these are read once.
         for (time, rank), positions in groupby(chosen, key=lambda each: (each.time, each.rank)):
@@ -119,6 +119,25 @@ class Group:
             at_once = bags.read(self.bags[rank].bag, [self._topic], TimeWindow(time, time + 1))
             found = (each for nth, each in enumerate(at_once) if nth in numbers)
             yield from bags.track_sources(found)
+
+    def _chosen(self, indices: Sequence[int]) -> Iterator[MessagePosition]:
+        """Yields the messages at some indices; fewer, where a bag was deleted since."""
+        if len(self.bags) > 1:
+            positions = self._positions()
+            yield from (positions[index] for index in indices if index < len(positions))
+            return
+        # Of a single bag only those that are wanted become objects.
+        times = self._log_times()
+        for index in indices:
+            if index < len(times):
+                time = times[index]
+                yield MessagePosition(time, 0, index - bisect_left(times, time))
+
+    def _log_times(self) -> Sequence[Ns]:
+        """Returns the log times of the messages, in order, where none has a duplicate."""
+        if len(self.bags) > 1:
+            return [each.time for each in self._positions()]
+        return sorted(self._stream.bags.log_times(self.bags[0].bag, self._topic, self._window))
 
     def _positions(self) -> list[MessagePosition]:
         if self._known_positions is None:
