@@ -56,6 +56,11 @@ def of_day(robot: str, day: date) -> BooleanExpression:
     return And(equal("robot", robot), equal("day", day.isoformat()))
 
 
+def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
+    """Returns the condition on rows of one day of some robots."""
+    return And(_one_of("robot", robots), equal("day", day.isoformat()))
+
+
 def of_bags(ids: Mapping[tuple[str, date], Collection[str]]) -> BooleanExpression:
     """Returns the condition on rows of bags, given by robot and day.
 

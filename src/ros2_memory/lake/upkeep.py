@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.lake.conditions import of_day
+from ros2_memory.lake.conditions import of_robots
 from ros2_memory.lake.tables import TABLES, day_of
 from ros2_memory.lake.warehouse import quiet_deletes
 from ros2_memory.lake.written_files import delete_unreferenced
@@ -25,8 +25,10 @@ log = get_logger(__name__)
 _DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 FEW_FILES: Final = 3
 """A day of a robot with more files in a table is put together."""
-_MOST_ROWS: Final = 10_000_000
-"""Of a day that is put together: they are in memory meanwhile."""
+_MOST_BYTES: Final = 128 << 20
+"""Of files that are put together at once: their rows are in memory meanwhile."""
+_MOST_ROBOTS: Final = 200
+"""In one condition: with more names Iceberg rules no file out by them."""
 
 
 def compact(
@@ -35,9 +37,10 @@ def compact(
     now: Ns,
     alive: Callable[[], object] = lambda: None,
 ) -> int:
-    """Puts each closed day of each robot into one file, in one transaction; returns how many.
+    """Puts each closed day of each robot into one file; returns how many were.
 
-    A day is closed a day after its end. The rows stay the same.
+    A day is closed a day after its end. The rows stay the same. One transaction replaces the files
+    of many robots, since each writes the table's list of versions again.
 
     Raises:
         LakeError: the lake cannot be read or written.
@@ -46,25 +49,39 @@ def compact(
     done = 0
     for name, table in tables.items():
         with location.translated(f"putting together the lake's {name}"):
-            files: Counter[tuple[str, date]] = Counter()
-            rows: Counter[tuple[str, date]] = Counter()
-            for task in table.refresh().scan().plan_files():
-                robot, day = task.file.partition[0], _day(task.file.partition[1])
-                files[robot, day] += 1
-                rows[robot, day] += task.file.record_count
-            for (robot, day), many in files.items():
-                if day >= closed or many <= FEW_FILES or rows[robot, day] > _MOST_ROWS:
-                    continue
+            order = [(each, "ascending") for each in TABLES[name].order]
+            for day, robots in _to_compact(table.refresh(), closed):
                 alive()
-                condition = of_day(robot, day)
+                condition = of_robots(robots, day)
                 whole = table.refresh().scan(row_filter=condition).to_arrow()
-                order = [(each, "ascending") for each in TABLES[name].order]
                 with quiet_deletes():
                     table.overwrite(whole.sort_by(order), overwrite_filter=condition)
-                done += 1
+                done += len(robots)
     if done:
         log.info("days_compacted", days=done)
     return done
+
+
+def _to_compact(table: IcebergTable, closed: date) -> list[tuple[date, list[str]]]:
+    """Returns what to put together of the days before `closed`: a day, and some of its robots."""
+    files: Counter[tuple[date, str]] = Counter()
+    size: Counter[tuple[date, str]] = Counter()
+    for task in table.scan().plan_files():
+        part = _day(task.file.partition[1]), task.file.partition[0]
+        files[part] += 1
+        size[part] += task.file.file_size_in_bytes
+    found: list[tuple[date, list[str]]] = []
+    room = 0
+    for part in sorted(files):
+        day, robot = part
+        if day >= closed or files[part] <= FEW_FILES or size[part] > _MOST_BYTES:
+            continue
+        room -= size[part]
+        if not found or found[-1][0] != day or room < 0 or len(found[-1][1]) == _MOST_ROBOTS:
+            found.append((day, []))
+            room = _MOST_BYTES - size[part]
+        found[-1][1].append(robot)
+    return found
 
 
 def _day(value: object) -> date:

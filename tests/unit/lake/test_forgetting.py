@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections import Counter
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -299,18 +300,27 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
 
 
 def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) -> None:
-    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
-    for number in range(5):
-        write_bag(bag_dir, number)
-    ship(lake, [robot_bags("hall", bag_dir)], most_bags=1)
+    """That of all robots in one transaction; the day of one with few files stays as it is."""
+    lake = tmp_path / "lake"
+    robots = {"hall": 4, "roof": 1, "yard": 4}
+    for number in range(4):
+        for robot, bags in robots.items():
+            if number < bags:
+                write_bag(tmp_path / robot, number)
+        ship(lake, [robot_bags(robot, tmp_path / robot) for robot in robots])
     before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
     values = lake_column(lake, "messages", "texts")
     where = location(lake)
     with where.opened() as catalog:
         tables = where.tables(catalog, TABLES)
+        messages = tables["messages"].refresh()
+        versions = len(messages.snapshots())
         assert compact(where, tables, (START_S + 3600) * NS_PER_S) == 0
         assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
-        assert len([*tables["messages"].refresh().scan().plan_files()]) == 1
+        files = Counter(task.file.partition[0] for task in messages.refresh().scan().plan_files())
+        assert files == {"hall": 1, "roof": 1, "yard": 1}
+        # What was deleted, and what was written instead.
+        assert len(messages.snapshots()) == versions + 2
         assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
     assert lake_column(lake, "messages", "texts") == values
