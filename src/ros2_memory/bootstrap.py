@@ -170,6 +170,7 @@ def _watch_of(
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.recorder.process.topics import load_topics
     from ros2_memory.triggers.search import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
@@ -182,6 +183,7 @@ def _watch_of(
         own,
         clock=WallClock(),
         split_duration_s=settings.recording.split_duration_s,
+        is_recorded=load_topics(settings.recording.topics_file).matches,
     )
 
 
@@ -646,5 +648,5 @@ def _extra_required(key: str) -> Iterator[None]:
     except ImportError as error:
         raise ConfigError(
             f"{key}: true needs the optional part of this package (no {error.name}): "
-            "pip install 'ros2-memory[observability]'"
+            "pip install '.[observability]'"
         ) from error

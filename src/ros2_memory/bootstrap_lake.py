@@ -40,8 +40,7 @@ def require_extra() -> None:
     for name in ("pyarrow", "pyiceberg"):
         if find_spec(name) is None:
             raise ConfigError(
-                f"a lake needs the optional part of this package (no {name}): "
-                "pip install 'ros2-memory[lake]'"
+                f"a lake needs the optional part of this package (no {name}): pip install '.[lake]'"
             )
 
 
@@ -118,7 +117,7 @@ def _engine_of(settings: Settings) -> LakeEngine:
     if find_spec(name) is None:
         raise ConfigError(
             f"lake.engine: {settings.lake.engine} needs the optional part of this package (no "
-            f"{name}): pip install 'ros2-memory[{extra}]'"
+            f"{name}): pip install '.[{extra}]'"
         )
     if settings.lake.engine == "ray":
         from ros2_memory.lake.engines.ray_engine import RayEngine

@@ -176,7 +176,7 @@ def test_without_the_extra_it_does_not_start_and_says_what_to_install(
     output = refused(bag_dir, [sys.executable, "-c", hidden])
     assert len(output.splitlines()) == 2
     assert f"{key}: true needs the optional part of this package" in output
-    assert "pip install 'ros2-memory[observability]'" in output
+    assert "pip install '.[observability]'" in output
 
 
 def test_there_are_no_metrics_over_stdio(bag_dir: Path) -> None:

@@ -67,7 +67,8 @@ class WatchedBags:
     Args:
         bag_dir: where the recordings are.
         rules: what to look for.
-        limits: of the housekeeper: `max_bytes`, `max_age_h`, `moments_bytes`.
+        limits: of the housekeeper: `max_bytes`, `max_age_h`, `moments_bytes`; and `unrecorded`, the
+            topics that the recorder is not to record.
     """
 
     def __init__(self, bag_dir: Path, rules: Sequence[Rule], **limits: Any) -> None:
@@ -75,6 +76,7 @@ class WatchedBags:
         self.bag_dir = bag_dir
         self.rules = rules
         self.limits = limits
+        self.unrecorded: set[str] = set(limits.pop("unrecorded", ()))
         self.clock = SettableClock(T0)
         self.own = OwnRecordings(bag_dir)
         self.names: list[str] = []
@@ -111,6 +113,7 @@ class WatchedBags:
                 moments,
                 clock=self.clock,
                 split_duration_s=10.0,
+                is_recorded=lambda topic: topic not in self.unrecorded,
             ),
             measure_free=lambda _: PLENTY,
         )

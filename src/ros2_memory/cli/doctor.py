@@ -520,7 +520,7 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
         wanted["server.metrics"] = ("prometheus_client",)
     if server.traces:
         wanted["server.traces"] = ("opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http")
-    do = "pip install 'ros2-memory[observability]', or set it to false: the server does not start"
+    do = "pip install '.[observability]', or set it to false: the server does not start"
     for key, modules in wanted.items():
         if missing := [name for name in modules if not _is_installed(name)]:
             seen = f"{key}=true needs {', '.join(missing)}, which cannot be imported"
@@ -534,7 +534,7 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
     states = [
         f"{what} is installed"
         if _is_installed(module)
-        else f"{what} is not installed: pip install 'ros2-memory[{extra}]' adds it"
+        else f"{what} is not installed: pip install '.[{extra}]' adds it"
         for what, module, extra in _COMMANDS_OF_EXTRAS
     ]
     yield _ok("extras", "; ".join(states))

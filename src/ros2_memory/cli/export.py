@@ -251,7 +251,7 @@ def _write_parquet(
     except ImportError as error:
         raise ConfigError(
             f"Parquet needs the optional part of this package (no {error.name}): "
-            "pip install 'ros2-memory[parquet]'"
+            "pip install '.[parquet]'"
         ) from error
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)

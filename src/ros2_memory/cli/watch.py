@@ -260,7 +260,10 @@ def as_line(seen: Observation) -> str:
     if seen.live:
         unusual = [each for each in seen.rates if each.assessment != AS_USUAL]
         usual = counted(len(seen.rates) - len(unusual), "topic")
-        parts = [f"{usual} as usual", *(f"{escape(each.topic)} {each}" for each in unusual)]
+        parts = [
+            f"{usual} at {'its' if len(seen.rates) - len(unusual) == 1 else 'their'} usual rate",
+            *(f"{escape(each.topic)} {each}" for each in unusual),
+        ]
     elif seen.rates:
         parts = [seen.not_live]
     head = f"recorder: {seen.recorder}; newest: {seen.newest}"

@@ -1,1 +1,1 @@
-"""Adapters of the telemetry port, which need `pip install 'ros2-memory[observability]'`."""
+"""Adapters of the telemetry port, which need `pip install '.[observability]'`."""

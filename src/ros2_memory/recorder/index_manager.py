@@ -220,7 +220,8 @@ class IndexManager:
                 self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
         # A file that grows and answers is read again with every query: not worth a line each time.
         grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
-        (self._log.debug if grew else self._log.info)(
+        changed = before is None or _figures(before) != _figures(after)
+        (self._log.info if changed and not grew else self._log.debug)(
             "index_scanned",
             bag_dir=str(self.bag_dir),
             bags=len(after.bags),
@@ -233,6 +234,15 @@ class IndexManager:
             problem=after.problem,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )
+
+
+def _figures(snapshot: Snapshot) -> tuple[object, ...]:
+    """Returns what a line about a scan shows, but for what came and went."""
+    return (
+        snapshot.bags,
+        *(map(len, (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty))),
+        snapshot.problem,
+    )
 
 
 @contextmanager

@@ -135,7 +135,7 @@ class Ros2BagRecorder(Recorder):
         """Makes the environment of `ros2` and reads its options from its help."""
         self._topics = load_topics(self._topics_file)
         self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
-        self._ros2 = find_ros2(self._env)
+        self._ros2 = find_ros2(self._env, sourced=bool(self._setup_files))
         self._options = self._known_options()
         if self._topics.services and SERVICES not in self._options:
             _log.warning(

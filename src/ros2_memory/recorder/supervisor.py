@@ -491,6 +491,7 @@ def make_bag_dir(bag_dir: Path) -> None:
     try:
         bag_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RecorderError(
-            f"{bag_dir} cannot be made: {error.strerror or error}; correct recording.bag_dir"
-        ) from error
+        reason = f"cannot be made: {error.strerror or error}"
+        if isinstance(error, FileExistsError | NotADirectoryError):
+            reason = "is a file, or lies below one, and not a directory"
+        raise RecorderError(f"{bag_dir} {reason}; correct recording.bag_dir") from error

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _MAX_LISTED: Final = 20
 _MAX_TOPICS: Final = 10
 _S_PER_DAY: Final = 86_400
+_SMALL_BYTES: Final = GB // 10
+"""Smaller sizes are given to the kilobyte."""
 
 
 def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
@@ -195,7 +197,7 @@ def _budget(budget: results.Budget) -> JsonObject:
 
 
 def _gigabytes(size: float | None) -> float | None:
-    return None if size is None else round(size / GB, 3)
+    return None if size is None else round(size / GB, 3 if size >= _SMALL_BYTES else 6)
 
 
 @render.register(results.RememberedMoment)

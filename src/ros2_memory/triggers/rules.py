@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import match_topics
@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.timebase import Ns
+
+
+GLOB_MARKS: Final = "*?["
+"""What makes a topic of a rule a glob."""
 
 
 class RuleKind(StrEnum):
@@ -57,7 +61,7 @@ class Rule:
         """Returns those of the topics that the rule watches."""
         if self.topic is None:
             return []
-        if any(mark in self.topic for mark in "*?["):
+        if any(mark in self.topic for mark in GLOB_MARKS):
             return match_topics(topics, self.topic)
         return [each for each in topics if each == self.topic]
 

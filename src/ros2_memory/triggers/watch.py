@@ -30,7 +30,7 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
 from ros2_memory.triggers.fold import Firing
-from ros2_memory.triggers.rules import RuleKind
+from ros2_memory.triggers.rules import GLOB_MARKS, RuleKind
 from ros2_memory.triggers.splits import chains_to_search
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ class Triggers:
         moments: saves what is to be kept.
         clock: the wall clock.
         split_duration_s: how long one split is.
+        is_recorded: whether a topic is among those that the recorder is to record.
         monotonic: a clock that never steps, in seconds.
     """
 
@@ -82,6 +83,7 @@ class Triggers:
         *,
         clock: Clock,
         split_duration_s: float,
+        is_recorded: Callable[[str], bool] = bool,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bag_dir = bag_dir
@@ -91,6 +93,7 @@ class Triggers:
         self._own = own
         self._clock = clock
         self._split = ns_from_unix(split_duration_s)
+        self._is_recorded = is_recorded
         self._monotonic = monotonic
         self._state: TriggerState | None = None
         self._lock = threading.Lock()
@@ -194,8 +197,22 @@ class Triggers:
             state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
             for record in state.rules.values():
                 record.problem = problem or record.problem
+            self._note_unrecorded(state)
             self._state = state
         return state
+
+    def _note_unrecorded(self, state: TriggerState) -> None:
+        """Notes rules on a topic that is not recorded: they can never fire."""
+        for name, record in state.rules.items():
+            topic = self._rules[name].topic
+            if topic is None or any(mark in topic for mark in GLOB_MARKS):
+                continue
+            reason = f"it can never fire: {topic} is not recorded; list it in topics.yaml"
+            if not self._is_recorded(topic):
+                record.problem = reason
+                _log.warning("rule_not_recorded", rule=name, reason=reason)
+            elif record.problem == reason:
+                record.problem = None
 
     def _begun(self, snapshot: Snapshot) -> TriggerState:
         live = self._live(snapshot)

@@ -413,7 +413,7 @@ class TestExtras:
             "server.metrics=true needs prometheus_client",
             "server.traces=true needs opentelemetry.sdk",
         ]
-        assert all("pip install 'ros2-memory[observability]'" in e["do"] for e in wrong["extras"])
+        assert all("pip install '.[observability]'" in e["do"] for e in wrong["extras"])
 
     def test_what_is_installed_is_in_order(self, robot: Path, capsys: Capture) -> None:
         pytest.importorskip("prometheus_client")
@@ -430,7 +430,7 @@ class TestExtras:
     ) -> None:
         monkeypatch.setitem(sys.modules, "pyarrow", None)
         assert cli.main(["doctor"]) == 0
-        assert "pip install 'ros2-memory[parquet]'" in capsys.readouterr().out
+        assert "pip install '.[parquet]'" in capsys.readouterr().out
 
 
 def test_a_recorder_with_another_list_of_topics_is_reported_instead_of_the_topics(

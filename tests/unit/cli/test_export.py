@@ -420,7 +420,7 @@ class TestParquet:
         monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
         monkeypatch.setitem(sys.modules, "pyarrow", None)
         assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 2
-        assert "ros2-memory[parquet]" in capsys.readouterr().err
+        assert "pip install '.[parquet]'" in capsys.readouterr().err
 
 
 def queried(folder: Path, query: str) -> list[tuple[object, ...]]:

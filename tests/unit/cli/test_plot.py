@@ -231,7 +231,7 @@ def test_without_the_extra_it_names_the_command_that_installs_it(
 ) -> None:
     monkeypatch.setattr("ros2_memory.cli.plot.commands.find_spec", lambda name: None)
     assert cli.main(["plot", "path", str(bags), "--out", str(tmp_path / "a.svg")]) == 2
-    assert "pip install 'ros2-memory[plot]'" in capsys.readouterr().err
+    assert "pip install '.[plot]'" in capsys.readouterr().err
 
 
 def test_a_recap_without_poses_has_the_rest(tmp_path: Path) -> None:

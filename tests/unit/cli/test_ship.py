@@ -146,7 +146,7 @@ def test_without_the_extra_it_names_the_extra(
         bootstrap_lake, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
     )
     assert ship() == 2
-    assert "pip install 'ros2-memory[lake]'" in capsys.readouterr().err
+    assert "pip install '.[lake]'" in capsys.readouterr().err
 
 
 def test_without_a_warehouse_it_says_how_to_name_one(

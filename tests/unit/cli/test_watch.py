@@ -65,7 +65,7 @@ def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture)
     assert cli.main(["watch", "--count", "2", "--every", "0.01"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2
-    assert "1 topic as usual" in lines[0]
+    assert "1 topic at its usual rate" in lines[0]
     assert "/chatter silent (0 Hz, usually 1" in lines[0]
     assert "/bumper slow (0.2 Hz" in lines[0]
     assert "/odom" not in lines[0]

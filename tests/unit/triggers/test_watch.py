@@ -175,6 +175,15 @@ class TestOtherKinds:
         robot.close_all()
         assert robot.record("quiet").fired == 0
 
+    def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(self, tmp_path: Path) -> None:
+        robot = WatchedBags(tmp_path / "bags", [rule(hold=S)], unrecorded={"/bumper"})
+        assert [each["rule"] for each in robot.log if each["event"] == "rule_not_recorded"]
+        assert "/bumper is not recorded" in (robot.record("bumper").problem or "")
+        robot.unrecorded.clear()
+        robot.house = robot.new_house()
+        robot.look()
+        assert robot.record("bumper").problem is None
+
     def test_a_recording_that_ended_unasked(self, tmp_path: Path) -> None:
         robot = watched(tmp_path, rule("restart", kind=RuleKind.RECORDER_RESTART))
         robot.begin(T0)

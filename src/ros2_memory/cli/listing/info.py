@@ -55,7 +55,8 @@ def topics(
 ) -> None:
     """List every recorded topic: type, messages, usual rate, first and last message.
 
-    The rate is that of the topic's newest hour, without the gaps between bags.
+    The rate is that of the topic's newest hour, from its first to its last message in each bag;
+    latched topics and logs have none.
     """
     settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY], recording)
     memory = open_memory(settings, verbose=verbose)
@@ -119,9 +120,10 @@ def _notes_apart(rows: list[JsonValue]) -> tuple[list[JsonValue], list[JsonValue
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
     """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
 
-    None for a latched topic, and if no bag has two messages of it.
+    None for a latched topic, for a log, whose lines come when something happens, and if no bag has
+    two messages of it.
     """
-    if latching.is_latched(snapshot, topic):
+    if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
     stated = [*snapshot.timeline.totals(topic).values()]
     if not stated:
@@ -302,17 +304,25 @@ def _with_budget_sentence(reply: JsonValue) -> JsonValue:
 def describe_budget(budget: dict[str, JsonValue]) -> str:
     """Returns how much of the budget the bags take, and how long it lasts."""
     growth = budget.get("growth_gb_per_day")
-    text = f"{format_value(budget.get('used_gb'))} of {format_value(budget.get('max_gb'))} GB"
+    text = f"{_size_text(budget.get('used_gb'))} of {_size_text(budget.get('max_gb'))}"
     if budget.get("foreign_gb"):
-        foreign = format_value(budget["foreign_gb"])
-        text += f"; bags that the recorder did not make take {foreign} GB more"
+        foreign = _size_text(budget["foreign_gb"])
+        text += f"; bags that the recorder did not make take {foreign} more"
     if growth is not None:
-        text += f"; grows by {format_value(growth)} GB a day"
+        text += f"; grows by {_size_text(growth)} a day"
     if "full_in_days" in budget:
-        text += f"; full in {_days(budget['full_in_days'])}"
-        text += f", and keeps {_days(budget['keeps_days'])}"
+        text += f"; full in {_days(budget['full_in_days'])} at this rate"
+        text += f"; bags older than {_days(budget['keeps_days'])} are deleted"
     return text
 
 
 def _days(value: JsonValue) -> str:
-    return f"{format_value(value)} {'day' if value == 1 else 'days'}"
+    days = round(value, 0 if value >= 10 else 1) if isinstance(value, int | float) else value
+    return f"{format_value(days)} {'day' if days == 1 else 'days'}"
+
+
+def _size_text(gigabytes: JsonValue) -> str:
+    """Returns a size in GB, or below 0.1 GB in MB."""
+    if not isinstance(gigabytes, int | float) or gigabytes >= 0.1 or not gigabytes:
+        return f"{format_value(gigabytes)} GB"
+    return f"{gigabytes * 1000:.3g} MB"

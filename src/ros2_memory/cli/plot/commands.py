@@ -231,8 +231,7 @@ def _check(out: Path) -> None:
     """
     if find_spec("matplotlib") is None:
         raise ConfigError(
-            "pictures need the optional part of this package (no matplotlib): "
-            "pip install 'ros2-memory[plot]'"
+            "pictures need the optional part of this package (no matplotlib): pip install '.[plot]'"
         )
     if out.suffix.lower() not in FORMATS:
         kinds = ", ".join(FORMATS)

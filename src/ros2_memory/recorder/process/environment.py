@@ -129,17 +129,20 @@ def advice_on_silence(env: Mapping[str, str]) -> str:
     return "do the publishers publish, and does a firewall block DDS?"
 
 
-def find_ros2(env: Mapping[str, str]) -> str:
+def find_ros2(env: Mapping[str, str], *, sourced: bool = False) -> str:
     """Returns the path of the `ros2` program.
+
+    `sourced`: the environment is that after the setup files.
 
     Raises:
         RecorderError: it is not on the environment's PATH.
     """
     found = shutil.which("ros2", path=env.get("PATH", os.defpath))
     if found is None:
+        where = "after sourcing recorder.setup_files" if sourced else "on PATH"
         raise RecorderError(
-            "there is no ros2 program on PATH; name the setup.bash of the ROS 2 distribution, and "
-            "of the workspace with the robot's own messages, in recorder.setup_files"
+            f"`ros2` was not found {where}; name the setup.bash of the ROS 2 distribution, and of "
+            "the workspace with the robot's own messages, in recorder.setup_files"
         )
     return str(Path(found).absolute())
 
