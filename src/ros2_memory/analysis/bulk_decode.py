@@ -6,11 +6,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import deque
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
-from ros2_memory.analysis.payload_templates import template_for
+from ros2_memory.analysis.payload_templates import json_template_for, template_for
 from ros2_memory.core.errors import UndecodableError
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import Pose
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.messages.json_template import JsonTemplate
     from ros2_memory.storage.base import BagReader, Record
 
 FEWEST: Final = 32
@@ -26,11 +29,28 @@ FEWEST: Final = 32
 _MIN_MATCHES: Final = 8
 """A template that matches fewer messages costs more than it saves."""
 _MAX_TEMPLATES: Final = 8
+_AS_JSON: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
 
 T = TypeVar("T")
 
 
-class BulkDecoder(Generic[T]):
+class RowTemplate(Protocol):
+    """What is common to the payloads of many messages."""
+
+    @property
+    def angles(self) -> tuple[str, ...]:
+        """The fields of angles whose ranges are wanted, which only single messages tell exactly."""
+
+    def matching(
+        self, first: Record, records: Sequence[Record], among: Sequence[int]
+    ) -> tuple[list[int], Bytes]:
+        """Returns the indices of records that match as `first` does, and their payloads as rows."""
+
+
+P = TypeVar("P", bound=RowTemplate)
+
+
+class BulkDecoder(Generic[T, P]):
     """Decodes the messages of one topic in batches; templates found in one serve the next.
 
     Args:
@@ -44,8 +64,8 @@ class BulkDecoder(Generic[T]):
     def __init__(
         self,
         decode: Callable[[Record], T],
-        template: Callable[[Record, T], PayloadTemplate | None],
-        apply: Callable[[PayloadTemplate, T, Sequence[Record], Bytes], Iterable[T]],
+        template: Callable[[Record, T], P | None],
+        apply: Callable[[P, T, Sequence[Record], Bytes], Iterable[T]],
         *,
         fewest: int = FEWEST,
     ) -> None:
@@ -53,7 +73,7 @@ class BulkDecoder(Generic[T]):
         self._template = template
         self._apply = apply
         self._fewest = fewest
-        self._known: list[tuple[PayloadTemplate, Record, T]] = []
+        self._known: list[tuple[P, Record, T]] = []
         self._may_learn = True
 
     def decode(self, records: Sequence[Record]) -> list[T | UndecodableError]:
@@ -87,7 +107,7 @@ class BulkDecoder(Generic[T]):
 
     def _match(
         self,
-        known: tuple[PayloadTemplate, Record, T],
+        known: tuple[P, Record, T],
         records: Sequence[Record],
         rest: deque[int],
         found: dict[int, T | UndecodableError],
@@ -109,7 +129,10 @@ class MotionSample(NamedTuple):
     speed_mps: float | None
 
 
-def motion_decoder(reader: BagReader, extractor: SchemaExtractor) -> BulkDecoder[MotionSample]:
+MotionDecoder: TypeAlias = "BulkDecoder[MotionSample, PayloadTemplate]"
+
+
+def motion_decoder(reader: BagReader, extractor: SchemaExtractor) -> MotionDecoder:
     """Returns a decoder of poses and speeds of one topic, equal to the extractor's one by one."""
 
     def decode(record: Record) -> MotionSample:
@@ -132,3 +155,73 @@ def _motion_samples(
     template: PayloadTemplate, _: MotionSample, _records: Sequence[Record], rows: Bytes
 ) -> Iterable[MotionSample]:
     return map(MotionSample, template.poses(rows), template.speeds(rows))
+
+
+class JsonRow(NamedTuple):
+    """A message as JSON, and its pose."""
+
+    text: str
+    pose: Pose | None
+
+
+class _JsonRows(NamedTuple):
+    """The template of messages, and of their JSON."""
+
+    payload: PayloadTemplate
+    json: JsonTemplate
+    angles: tuple[str, ...] = ()
+
+    def matching(
+        self, first: Record, records: Sequence[Record], among: Sequence[int]
+    ) -> tuple[list[int], Bytes]:
+        return self.payload.matching(first, records, among)
+
+
+class JsonRows:
+    """Decodes messages of any topics as JSON in UTF-8, many at once.
+
+    Args:
+        reader: of the messages.
+        extractor: gives their values, as replies show them, and poses.
+    """
+
+    def __init__(self, reader: BagReader, extractor: SchemaExtractor) -> None:
+        self._reader = reader
+        self._extractor = extractor
+        self._decoders: dict[str, BulkDecoder[JsonRow, _JsonRows]] = {}
+
+    def of(self, records: Sequence[Record]) -> list[JsonRow | UndecodableError]:
+        """Returns what each message says, or why it cannot be decoded."""
+        by_topic: dict[str, list[int]] = {}
+        for at, record in enumerate(records):
+            by_topic.setdefault(record.channel.topic, []).append(at)
+        found: dict[int, JsonRow | UndecodableError] = {}
+        for topic, places in by_topic.items():
+            if topic not in self._decoders:
+                self._decoders[topic] = BulkDecoder(self._decode, self._template, self._apply)
+            rows = self._decoders[topic].decode([records[at] for at in places])
+            found.update(zip(places, rows, strict=True))
+        return [found[at] for at in range(len(records))]
+
+    def _decode(self, record: Record) -> JsonRow:
+        message, type_name = self._reader.decode(record), record.channel.type
+        shown = self._extractor.shown(message, type_name)
+        # Escaped letters are among what UTF-8 holds as it is.
+        text = _AS_JSON(shown.value) if "\\" in shown.text else shown.text
+        return JsonRow(text, self._extractor.pose(message, type_name))
+
+    def _template(self, record: Record, _: JsonRow) -> _JsonRows | None:
+        payload = template_for(self._reader, self._extractor, record)
+        if payload is None:
+            return None
+        found = json_template_for(self._reader, self._extractor, record, payload)
+        return None if found is None else _JsonRows(payload, found)
+
+    def _apply(
+        self, template: _JsonRows, _: JsonRow, _records: Sequence[Record], rows: Bytes
+    ) -> Iterable[JsonRow]:
+        payload = template.payload
+        texts = template.json.texts(
+            len(rows), partial(payload.column, rows), partial(payload.nanoseconds, rows)
+        )
+        return map(JsonRow, texts, payload.poses(rows))

@@ -22,12 +22,14 @@ from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.messages.conversions import ANGLES, unit
 from ros2_memory.messages.detections import depends_on_numbers
+from ros2_memory.messages.json_template import Marks
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Quaternion, StampedTransform, Vector3
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.messages.json_template import JsonTemplate
     from ros2_memory.storage.base import BagReader, CdrLayout, Record, Schema
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
@@ -221,7 +223,7 @@ class _Marked:
             struct.pack_into("<iI", payload, offset, second, 0)
             self.time_of[float(second)] = offset
         type_name = record.channel.type
-        message = reader.decode(record._replace(payload=bytes(payload)))
+        self.message = message = reader.decode(record._replace(payload=bytes(payload)))
         self.value = extractor.exact(message, type_name)
         self.pose = extractor.pose(message, type_name)
         self.twist = extractor.twist(message, type_name)
@@ -272,6 +274,32 @@ def template_for(
     """Returns the template of a message that can be decoded; None where it has none."""
     layout = reader.layout(record)
     return None if layout is None else _marked_template(reader, extractor, record, layout)
+
+
+def json_template_for(
+    reader: BagReader,
+    extractor: SchemaExtractor,
+    record: Record,
+    template: PayloadTemplate,
+) -> JsonTemplate | None:
+    """Returns the JSON of all messages of a template, as a reply shows them; else None."""
+    one, other = (
+        extractor.json_template(
+            each.message, record.channel.type, Marks(each.offset_of, each.time_of)
+        )
+        for each in _marked(reader, extractor, record, template.layout)
+    )
+    return one if one == other else None
+
+
+def _marked(
+    reader: BagReader, extractor: SchemaExtractor, record: Record, layout: CdrLayout
+) -> tuple[_Marked, _Marked]:
+    """Returns a message with marks, and with others."""
+    return (
+        _Marked(reader, extractor, record, layout, _FIRST_MARKS),
+        _Marked(reader, extractor, record, layout, _OTHER_MARKS),
+    )
 
 
 class _KnownTemplate(NamedTuple):
@@ -327,11 +355,8 @@ class Templates:
 def _marked_template(
     reader: BagReader, extractor: SchemaExtractor, record: Record, layout: CdrLayout
 ) -> PayloadTemplate | None:
-    one, other = (
-        _Marked(reader, extractor, record, layout, marks) for marks in (_FIRST_MARKS, _OTHER_MARKS)
-    )
     try:
-        return _template(record.channel.type, layout, one, other)
+        return _template(record.channel.type, layout, *_marked(reader, extractor, record, layout))
     # Two values of different structure have leaves that do not pair, which zip reports.
     except (_NoTemplateError, ValueError):
         return None

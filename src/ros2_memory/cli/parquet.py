@@ -10,7 +10,6 @@ a pose `frame_id`, `x`, `y`, `z` (m) and `qx`, `qy`, `qz`, `qw`, unrounded.
 
 from __future__ import annotations
 
-import json
 from collections import OrderedDict
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -21,18 +20,20 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ros2_memory.analysis.bulk_decode import JsonRows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.bulk_decode import JsonRow
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.base import BagReader, Record
 
 SCHEMA: Final = pa.schema(
     [
@@ -48,6 +49,8 @@ SCHEMA: Final = pa.schema(
 )
 _GROUP_ROWS: Final = 20_000
 """Rows of a row group: some megabytes."""
+_WAITING_BYTES: Final = 16 << 20
+"""Of messages that are decoded at once, at most, but for a single one."""
 _DAY_NS: Final = 86_400 * NS_PER_S
 _NO_POSE: Final = (None,) * 7
 _MAX_OPEN_FILES: Final = 16
@@ -61,24 +64,42 @@ Row = tuple[object, ...]
 class _PartFile:
     """One file being written, under a temporary name until the dataset is complete."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, rows_of: Callable[[Sequence[Record]], list[Row]]) -> None:
         self.path = path
         self.temporary = path.with_name(f".{path.name}.tmp")
-        self.rows: list[Row] = []
+        self._rows_of = rows_of
+        self._rows: list[Row] = []
+        self._waiting: list[Record] = []
+        self._waiting_bytes = 0
         self.temporary.unlink(missing_ok=True)  # or a link there would be written through
         self.writer = pq.ParquetWriter(self.temporary, SCHEMA, compression="zstd")
 
-    def flush(self) -> None:
-        """Writes the buffered rows as a row group."""
-        if self.rows:
-            columns = dict(zip(_COLUMNS, zip(*self.rows, strict=True), strict=True))
-            self.writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
-            self.rows.clear()
+    def add(self, record: Record) -> None:
+        """Takes the next message."""
+        self._waiting.append(record)
+        self._waiting_bytes += len(record.payload)
+        if len(self._rows) + len(self._waiting) >= _GROUP_ROWS:
+            self._flush()
+        elif self._waiting_bytes >= _WAITING_BYTES:
+            self._decode()
 
     def close(self) -> None:
-        """Writes the buffered rows, and ends the file."""
-        self.flush()
+        """Writes what is buffered, and ends the file."""
+        self._flush()
         self.writer.close()
+
+    def _decode(self) -> None:
+        """Makes rows of the waiting messages."""
+        self._rows += self._rows_of(self._waiting)
+        self._waiting, self._waiting_bytes = [], 0
+
+    def _flush(self) -> None:
+        """Writes what is buffered as a row group."""
+        self._decode()
+        if self._rows:
+            columns = dict(zip(_COLUMNS, zip(*self._rows, strict=True), strict=True))
+            self.writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
+            self._rows.clear()
 
 
 class Dataset:
@@ -95,8 +116,7 @@ class Dataset:
         self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None = None
     ) -> None:
         self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
-        self._reader = reader
-        self._extractor = extractor
+        self._json = JsonRows(reader, extractor)
         self._open: OrderedDict[Path, _PartFile] = OrderedDict()
         self._parts: dict[Path, list[_PartFile]] = {}
         self._newest: tuple[BagFile, Ns, _PartFile] | None = None
@@ -120,11 +140,8 @@ class Dataset:
                 self.files += 1
 
     def _add(self, stored: StoredMessage) -> None:
-        part = self._part_for(stored)
-        part.rows.append(self._row(stored))
+        self._part_for(stored).add(stored.record)
         self.rows += 1
-        if len(part.rows) >= _GROUP_ROWS:
-            part.flush()
 
     def _part_for(self, stored: StoredMessage) -> _PartFile:
         """Returns the file of a message's partition."""
@@ -154,33 +171,29 @@ class Dataset:
                 ", name another folder, or delete this one"
             )
         parts = self._parts.setdefault(folder, [])
-        part = _PartFile(folder / f"part-{len(parts)}.parquet")
+        part = _PartFile(folder / f"part-{len(parts)}.parquet", self._rows_of)
         self._cleanup.callback(part.temporary.unlink, missing_ok=True)
         self._cleanup.enter_context(part.writer)
         parts.append(part)
         return part
 
-    def _row(self, stored: StoredMessage) -> Row:
-        record = stored.record
-        topic, type_name = record.channel.topic, record.channel.type
-        row = (topic, type_name, record.log_time, record.publish_time)
-        try:
-            message = self._reader.decode(record)
-        except UndecodableError as error:
-            return (*row, None, error.reason, None, *_NO_POSE)
-        shown = self._extractor.shown(message, type_name)
-        text = shown.text
-        if "\\" in text:  # such as escaped letters, which UTF-8 holds as they are
-            text = _without_surrogates(
-                json.dumps(shown.value, ensure_ascii=False, separators=(",", ":"))
-            )
-        pose = self._extractor.pose(message, type_name)
-        if pose is None:
-            return (*row, text, None, None, *_NO_POSE)
-        frame = _without_surrogates(pose.frame_id) or None
-        return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))
+    def _rows_of(self, records: Sequence[Record]) -> list[Row]:
+        """Returns the rows of messages."""
+        return [*map(_row, records, self._json.of(records))]
+
+
+def _row(record: Record, found: JsonRow | UndecodableError) -> Row:
+    channel = record.channel
+    row = (channel.topic, channel.type, record.log_time, record.publish_time)
+    if isinstance(found, UndecodableError):
+        return (*row, None, found.reason, None, *_NO_POSE)
+    pose, text = found.pose, _without_surrogates(found.text)
+    if pose is None:
+        return (*row, text, None, None, *_NO_POSE)
+    frame = _without_surrogates(pose.frame_id) or None
+    return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))
 
 
 def _without_surrogates(text: str) -> str:
     """Returns the text with lone surrogates, which UTF-8 cannot hold, escaped as in JSON."""
-    return text.encode("utf-8", "backslashreplace").decode()
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()

@@ -25,7 +25,7 @@ from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
+    from ros2_memory.analysis.bulk_decode import MotionDecoder
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import Pose, Vector3
@@ -161,7 +161,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
 def add_poses(
     view: View,
     add: AddPose,
-    decoder: BulkDecoder[MotionSample],
+    decoder: MotionDecoder,
     messages: Iterable[StoredMessage],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
@@ -203,7 +203,7 @@ def _batches(messages: Iterable[StoredMessage]) -> Iterator[list[StoredMessage]]
 
 
 def positions_of(
-    view: View, decoder: BulkDecoder[MotionSample], messages: Iterable[StoredMessage]
+    view: View, decoder: MotionDecoder, messages: Iterable[StoredMessage]
 ) -> Iterator[tuple[StoredMessage, Vector3]]:
     """Yields messages with the positions (m) of their poses; without those that are NaN or beyond.
 

@@ -44,7 +44,7 @@ from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample
+    from ros2_memory.analysis.bulk_decode import MotionDecoder
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -154,7 +154,7 @@ def store_shared_standstills(view: View, topic: str, window: TimeWindow) -> int:
 def _add_places(
     view: View,
     to: StandstillBuilder | StandstillCollector,
-    decoder: BulkDecoder[MotionSample],
+    decoder: MotionDecoder,
     messages: Iterable[StoredMessage],
     failures: list[UndecodableError],
 ) -> Span | None:

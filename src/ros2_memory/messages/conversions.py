@@ -168,10 +168,16 @@ def unit(numbers: Quaternion) -> Quaternion | None:
 
 def euler(node: object) -> dict[str, Degrees] | None:
     """Returns roll, pitch and yaw (REP-103, degrees) of a quaternion; None if it is no rotation."""
-    unit = rotation(node)
-    if unit is None:
+    numbers = xyzw(node)
+    return None if numbers is None else euler_of(numbers)
+
+
+def euler_of(numbers: Quaternion) -> dict[str, Degrees] | None:
+    """Returns the same of four numbers."""
+    turn = unit(numbers)
+    if turn is None:
         return None
-    roll, pitch, yaw = geometry.rpy(unit)
+    roll, pitch, yaw = geometry.rpy(turn)
     return {
         "roll_deg": Degrees(math.degrees(roll)),
         "pitch_deg": Degrees(math.degrees(pitch)),

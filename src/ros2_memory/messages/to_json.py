@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.messages.fields import Array, FieldTable
+
+T = TypeVar("T")
 
 MAX_DEPTH: Final = 24
 MAX_NOTES: Final = 20
@@ -171,7 +173,7 @@ class ExactJson:
         limit: bytes of a byte array that is rendered as numbers.
     """
 
-    _write = _EXACT
+    write = _EXACT
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -183,7 +185,7 @@ class ExactJson:
         if node is None or node is ABSENT or isinstance(node, bool):
             return node if isinstance(node, bool) else None
         if isinstance(node, int):
-            return self._write.integer(int(node))
+            return self.write.integer(int(node))
         if isinstance(node, float):
             return self._float(node)
         if depth >= MAX_DEPTH:
@@ -194,10 +196,10 @@ class ExactJson:
 
     def _float(self, number: float) -> JsonValue:
         if isinstance(number, Metric):
-            return self._write.metric(number)
+            return self.write.metric(number)
         if isinstance(number, Degrees):
-            return self._write.degrees(number)
-        return self._write.real(number)
+            return self.write.degrees(number)
+        return self.write.real(number)
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
         cls: type = type(node)
@@ -229,11 +231,11 @@ class ExactJson:
             return self._rotation(node, path)
         if kind is ValueKind.TIME:
             time = nanoseconds(node)
-            return None if time is None else self._write.seconds(time)
+            return None if time is None else self.write.seconds(time)
         vector = xyz(node) if kind is ValueKind.VECTOR else None
         if vector is not None:
             x, y, z = vector
-            metric = self._write.metric
+            metric = self.write.metric
             return {"x": metric(x), "y": metric(y), "z": metric(z)}
         fields: dict[str, JsonValue] = {}
         for name, attribute, summarize in shape.fields:
@@ -249,7 +251,7 @@ class ExactJson:
             note = f"{_named(path)}: no rotation (a zero or NaN quaternion)"
             self.note("rotation", path, note)
             return None
-        return {name: self._write.degrees(angle) for name, angle in angles.items()}
+        return {name: self.write.degrees(angle) for name, angle in angles.items()}
 
     def _array(self, array: Array, path: str, depth: int) -> JsonValue:
         if array.ndim == 0:
@@ -262,9 +264,9 @@ class ExactJson:
 
     def _scalar(self, scalar: np.generic[object], path: str) -> JsonValue:
         if isinstance(scalar, np.float32):
-            return self._write.single(scalar)
+            return self.write.single(scalar)
         if isinstance(scalar, np.floating):
-            return self._write.real(float(scalar))
+            return self.write.real(float(scalar))
         plain = scalar.item()
         known = isinstance(plain, bool | int | bytes)
         return self.value(plain if known else str(plain), path, MAX_DEPTH - 1)
@@ -280,7 +282,7 @@ class ExactJson:
         numbers: JsonValue = _at_most_64_bits(array).tolist()
         return numbers
 
-    def _elements(self, nodes: Sequence[object], _path: str, /) -> Sequence[object]:
+    def _elements(self, nodes: Sequence[T], _path: str, /) -> Sequence[T]:
         return nodes
 
     def _entries(self, node: Mapping[object, object], _path: str, /) -> list[tuple[str, object]]:
@@ -297,7 +299,7 @@ class ReplyJson(ExactJson):
     fill a reply alone. `notes` is complete when the walk is.
     """
 
-    _write = _ROUNDED
+    write = _ROUNDED
 
     def __init__(self, limit: int, squeeze: int = 1) -> None:
         super().__init__(limit)
@@ -332,7 +334,7 @@ class ReplyJson(ExactJson):
         numbers: JsonValue = array.tolist()
         return numbers
 
-    def _elements(self, nodes: Sequence[object], path: str, /) -> Sequence[object]:
+    def _elements(self, nodes: Sequence[T], path: str, /) -> Sequence[T]:
         if len(nodes) <= self._limit:
             return nodes
         self._note_thinned(len(nodes), path)

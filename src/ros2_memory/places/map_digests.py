@@ -121,7 +121,7 @@ class _MapReader:
         self._view = view
         self._settings = settings
         self._collector = MapCollector(settings, sights)
-        self._decoders: dict[str, BulkDecoder[Pose | None]] = {}
+        self._decoders: dict[str, BulkDecoder[Pose | None, PayloadTemplate]] = {}
         self.is_complete = True
 
     def digest(self, bag: BagFile, statics: Statics) -> MapDigest:
