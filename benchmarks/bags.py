@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from benchmarks import payloads
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.layout import HANDOVER_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -138,6 +139,8 @@ def made(
 ) -> History:
     """The history of so many splits in `folder`, taken as it lies there or made.
 
+    Where making it was interrupted it goes on.
+
     Raises:
         ValueError: there is not a bag to make.
     """
@@ -151,7 +154,11 @@ def made(
     if seal.is_file() and json.loads(seal.read_text(encoding="utf-8")) == facts:
         return history
     seal.unlink(missing_ok=True)
-    shutil.rmtree(place, ignore_errors=True)
+    begun = folder / f"{name}.begun.json"
+    if not begun.is_file() or json.loads(begun.read_text(encoding="utf-8")) != facts:
+        shutil.rmtree(place, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        begun.write_text(json.dumps(facts), encoding="utf-8")
     splits = list(history.splits())
     recordings = [
         splits[at : at + SPLITS_OF_A_RECORDING] for at in range(0, bags, SPLITS_OF_A_RECORDING)
@@ -163,20 +170,23 @@ def made(
         with ProcessPoolExecutor(jobs) as workers:
             for _ in workers.map(record, recordings):
                 pass
-    seal.write_text(json.dumps(facts), encoding="utf-8")
+    begun.replace(seal)
     return history
 
 
 def _record(history: History, splits: list[Split]) -> None:
-    """Writes one recording."""
-    splits[0].path.parent.mkdir(parents=True)
+    """Writes one recording, unless it was written before a run was interrupted."""
+    folder = splits[0].path.parent
+    if (folder / HANDOVER_FILE).exists():
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     for split in splits:
         _write(split, splits[: split.nth + 1], history.topics)
         # A bag that was closed long ago, as most bags of a history were.
         closed = split.start + SPLIT_NS
         os.utime(split.path, ns=(closed, closed))
     text = "rosbag2_bagfile_information:\n" + indent(metadata(splits, history.topics), "  ") + "\n"
-    folder = splits[0].path.parent
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
     write_handover(folder, _handover(history, splits))
 
