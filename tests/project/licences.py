@@ -28,7 +28,11 @@ _CLASSIFIED: Final = {
     "License :: OSI Approved :: Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "License :: OSI Approved :: Python Software Foundation License": "PSF-2.0",
 }
-_SPOKEN: Final = {"BSD": "BSD-3-Clause", "3-Clause BSD License": "BSD-3-Clause"}
+_SPOKEN: Final = {
+    "BSD": "BSD-3-Clause",
+    "3-Clause BSD License": "BSD-3-Clause",
+    "Apache 2.0": "Apache-2.0",
+}
 _MET: Final = "met"
 _UNMET: Final = "unmet"
 
