@@ -274,7 +274,9 @@ class _BagRows:
             add(self._pose_topic, "map", encode_map_track(replace(in_map, own=own)))
             add("", "sights", self._sights())
 
-    def _add_digest(self, topic: str, kind: str, packed: bytes) -> None:
+    def _add_digest(self, topic: str, kind: str, packed: bytes | None) -> None:
+        if packed is None:
+            return
         summaries = self._bag.summary.of(topic)
         first = min((each.first for each in summaries), default=self._bag.start)
         last = max((each.last for each in summaries), default=self._bag.end)

@@ -35,6 +35,8 @@ KIND: Final = "states"
 EMPTY_KIND: Final = "empty"
 """Likewise: where a detector had nothing to report."""
 _UNDECODABLE: Final = -1
+_MOST_CHARS: Final = 1 << 20
+"""Of all that a topic states in a bag: a hostile one states something else with each message."""
 
 
 class _Packed(TypedDict):
@@ -102,14 +104,22 @@ def is_stated(events: TopicEvents | None) -> bool:
 
 
 class StateRuns:
-    """Takes what the messages of one topic of a bag state, in log-time order."""
+    """Takes what the messages of one topic of a bag state, in log-time order.
+
+    Where that is too much nothing is kept.
+    """
 
     def __init__(self) -> None:
         self._states: dict[State | None, int] = {None: _UNDECODABLE}
         self._runs: list[list[int]] = []
+        self._chars = 0
 
     def add(self, time: Ns, state: State | None) -> None:
         """Takes the next message; None for one that is undecodable."""
+        if self._chars > _MOST_CHARS:
+            return
+        if state not in self._states:
+            self._chars += len(json.dumps(state))
         nth = self._states.setdefault(state, len(self._states) - 1)
         is_counted = state is not None and bool(state.errors or state.reports)
         if self._runs and self._runs[-1][0] == nth and not is_counted:
@@ -117,8 +127,10 @@ class StateRuns:
         else:
             self._runs.append([nth, time, time, 1])
 
-    def packed(self) -> bytes:
-        """Returns them as bytes; times are since the end of the run before."""
+    def packed(self) -> bytes | None:
+        """Returns them as bytes, None where they are too many; times are since the run before."""
+        if self._chars > _MOST_CHARS:
+            return None
         runs: list[list[int]] = []
         before = 0
         for nth, first, last, count in self._runs:

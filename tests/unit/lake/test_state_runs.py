@@ -50,9 +50,11 @@ def test_all_that_follows_from_states_is_kept(steps: list[tuple[int, State | Non
     runs = StateRuns()
     for each in messages:
         runs.add(*each)
+    packed = runs.packed()
+    assert packed is not None
     found = [
         (record.log_time, stated_in(record))
-        for record in states("/state", "x/msg/X", unpacked(runs.packed()))
+        for record in states("/state", "x/msg/X", unpacked(packed))
     ]
     assert [state for _, state in found] == [state for _, state in messages]
     assert [at for at, _ in found] == sorted(at for at, _ in found)
@@ -93,3 +95,11 @@ def test_a_topic_that_states_nothing_more_than_what_is_in_view_has_no_states() -
     assert is_stated(added([(1, State(flags=(("value", True),)))]))
     assert is_stated(added([(1, None)]))
     assert is_stated(None)
+
+
+def test_what_a_hostile_bag_states_is_bounded() -> None:
+    runs = StateRuns()
+    for nth in range(30):
+        names = [f"{nth} {at} {'x' * 100}" for at in range(512)]
+        runs.add(nth, State(flags=tuple((name, True) for name in names)))
+    assert runs.packed() is None
