@@ -257,7 +257,7 @@ def find_last_match(
     With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
     of a score below `min_score` do not count.
     """
-    condition = condition_of(memory.limits, condition_type, value, field, min_score)
+    condition = condition_of(memory, topic, condition_type, value, field=field, min_score=min_score)
     now = memory.clock.now()
     view = View(memory, call, now)
     until = _before(before_s)
@@ -294,7 +294,9 @@ def value_when(
     With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
     of a score below `min_score` do not count.
     """
-    condition = condition_of(memory.limits, condition_type, value, field, min_score)
+    condition = condition_of(
+        memory, condition_topic, condition_type, value, field=field, min_score=min_score
+    )
     now, until = memory.clock.now(), _before(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)

@@ -233,7 +233,7 @@ def test_where_the_pose_topic_is_not_recorded_the_one_with_poses_is_named(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*others, pose_stamped(T0 + S, 1.0, 2.0, "/pose")])
     reply = ask(tmp_path, recalls, tool, **given)
     assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
-    assert "no topic /odom is recorded, which data.pose_topic names" in reply["detail"]
+    assert "data.pose_topic is /odom, which these bags do not have" in reply["detail"]
     assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in reply["detail"]
     assert "set data.pose_topic=/pose" in reply["detail"]
     assert "/rosout" not in reply["detail"]

@@ -278,6 +278,7 @@ class Condition:
             self.field is not None
             or isinstance(test, NearPosition)
             or (isinstance(test, Contains) and test.is_number)
+            or (isinstance(test, Equals) and _plain_text(test) is not None)
         )
 
     @property
@@ -556,14 +557,14 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
             return None
         targets = at_field(value, condition.field)
         if targets:
-            return _refusal_for_number(condition, targets)
+            return _refusal_for_number(condition, targets) or _refusal_for_text(condition, targets)
         known = ", ".join(_paths(value)) or "none"
         return f"the values have no field {condition.field!r}; their fields are: {known}"
     if isinstance(condition.test, NearPosition):
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
         return _refusal_for_position(value)
-    return _refusal_for_number(condition, [value])
+    return _refusal_for_number(condition, [value]) or _refusal_for_text(condition, [value])
 
 
 def _refusal_for_position(value: JsonValue) -> str:
@@ -594,6 +595,33 @@ def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> s
         "the values hold numbers and no text, and contains finds a number only as the value of a "
         "field or as an element of its list: name that in field, or ask with equals"
     )
+
+
+def _refusal_for_text(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Returns why a text that spells no number meets none of these; None where it may."""
+    text = _plain_text(condition.test)
+    is_narrow = condition.field is not None or isinstance(condition.test, Equals)
+    if text is None or not is_narrow or any(map(_has_unknown_part, targets)):
+        return None
+    kinds = {type(leaf) for each in targets for leaf in leaves(each)}
+    if not kinds or not kinds <= {bool, int, float}:
+        return None
+    where = "the values" if condition.field is None else f"the values of field {condition.field!r}"
+    given = f"and {abbreviate(text)} is a text"
+    if kinds == {bool}:
+        return f"{where} are booleans, {given}: the value must be true or false"
+    return f"{where} are numbers, {given}: the value must be a number"
+
+
+def _plain_text(test: Test) -> str | None:
+    """Returns the text that a test looks for, unless it spells a boolean or a number."""
+    if isinstance(test, Contains):
+        needle = test.needle
+    elif isinstance(test, Equals):
+        needle = test.value
+    else:
+        return None
+    return needle if isinstance(needle, str) and _meaning(needle) is None else None
 
 
 def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:

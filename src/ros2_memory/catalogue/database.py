@@ -145,6 +145,10 @@ class CatalogueDatabase:
         """Whether it failed, and has not been written since."""
         self.failures = 0
         """How often it could not be read: answers of meanwhile may lack something."""
+        self.refusals = 0
+        """How often it did not store something; it is computed again for each answer."""
+        self.refused_for: str | None = None
+        """Why it did not store the last of those."""
 
     @property
     def path(self) -> Path | None:
@@ -211,6 +215,8 @@ class CatalogueDatabase:
                         return False
                 # A number or text that SQLite cannot store: the bags stay without an entry.
                 except (ValueError, OverflowError) as error:
+                    self.refusals += 1
+                    self.refused_for = str(error)
                     log.warning("catalogue_refused", reason=str(error))
                     return False
                 else:

@@ -413,11 +413,14 @@ class Catalogue(CatalogueDatabase):
         return self.read(ask, {})
 
     def cache_answer(self, question: str, numbers: Sequence[int], answer: str) -> None:
-        """Stores what was computed from these entries, until the oldest of them is deleted."""
+        """Stores what was computed from these entries, until the oldest of them is deleted.
+
+        Stores nothing where there are none: it would never be deleted.
+        """
 
         def write(connection: sqlite3.Connection) -> None:
             row_ids = self.row_ids(numbers)
-            if len(row_ids) == len(numbers) and not any_is_gone(connection, row_ids):
+            if row_ids and len(row_ids) == len(numbers) and not any_is_gone(connection, row_ids):
                 plain = answer.encode("utf-8", "surrogatepass")
                 stored = packed_by_model(connection, NO_TOPIC, _kind_of(question), plain)
                 connection.execute(

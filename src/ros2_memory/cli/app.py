@@ -40,7 +40,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "ask.ask",
         "call any tool of the server, without a server",
         {
-            0: "the tool answered, also with null (never)",
+            0: "the tool answered, even if the answer is 'never'",
             1: "the tool returned an error, which gives the reason",
         },
     ),

@@ -128,6 +128,7 @@ def _examine(
         yield from check_clock(snapshot, now)
         yield from check_bags(settings, memory)
         yield from check_recordings(memory, snapshot)
+        yield from check_catalogue(memory)
         recorder = settings.recorder
         if isinstance(recorder, NullRecorderNode):
             yield _ok("recorder", "recorder=none: nothing is recorded here")
@@ -157,6 +158,7 @@ def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
         *check_clock(snapshot, now),
         *check_bags(own, memory),
         *check_recordings(memory, snapshot),
+        *check_catalogue(memory),
     ]
     for each in found:
         if each.level is not Level.OK or each.about == "bags":
@@ -207,14 +209,14 @@ def _check_permissions(bag_dir: Path, *, records: bool) -> Finding:
         do = "give this user the right to read it, or run as the user of the services"
         return _error("bag_dir", f"{user} may not read {bag_dir}", do)
     if not records:
-        return _ok("bag_dir", f"{bag_dir}, where {user} may read")
+        return _ok("bag_dir", f"{bag_dir}, readable by {user}")
     if os.access(bag_dir, os.R_OK | os.W_OK | os.X_OK):
-        return _ok("bag_dir", f"{bag_dir}, where {user} may read and write")
+        return _ok("bag_dir", f"{bag_dir}, readable and writable by {user}")
     do = (
         "fine if the recorder runs as another user, who may: "
         "sudo -u USER ros2-memory doctor looks as that one"
     )
-    return _warning("bag_dir", f"{user} may read {bag_dir}, and not write there", do)
+    return _warning("bag_dir", f"{bag_dir}, readable but not writable by {user}", do)
 
 
 def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Finding:
@@ -273,7 +275,7 @@ def check_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
         seen = f"{faults} dated by a wrong clock: `ros2-memory info` lists them"
         yield _warning("clock", seen, do)
     else:
-        yield _ok("clock", f"it says {iso_local(now)}")
+        yield _ok("clock", f"{iso_local(now)} (this machine)")
 
 
 def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
@@ -284,8 +286,9 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         yield _error("bags", snapshot.problem, "see bag_dir above; is the disk mounted?")
         return
     if covered.bags or covered.active:
-        newest = "" if covered.latest is None else f", the newest from {iso_local(covered.latest)}"
-        yield _ok("bags", f"{counted(covered.bags, 'bag answers', 'bags answer')}{newest}")
+        newest = "" if covered.latest is None else f"; newest: {iso_local(covered.latest)}"
+        files = counted(covered.bags, "bag file is", "bag files are")
+        yield _ok("bags", f"{files} readable{newest}")
     else:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
         yield _warning("bags", nothing_here(snapshot), do)
@@ -361,6 +364,17 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
         )
         do = "if no program writes it (a copy), wait until then: answers use its readable part"
         yield _warning("bags", seen, do)
+
+
+def check_catalogue(memory: Memory) -> Iterator[Finding]:
+    """Checks that the catalogue stored what the checks before this one computed."""
+    catalogue = None if memory.recall is None else memory.recall.catalogue
+    if catalogue is None or not catalogue.refusals:
+        return
+    entries = counted(catalogue.refusals, "result")
+    seen = f"the catalogue did not store {entries} ({catalogue.refused_for}): no answer depends "
+    do = "answers are right, and slower; please report this as a defect, with the reason"
+    yield _warning("catalogue", f"{seen}on it", do)
 
 
 def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:

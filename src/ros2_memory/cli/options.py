@@ -401,10 +401,10 @@ def reported_errors(command: str) -> Iterator[None]:
         _print_collected()
         if events := withheld_warnings():
             names = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
+            advice = "" if command == "doctor" else ", `ros2-memory doctor` says what to do"
+            logged = counted(events.total(), "warning")
             print(
-                f"ros2-memory: {counted(events.total(), 'warning')} logged ({names}); -v shows the "
-                "log, `ros2-memory doctor` says what to do",
-                file=sys.stderr,
+                f"ros2-memory: {logged} logged ({names}); -v shows the log{advice}", file=sys.stderr
             )
 
 

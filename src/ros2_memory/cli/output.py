@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ros2_memory.messages.levels import with_level_names
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -48,6 +50,7 @@ _TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
 
 def print_reply(console: Console, value: JsonValue, now: float | None = None) -> None:
     """Prints any reply. The ages of times count from `now` (Unix s), or from the reply's own."""
+    value = with_level_names(value)
     if isinstance(value, dict):
         stated = value.get("now")
         _print_object(console, value, stated if isinstance(stated, float) else now)
@@ -226,7 +229,7 @@ def format_value(value: JsonValue) -> str:
     if value is None:
         return "-"
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        return "true" if value else "false"
     if isinstance(value, float):
         return format_time(value) if _is_time(value) else f"{value:,.10g}".replace(",", "")
     if isinstance(value, str):

@@ -321,7 +321,8 @@ def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
             for bag, remark in left_open[-MAX_NAMED:]
         ]
         yield (
-            f"{counted(len(left_open), 'bag')} left open by a crash; what is readable is used: "
+            f"{counted(len(left_open), 'unfinished bag')}; "
+            f"{'its' if len(left_open) == 1 else 'their'} readable part is used: "
             f"{listed(names, len(left_open))}"
         )
     yield from by_remark(

@@ -80,7 +80,7 @@ def resolve_pose_topic(
     except NoDataError as error:
         if error.reason is not NoDataReason.TOPIC_NOT_RECORDED:
             raise
-        detail = f"no topic {configured} is recorded, which data.pose_topic names"
+        detail = f"data.pose_topic is {configured}, which these bags do not have"
         topics = topics_with(view, what)
         if not topics and what == "position":
             topics = topics_that_show_poses(view)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections import OrderedDict
+from itertools import chain
 from threading import Lock
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -18,13 +19,14 @@ from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, listed
+from ros2_memory.core.text import Reason, listed, match_topics
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.messages.detections import detections_of
+from ros2_memory.messages.levels import level_number
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -35,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.context import QuerySettings
+    from ros2_memory.history.context import Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
@@ -51,19 +53,38 @@ _MOST_TRUTHS: Final = 65_536
 
 
 def condition_of(
-    settings: QuerySettings,
+    memory: Memory,
+    pattern: str,
     condition_type: str,
     value: JsonValue,
+    *,
     field: str | None,
     min_score: float | None,
 ) -> Condition:
     """Returns the condition of a question; without a `min_score` of its own the configured one.
 
+    `pattern` is the name or glob of the topics. Where all of these are of one type, the field may
+    be a full path in its messages, and the level of a log or status may be named (WARN).
+
     Raises:
         InvalidArgumentsError: it is no condition.
     """
-    least = settings.min_score if min_score is None else min_score
-    return parse_condition(condition_type, value, settings.position_tolerance_m, field, least)
+    limits = memory.limits
+    least = limits.min_score if min_score is None else min_score
+    types = _types_of(memory, pattern) if field else frozenset()
+    if field and len(types) == 1:
+        (type_name,) = types
+        field = memory.extractor.field_name(type_name, field.strip())
+        value = level_number(value, field, type_name)
+    return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
+
+
+def _types_of(memory: Memory, pattern: str) -> frozenset[str]:
+    """Returns the types of the topics that match; one without its leading slash, too."""
+    timeline = memory.index.snapshot().timeline
+    topics = match_topics(timeline.topics(), pattern)
+    topics = topics or match_topics(timeline.topics(), f"/{pattern}")
+    return frozenset(chain.from_iterable(map(timeline.types_of, topics)))
 
 
 def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:

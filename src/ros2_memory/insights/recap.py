@@ -74,10 +74,10 @@ _PLURALS: Final = {
     "error": "errors",
     "failed goal": "failed goals",
     "stop": "stops",
-    "flip": "flips",
+    "flip": "on/off changes",
     "drop": "speed drops",
     "goal": "goals",
-    "thing": "sights of things",
+    "thing": "sightings",
 }
 """The kinds of events, the most important first, and the words for several of each."""
 _KINDS: Final = tuple(_PLURALS)
@@ -314,7 +314,7 @@ def _topic_events(
         last_seen |= dict.fromkeys(seen.at_end(found.last, known_to), found.last)
         note_limits(view, topic, found)
     if below:
-        sights = counted(below, "sight of a thing", "sights of things")
+        sights = counted(below, "sighting", "sightings")
         view.notes.add(f"{sights} left out: no score in it reaches min_score {min_score:g}")
     things = united(visible)
     if there is None:

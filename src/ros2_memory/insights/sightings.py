@@ -3,7 +3,7 @@
 A sighting is message after message of one topic that meets a condition. It ends with a message of
 that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector may
 publish only what it sees. A message that cannot be decoded is neither a match nor an end. Of the
-status of an action each goal is a sighting.
+status of an action each goal is a sighting, of a log each message.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from ros2_memory.places.scope import Scope
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
@@ -118,14 +118,14 @@ def find_matches(
         NoDataError: nothing is recorded, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
-    condition = condition_of(memory.limits, condition_type, value, field, min_score)
+    condition = condition_of(memory, topic, condition_type, value, field=field, min_score=min_score)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
     window = clamped(view, search_window(span, now))
-    collected = _Sightings(limit, oldest_first=oldest_first)
+    collected = _Sightings(limit, view.snapshot.timeline.is_log, oldest_first=oldest_first)
     scope = Scope(view, window, where, during)
     goals = goals_asked(view, matching_topics(view, topic), condition, scope)
     if goals is None:
@@ -204,7 +204,7 @@ def read_sightings(
     goals = goals_asked(view, matching_topics(view, pattern), condition, scope)
     if goals is not None:
         return [(each.first, each.last) for each in reversed(goals)], None
-    found = _Sightings(MAX_COUNTED, oldest_first=True)
+    found = _Sightings(MAX_COUNTED, view.snapshot.timeline.is_log, oldest_first=True)
     _collect(view, ReverseSearch(view, pattern, condition), scope, found)
     if found.count > MAX_COUNTED:
         view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
@@ -281,13 +281,19 @@ def _stop(search: ReverseSearch, found: _Sightings) -> None:
 class _Sightings:
     """Collects matches that come newest first; selects the newest or the oldest sightings.
 
+    Args:
+        limit: how many are selected.
+        is_log: whether each message of a topic is a sighting of its own.
+        oldest_first: whether the oldest are selected.
+
     Attributes:
         count: how many sightings there are so far.
         cut: whether the search ended before all was searched, or might have.
     """
 
-    def __init__(self, limit: int, *, oldest_first: bool) -> None:
+    def __init__(self, limit: int, is_log: Callable[[str], bool], *, oldest_first: bool) -> None:
         self._limit = limit
+        self._is_log = is_log
         self._oldest_first = oldest_first
         self._kept: deque[_Matches] = deque(maxlen=limit if oldest_first else None)
         self._open: OrderedDict[str, _Matches] = OrderedDict()  # least recently matched first
@@ -302,6 +308,8 @@ class _Sightings:
             self._open[topic] = matches = _Matches(found, found.time, found.time)
             self._kept.append(matches)
             self.count += 1
+            if self._is_log(topic):
+                self.end(topic)
         else:
             matches.first = matches.reach = found.time
             matches.messages += 1

@@ -126,7 +126,7 @@ def missing_data(view: View) -> Iterator[str]:
         yield nothing_here(snapshot)
     if left_open := snapshot.timeline.disk_use[1]:
         bags = counted(left_open, "bag was", "bags were")
-        yield f"{bags} left open by a crash: what did not reach the disk is lost"
+        yield f"{bags} left open by a crash: unwritten messages are lost"
     if snapshot.unread:
         files = counted(len(snapshot.unread), "file is not read", "files are not read")
         yield f"{files}; data_time_range says why"

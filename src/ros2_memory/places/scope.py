@@ -6,13 +6,12 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.reverse_search import ReverseSearch, condition_of
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.where import parse_where, times_inside
 
@@ -112,10 +111,14 @@ class _States:
     """
 
     def __init__(self, view: View, during: WhileCondition) -> None:
-        tolerance_m = view.memory.limits.position_tolerance_m
         self._view = view
-        self._condition = parse_condition(
-            during.condition_type, during.value, tolerance_m, during.field
+        self._condition = condition_of(
+            view.memory,
+            during.topic,
+            during.condition_type,
+            during.value,
+            field=during.field,
+            min_score=0.0,
         )
         self._search = ReverseSearch(view, during.topic, self._condition)
         latching = view.memory.limits.latching

@@ -188,6 +188,11 @@ def _catalogue(backfill: Backfill) -> JsonObject:
             "state": state if backfill.catalogue.trouble is None else "failing",
         }
     }
+    if backfill.catalogue.refusals:
+        shown["catalogue_refusals"] = {
+            "count": backfill.catalogue.refusals,
+            "reason": _short(backfill.catalogue.refused_for or ""),
+        }
     if undecodable:
         shown["undecodable"] = {
             "topics": len(undecodable),

@@ -29,7 +29,8 @@ from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
     "When, where, how often and how long a condition was true, newest first. "
-    "Consecutive matches are one sighting; on /_action/status each goal is one: failed, aborted, "
+    "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
+    "goal: failed, aborted, "
     'succeeded. while: {{"topic": "/is_docked", "condition_type": '
     '"equals", "value": false}} requires a condition on another topic too. '
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "

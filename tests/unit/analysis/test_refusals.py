@@ -65,7 +65,17 @@ def test_a_number_is_contained_in_a_text_or_in_what_a_field_names(wanted: JsonVa
     assert refusal(ODOM, "contains", wanted, "position.x") is None
     assert refusal(SEEN, "contains", wanted) is None
     assert refusal({"data": []}, "contains", wanted) is None
+
+
+@pytest.mark.parametrize("kind", ["equals", "contains"])
+def test_a_text_is_not_asked_of_numbers_or_booleans(kind: str) -> None:
+    assert "true or false" in (refusal({"value": True}, kind, "yes", "value") or "")
+    assert "must be a number" in (refusal({"level": 30, "msg": "x"}, kind, "WARN", "level") or "")
+    assert "must be a number" in (refusal(ODOM, "equals", "cup") or "")
     assert refusal(ODOM, "contains", "cup") is None
+    assert refusal({"level": 30, "msg": "x"}, kind, "WARN") is None
+    assert refusal({"value": None}, kind, "yes") is None
+    assert refusal({"value": True}, kind, "false") is None
 
 
 _values = st.recursive(
@@ -82,6 +92,7 @@ _values = st.recursive(
 def test_what_matches_is_never_refused(value: JsonValue, field: str) -> None:
     tests: list[tuple[str, JsonValue]] = [
         ("equals", 1),
+        ("equals", "cup"),
         ("contains", "cup"),
         ("contains", "1"),
         ("contains", 2),

@@ -276,6 +276,20 @@ def test_what_entries_add_up_to_is_kept_only_while_all_of_them_are_there(tmp_pat
     assert catalogue.cached_answers("what") == {tuple(numbers[:2]): "kept"}
 
 
+def test_what_is_computed_from_nothing_is_not_stored_and_what_is_refused_is_counted(
+    tmp_path: Path,
+) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.cache_answer("what", [], "nothing")
+    assert (catalogue.cached_answers("what"), catalogue.refusals) == ({}, 0)
+
+    def refuse(_: sqlite3.Connection) -> None:
+        raise ValueError("too large")
+
+    assert not catalogue.write(refuse)
+    assert (catalogue.refusals, catalogue.refused_for) == (1, "too large")
+
+
 def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
     catalogue = catalogue_in(tmp_path)
     catalogue.put(KEY, DIGEST)

@@ -21,7 +21,7 @@ from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, odom, text, write_mcap
+from tests.support.bags import Msg, log_entry, odom, text, write_mcap
 from tests.support.housekeepers import own_all
 from tests.support.shared_bags import REAL, needs_real
 
@@ -121,7 +121,7 @@ class TestPaths:
         bag.write_bytes(bag.read_bytes()[:-20])
         os.utime(bag, (1.7e9, 1.7e9))
         _, shown = run(capsys, "topics", folder)
-        assert shown.count("left open by a crash") == 1
+        assert shown.count("readable part is used") == 1
         assert "2 topics: 1 bag left open" in shown
         _, shown = run(capsys, "topics", folder, "--json")
         assert [len(row["notes"]) for row in json.loads(shown)] == [1, 1]
@@ -303,6 +303,17 @@ class TestCat:
         rows = [*csv.reader(shown.splitlines())]
         assert rows[0] == ["time", "position.y", "header.frame_id"]
         assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
+
+    def test_levels_of_a_log_have_their_names(self, tmp_path: Path, capsys: Capture) -> None:
+        lines = [log_entry(T0 + level, level, "nav", "said") for level in (30, 35)]
+        write_mcap(tmp_path / "rec" / "rec_0.mcap", lines)
+        _, shown = run(capsys, "cat", "/rosout", tmp_path)
+        assert [line.split("level: ")[1].split(";")[0] for line in shown.splitlines()] == [
+            "WARN (30)",
+            "35",
+        ]
+        _, shown = run(capsys, "cat", "/rosout", tmp_path, "--field", "level", "--limit", "1")
+        assert shown.split("level: ")[1] == "WARN (30)\n"
 
     @pytest.mark.parametrize(
         ("words", "expected"),

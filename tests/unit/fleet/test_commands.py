@@ -28,7 +28,7 @@ def test_doctor_checks_each_robot(robots: str, capsys: pytest.CaptureFixture[str
     told = json.loads(capsys.readouterr().out)
     found = [each for each in told["findings"] if each["about"] == "robot"]
     assert [each["level"] for each in found] == ["ok", "warning"]
-    assert found[0]["seen"].startswith("r1: 2 bags answer")
+    assert found[0]["seen"].startswith("r1: 2 bag files are readable")
     assert "away" in found[1]["seen"]
     assert "check fleet.robots" in found[1]["seen"]
 

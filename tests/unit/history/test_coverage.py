@@ -112,7 +112,7 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it() -> N
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 5, 15) == [
         (
-            "1 bag left open by a crash; what is readable is used: rec/rec_1.mcap (the last 41 "
+            "1 unfinished bag; its readable part is used: rec/rec_1.mcap (the last 41 "
             "bytes could not be read)"
         )
     ]

@@ -201,7 +201,7 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_pa
     [told] = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", start=at(1), end=at(31))[
         "notes"
     ][:1]
-    assert told.startswith("1 bag left open by a crash; what is readable is used: rec/rec_2.mcap (")
+    assert told.startswith("1 unfinished bag; its readable part is used: rec/rec_2.mcap (")
     [named] = asked(memory, tmp_path, "data_time_range")["incomplete"]
     assert named["file"] == "rec/rec_2.mcap"
     rows = queries.list_recorded_topics(memory, Call())

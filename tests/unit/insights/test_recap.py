@@ -475,12 +475,14 @@ def test_toggles_that_are_too_many_to_keep_are_counted(tmp_path: Path, recalls: 
         memory = recalling(replace(memory), tmp_path)
     answer = over(memory, 0, 10)
     more = 4 * 40 - 64
-    assert dict(answer.counts) == {"flips": 64}
+    assert dict(answer.counts) == {"on/off changes": 64}
     assert (
         f"/fmu/out/vehicle_status changes too often to list each change: {more} more"
         in answer.notes
     )
-    assert any("left out, because there are too many: 39 flips" in note for note in answer.notes)
+    assert any(
+        "left out, because there are too many: 39 on/off changes" in note for note in answer.notes
+    )
 
 
 def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
@@ -556,10 +558,8 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     answer = over(memory_of(tmp_path), 0, 100)
     assert len(answer.events) == MOST_EVENTS
     assert len(times(answer.events, "flip")) == 19
-    assert dict(answer.counts) == {"flips": 19, "sights of things": 20}
-    assert any(
-        "left out, because there are too many: 14 sights of things" in n for n in answer.notes
-    )
+    assert dict(answer.counts) == {"on/off changes": 19, "sightings": 20}
+    assert any("left out, because there are too many: 14 sightings" in n for n in answer.notes)
     assert [each.start for each in answer.events] == sorted(each.start for each in answer.events)
     reply = Replies(tmp_path, 24_000).answer(answer).text
     assert len(reply) < 3_500

@@ -30,7 +30,18 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import boolean, detections, odom, text, tf, transform, write_mcap
+from tests.support.bags import (
+    boolean,
+    command,
+    detections,
+    diagnostics,
+    log_entry,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.examples import examples
@@ -447,3 +458,54 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
             oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
             assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
             assert oldest.total == len(answer.sightings)
+
+
+@each_way
+def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
+    tmp_path: Path, recalls: bool
+) -> None:
+    lines = [(20, "begins"), (30, "slow"), (40, "lost"), (30, "slow"), (20, "ends")]
+    logged = [log_entry(BEGIN + n * S, level, "nav", said) for n, (level, said) in enumerate(lines)]
+    state = diagnostics(BEGIN + 5 * S, motor=(1, "hot"))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*logged, state])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(memory, tmp_path)
+
+    def texts(kind: str, value: JsonValue) -> list[object]:
+        call = {"condition_type": kind, "value": value, "field": "level", "fields": ["msg"]}
+        found = asked(memory, tmp_path, "find_matches", topic="/rosout", **call)
+        return [each["value"]["msg"] for each in found["sightings"]]
+
+    assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
+    assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
+    warned = {"condition_type": "equals", "value": "WARN", "field": "status.level"}
+    assert asked(memory, tmp_path, "find_last_match", topic="/diagnostics", **warned) is not None
+    refused = asked(
+        memory, tmp_path, "find_last_match", topic="/rosout", **warned | {"value": "OK"}
+    )
+    assert refused["error"] == "invalid_arguments"
+
+
+def test_a_condition_takes_the_path_of_a_field_in_the_message(tmp_path: Path) -> None:
+    driven = [odom(BEGIN + n * S, 0.0, n / 2) for n in range(4)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*driven, command(BEGIN, 0.5)])
+    memory = memory_of(tmp_path)
+    for topic, paths, limit in (
+        ("/odom", ("pose.pose.position.y", "position.y"), 0.9),
+        ("/cmd_vel", ("linear.x", "linear_velocity.x"), 0.4),
+    ):
+        raw, mapped = (
+            asked(
+                memory,
+                tmp_path,
+                "find_matches",
+                topic=topic,
+                condition_type="above",
+                value=limit,
+                field=path,
+            )["sightings"]
+            for path in paths
+        )
+        assert raw == mapped
+        assert len(raw) == 1

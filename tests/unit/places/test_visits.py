@@ -431,7 +431,7 @@ def test_a_bag_left_open_is_named_only_where_its_time_is_asked_for(tmp_path: Pat
     def is_named(start: float) -> bool:
         around = {"start": start, "end": start + 20.0}
         reply = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0, **around)
-        return any("left open by a crash" in note for note in reply.get("notes", []))
+        return any("readable part is used" in note for note in reply.get("notes", []))
 
     assert is_named(1_784_000_000.0)
     assert not is_named(1_784_001_000.0)

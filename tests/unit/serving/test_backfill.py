@@ -26,6 +26,7 @@ from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.cli import main
+from ros2_memory.cli.doctor import check_catalogue
 from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
@@ -295,6 +296,11 @@ async def test_health_tells_how_far_the_catalogue_is(tmp_path: Path) -> None:
     backfill.digest(backfill.waiting()[0])
     reply = await Health(memory, "1.2.3", backfill)()
     assert reply["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
+    backfill.catalogue.refusals, backfill.catalogue.refused_for = 2, "too large"
+    reply = await Health(memory, "1.2.3", backfill)()
+    assert reply["catalogue_refusals"] == {"count": 2, "reason": "too large"}
+    (finding,) = check_catalogue(replace(memory, recall=DigestCache(backfill.catalogue, tmp_path)))
+    assert "did not store 2 results (too large)" in finding.seen
 
 
 # The command

@@ -35,6 +35,7 @@ from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
+from ros2_memory.messages.levels import with_level_names
 
 _TIME: Final = "time"
 
@@ -137,7 +138,7 @@ def _extracted(
             shown = extractor.shown(message, type_name, fields).value
             is_checked = True
         if not exact:
-            yield Row(each.time, shown)
+            yield Row(each.time, with_level_names(shown, type_name))
         elif fields:
             found = {path: extractor.exact_at(message, type_name, path) for path in fields}
             yield Row(each.time, found)

@@ -60,7 +60,7 @@ _ROWS: Final = {
     "failed goal": "failed goals",
     "error": "errors",
     "drop": "speed drops",
-    "flip": "flips",
+    "flip": "on/off",
     "thing": "things in view",
 }
 """The kinds of events in a recap, and the name of each one's row, the first one on top."""

@@ -2,8 +2,8 @@
 
 const ZONE = Intl.DateTimeFormat().resolvedOptions().timeZone;
 const ONE = { gaps: "gap", "clock steps": "clock step", silences: "silence", errors: "error",
-  "failed goals": "failed goal", stops: "stop", flips: "flip", "speed drops": "speed drop",
-  goals: "goal", "sights of things": "sight of a thing" };
+  "failed goals": "failed goal", stops: "stop", "on/off changes": "on/off change", "speed drops": "speed drop",
+  goals: "goal", sightings: "sighting" };
 const MISSED = "not_seen_where_expected";
 
 function robotRows(robot, extra = []) {

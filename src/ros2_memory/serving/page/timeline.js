@@ -257,9 +257,9 @@ class Timeline {
     c.fillRect(GUTTER, middle - 0.5, this.wide, 1);
     const isSeen = lane === "seen";
     const { counts = {} } = this.view;
-    if (isSeen && !this.lanes.seen.length && counts["sights of things"]) {
+    if (isSeen && !this.lanes.seen.length && counts.sightings) {
       c.fillStyle = colour("soft");
-      c.fillText(`${counts["sights of things"]} sights of things: zoom in to see when`, GUTTER + 6, middle + 4);
+      c.fillText(`${counts.sightings} sightings: zoom in to see when`, GUTTER + 6, middle + 4);
     }
     for (const each of this.lanes[lane]) {
       const left = this.x(each.t);

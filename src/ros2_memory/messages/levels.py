@@ -1,0 +1,61 @@
+"""The names of levels in logs and diagnostics: WARN is 30 in the one, and 1 in the other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import InvalidArgumentsError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from ros2_memory.core.model import JsonValue
+
+FIELD: Final = "level"
+_LOG: Final = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40, "FATAL": 50}
+_STATUS: Final = {"OK": 0, "WARN": 1, "ERROR": 2, "STALE": 3}
+_BY_TYPE: Final[Mapping[str, Mapping[str, int]]] = {
+    "rcl_interfaces/msg/Log": _LOG,
+    "diagnostic_msgs/msg/DiagnosticArray": _STATUS,
+    "diagnostic_msgs/msg/DiagnosticStatus": _STATUS,
+}
+_BESIDE: Final = ((frozenset({"msg"}), _LOG), (frozenset({"message", "hardware_id"}), _STATUS))
+"""Fields beside `level` by which an extracted value is one of a log, or a status."""
+
+
+def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonValue:
+    """Returns the number of a level, where a condition on `level` gives its name; else the value.
+
+    Raises:
+        InvalidArgumentsError: messages of the type have no level of that name.
+    """
+    names = _BY_TYPE.get(type_name)
+    is_name = isinstance(value, str) and value.strip().isalpha()
+    if names is None or not is_name or (field or "").rpartition(".")[2] != FIELD:
+        return value
+    word = str(value).strip().upper()
+    number = names.get("WARN" if word == "WARNING" else word)
+    if number is None:
+        known = ", ".join(f"{name} ({each})" for name, each in names.items())
+        raise InvalidArgumentsError(f"{value!r} is no level of {type_name}: these are {known}")
+    return number
+
+
+def with_level_names(value: JsonValue, type_name: str | None = None) -> JsonValue:
+    """Returns a value with names beside the numbers of levels, for people: `WARN (30)`.
+
+    Without its type they are known by the fields beside them.
+    """
+    if isinstance(value, list):
+        return [with_level_names(each, type_name) for each in value]
+    if not isinstance(value, dict):
+        return value
+    shown = {key: with_level_names(each, type_name) for key, each in value.items()}
+    number = value.get(FIELD)
+    beside = next((names for keys, names in _BESIDE if keys <= value.keys()), None)
+    names = beside if type_name is None else _BY_TYPE.get(type_name)
+    if names is not None and isinstance(number, int) and not isinstance(number, bool):
+        name = next((each for each, known in names.items() if known == number), None)
+        if name is not None:
+            shown[FIELD] = f"{name} ({number})"
+    return shown
