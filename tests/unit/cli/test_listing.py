@@ -122,7 +122,7 @@ class TestPaths:
         os.utime(bag, (1.7e9, 1.7e9))
         _, shown = run(capsys, "topics", folder)
         assert shown.count("readable part is used") == 1
-        assert "2 topics: 1 bag left open" in shown
+        assert "2 topics: 1 unfinished bag" in shown
         _, shown = run(capsys, "topics", folder, "--json")
         assert [len(row["notes"]) for row in json.loads(shown)] == [1, 1]
 
