@@ -131,7 +131,7 @@ def find_matches(
     if goals is None:
         search = ReverseSearch(view, topic, condition)
         known = None
-        if not scope.is_bounded:
+        if not scope.is_bounded and not any(map(view.snapshot.timeline.is_log, search.topics)):
             known = known_sightings(
                 view, search, condition, window, limit, oldest_first=oldest_first
             )

@@ -479,6 +479,8 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
+    slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True)
+    assert [each.messages for each in slow.sightings] == [1, 1, 1]
     warned = {"condition_type": "equals", "value": "WARN", "field": "status.level"}
     assert asked(memory, tmp_path, "find_last_match", topic="/diagnostics", **warned) is not None
     refused = asked(
