@@ -259,7 +259,7 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     assert "give topic" not in detail
     in_degrees = "(sensor_msgs/msg/NavSatFix): get_position_at answers them by topic"
     assert (in_degrees in detail) == (tool != "get_velocity_at")
-    assert "no topic /odom is recorded" in detail
+    assert "data.pose_topic is /odom" in detail
 
 
 @each_way
