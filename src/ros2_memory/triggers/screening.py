@@ -261,7 +261,8 @@ class Screening:
                 screen.files[path.name] = FileStep.READ
                 self._problems.pop(f"{name}/{path.name}", None)
             except _UselessRuleError as error:
-                self._problems[f"{name}/{path.name}"] = str(error)
+                waiting = paths[paths.index(path) :]
+                self._problems |= {f"{name}/{each.name}": str(error) for each in waiting}
                 self._retry_s[path] = now_s + RETRY_S
                 return found, False
             except BagUnreachableError:

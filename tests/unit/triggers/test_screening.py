@@ -130,7 +130,7 @@ class TestServing:
             "have no field 'pose.position.x'; their fields are: "
             in bags.screening.failing_rules()[0]
         )
-        assert "2 splits are not served" in (bags.screening.problem() or "")
+        assert "3 splits are not served" in (bags.screening.problem() or "")
         failed = [each for each in logs if each["event"] == "exclusion_rule_fails"]
         # Every ten minutes; a step is a minute.
         assert [each["log_level"] for each in failed] == ["error"]
