@@ -238,7 +238,7 @@ def test_a_killed_recorder_is_replaced_by_a_new_recording(site: Site) -> None:
     daemon.wait_for("recorder_started", 2)
     daemon.wait_for("recording", 2)
     (died,) = daemon.events("recorder_died")
-    assert "status -9" in died["reason"]
+    assert "was killed (SIGKILL)" in died["reason"]
     assert daemon.stop() == 0
     assert len(daemon.recordings()) == 2
 
