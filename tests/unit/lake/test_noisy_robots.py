@@ -129,3 +129,19 @@ def test_events_are_known_where_digests_are_of_another_version(
     assert [found["counts"].get(each) for each in reported] == [
         expected["counts"].get(each) for each in reported
     ]
+
+
+def test_rows_of_before_states_were_shipped_answer_what_they_did(
+    robots: Robots, engine: LakeEngine, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    with monkeypatch.context() as patched:
+        for name in ("KIND", "EMPTY_KIND"):
+            patched.setattr(f"ros2_memory.lake.rows.{name}", "of a later version")
+        catalog = lake_in(tmp_path)
+        fill(catalog, {"hall": robots.mounted.robots["hall"].memory()})
+    over_lake = fleet_of({"hall": lake_robots(catalog, engine, ["hall"])["hall"].memory})
+    sightings = {**SEEN, "robot": "hall", "by": "hour"}
+    for tool, given in (("recap", {**ALL, "robot": "hall"}), ("find_matches", sightings)):
+        assert reply(over_lake, tool, given) == reply(robots.mounted, tool, given)
+    cut = reply(over_lake, "recap", {"start": START_S + 5, "end": START_S + 50, "robot": "hall"})
+    assert cut["error"] == NotShippedError.code
