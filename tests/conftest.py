@@ -18,7 +18,7 @@ from xdist.remote import Producer
 
 from tests.support.composed import composed_once
 from tests.support.examples import examples
-from tests.support.measured import is_measured, nothing_measured
+from tests.support.measured import is_measured, nothing_measured, only_ours_measured
 from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
 
@@ -54,6 +54,13 @@ for _number, _handler in (
 # What is imported and collected stays: the collector would go through all of it time and again,
 # for a third of the processor time of collecting, and for 0.4 s each later time.
 gc.disable()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Measures what tests import of the package, and not the collecting."""
+    with only_ours_measured():
+        return (yield)
 
 
 def pytest_collection_finish() -> None:

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import sys
 from contextlib import contextmanager
+from importlib.machinery import SourceFileLoader
 from typing import TYPE_CHECKING, Final, ParamSpec, TypeVar
+from unittest.mock import patch
 
 import pytest
 from coverage import Coverage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from types import ModuleType
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -100,6 +103,31 @@ def nothing_measured() -> Iterator[None]:
     finally:
         for measuring in reversed(stopped):
             measuring.start()
+
+
+@contextmanager
+def only_ours_measured() -> Iterator[None]:
+    """Within it, what is imported of the package is traced, and nothing else.
+
+    Of collecting, tracing everything takes half: 18 s of processor time instead of 8 s.
+    """
+    tracing = sys.gettrace()
+    execute = SourceFileLoader.exec_module
+
+    def traced_if_ours(self: SourceFileLoader, module: ModuleType) -> None:
+        outer = sys.gettrace()
+        sys.settrace(tracing if module.__name__.partition(".")[0] == "ros2_memory" else None)
+        try:
+            execute(self, module)
+        finally:
+            sys.settrace(outer)
+
+    sys.settrace(None)
+    try:
+        with patch.object(SourceFileLoader, "exec_module", traced_if_ours):
+            yield
+    finally:
+        sys.settrace(tracing)
 
 
 def untraced(function: Callable[_P, _R]) -> Callable[_P, _R]:
