@@ -289,7 +289,7 @@ def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(
     plain = memory_of(tmp_path)
     recalled = recalling(replace(plain), tmp_path)
     told = [
-        recap(memory, Call(), TimeRange(start_s=590.0, end_s=610.0)) for memory in (plain, recalled)
+        recap(memory, Call(), TimeRange(start_s=600.0, end_s=610.0)) for memory in (plain, recalled)
     ]
     assert told[0] == told[1]
     assert told[0].events == ()
