@@ -58,15 +58,16 @@ gc.disable()
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Measures what tests import of the package, and not the collecting."""
-    with only_ours_measured():
-        return (yield)
+    """Measures what tests import of the package, and not the collecting.
 
-
-def pytest_collection_finish() -> None:
-    """From here on there is garbage, among new objects only."""
-    gc.freeze()
-    gc.enable()
+    From its end on there is garbage, among new objects only.
+    """
+    try:
+        with only_ours_measured():
+            return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_unconfigure() -> None:
