@@ -16,6 +16,7 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.cli.ask import complete, parse_arguments
+from ros2_memory.cli.listing.info import describe_budget
 from ros2_memory.cli.output import escape, format_value
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
@@ -23,6 +24,8 @@ from tests.support.bags import odom, text, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from ros2_memory.core.model import JsonValue
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
@@ -204,6 +207,19 @@ class TestInfo:
         shown = capsys.readouterr().out
         assert "of 2 GB" in shown
         assert "full in" in shown
+
+    def test_a_small_budget_is_in_megabytes(self) -> None:
+        budget: dict[str, JsonValue] = {
+            "used_gb": 0.000425,
+            "max_gb": 0.02,
+            "growth_gb_per_day": 0.254,
+            "full_in_days": 19.68,
+            "keeps_days": 7.0,
+        }
+        assert describe_budget(budget) == (
+            "0.425 MB of 20 MB; grows by 0.254 GB a day; full in 20 days at this rate; "
+            "bags older than 7 days are deleted"
+        )
 
 
 class TestConfig:

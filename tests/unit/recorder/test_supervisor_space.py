@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from structlog.testing import capture_logs
 
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.supervisor import make_bag_dir
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
     World,
@@ -258,3 +260,9 @@ class TestHouse:
             world.run(60)
         assert len([each for each in logs if "catalogue is locked" in str(each)]) == 1
         assert world.supervisor.is_recording
+
+
+def test_a_bag_directory_that_is_a_file_is_called_one(tmp_path: Path) -> None:
+    (tmp_path / "bags").touch()
+    with pytest.raises(RecorderError, match="is a file, or lies below one, and not a directory"):
+        make_bag_dir(tmp_path / "bags")

@@ -234,3 +234,14 @@ class TestWhileSomethingIsRecorded:
         self.settle_beside(bag_dir, "a")
         assert incomplete_handover(bag_dir / "a") == "b"
         assert read_handover(bag_dir / "b").handover == pending("a")
+
+
+def test_one_whose_predecessor_was_deleted_is_settled(tmp_path: Path) -> None:
+    new = recording(tmp_path, "b", 7, 15, delay=9)
+    begin = Overlap(T0 + 6 * S, T0 + 10 * S, ("b_0.mcap",))
+    after = Handover(previous="a", counts_from=T0 + 9 * S, begin=begin, compared=False)
+    write_handover(new, after)
+    with capture_logs() as logs:
+        recover_handovers(tmp_path, READER)
+    assert not logs
+    assert read_handover(new).handover == after
