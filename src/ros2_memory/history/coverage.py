@@ -337,9 +337,12 @@ def describe_misdated(faults: Sequence[ClockFault]) -> str:
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
-    """Yields where nothing was recorded, by `Snapshot.gaps`; of a window, the parts in it."""
+    """Yields where nothing was recorded, by `Snapshot.gaps`; of a window, the parts in it.
+
+    A part that only the tolerance of its bounds reaches is left out.
+    """
     asked = window or TimeWindow.everything()
+    first, last = asked.asked()
     for start, end in view.snapshot.gaps:
-        begin, stop = max(start, asked.start), min(end, asked.stop)
-        if begin < stop:
-            yield begin, stop
+        if start < last and first < end:
+            yield max(start, asked.start), min(end, asked.stop)
