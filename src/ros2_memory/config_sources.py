@@ -23,7 +23,6 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from yaml import YAMLError
 
-from ros2_memory.config_errors import reason_of
 from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -218,8 +217,8 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
         is_cut = text.count("[") != text.count("]") or text.count("{") != text.count("}")
         spaces = "; if it has a space, it needs quotes as a whole" if is_cut else ""
         raise ConfigError(
-            f"{text!r} is not an override ({reason_of(error)}; set {source}); write key=value, "
-            f"such as server.port=9300, and key='value' where special characters are in it{spaces}"
+            f"{text!r} is not an override (set {source}); write key=value, such as "
+            f"server.port=9300, and key='value' where special characters are in it{spaces}"
         ) from error
     key = override.key_or_group
     is_group = key in options

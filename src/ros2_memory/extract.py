@@ -199,20 +199,6 @@ class SchemaExtractor:
         found = self._find(message, type_name, path)
         return None if found is ABSENT else ExactJson(self.limit).value(found, path)
 
-    def field_name(self, type_name: str, path: str) -> str:
-        """Returns a full path in a message as the extracted value names it; else the path as it is.
-
-        `pose.pose.position.y` of an odometry is `position.y`.
-        """
-        fields, segments = self._plan(type_name).fields, tuple(path.split("."))
-        if segments[0] in fields:
-            return path
-        mapped = [(name, way) for name, way in fields.items() if segments[: len(way)] == way]
-        if not mapped:
-            return path
-        name, way = max(mapped, key=lambda each: len(each[1]))
-        return ".".join((name, *segments[len(way) :]))
-
     def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
         """Returns the value for a reply: strict JSON, thinned and rounded, with notes.
 

@@ -46,8 +46,8 @@ from ros2_memory.history.no_data import (
     describe_lack,
     no_data_at,
     no_data_between,
+    pose_topic_or_only,
     require_bags,
-    resolve_pose_topic,
     resolve_topic,
     seconds,
     with_notes,
@@ -170,7 +170,7 @@ def position(
     In the pose's own frame, or in `frame_id`. A topic of a satellite receiver gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
-    name = resolve_pose_topic(view, topic, degrees=True)
+    name = pose_topic_or_only(view, topic, degrees=True)
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
     message, type_name = decode(view, found), found.record.channel.type
@@ -207,7 +207,7 @@ def velocity(
 ) -> results.Velocity:
     """Returns the robot's newest twist at or before a moment, within the tolerance (s)."""
     view, at, now = open_moment(memory, call, moment)
-    name = resolve_pose_topic(view, topic, "velocity")
+    name = pose_topic_or_only(view, topic, "velocity")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
     twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
@@ -423,7 +423,7 @@ def trajectory_summary(
     Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
     """
     view, window = open_span(memory, call, span)
-    name = resolve_pose_topic(view, topic)
+    name = pose_topic_or_only(view, topic)
     path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
     if path is None:
         raise no_data_between(view, (name,), window)

@@ -211,10 +211,9 @@ def test_a_satellite_fix_is_reported_in_degrees(tmp_path: Path, recalls: bool) -
     near = {"topic": "/fix", "condition_type": "near_position", "value": {"x": 48.12, "y": 11.77}}
     refused = ask(tmp_path, recalls, "find_last_match", **near)
     assert "degrees" in refused["detail"]
-    unknown = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 2)
-    assert unknown["detail"].endswith(
-        "latitude and longitude are on /fix (sensor_msgs/msg/NavSatFix): give topic"
-    )
+    only = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 2)
+    assert only["topic"] == "/fix"
+    assert only["notes"][0].startswith("by /fix, the only topic for it: data.pose_topic is /odom")
 
 
 ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
@@ -225,17 +224,37 @@ ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
 
 
 @each_way
+def test_the_only_topic_with_poses_of_the_robot_answers_with_a_note(
+    tmp_path: Path, recalls: bool
+) -> None:
+    driven = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(4)]
+    goal = pose_stamped(T0, 9.0, 9.0, "/goal_pose")
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*driven, goal])
+    for tool, given, key, expected in (
+        ("get_position_at", {"timestamp": T0_S + 2}, "x", 2.0),
+        ("trajectory_summary", {"start": T0_S, "end": T0_S + 3}, "distance_m", 3.0),
+    ):
+        reply = ask(tmp_path, recalls, tool, **given)
+        assert (reply["topic"], reply[key]) == ("/pose", expected)
+        assert any(note.startswith("by /pose, the only topic") for note in reply["notes"])
+    between = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 1.5)
+    assert between["reason"] == "between_messages"
+    assert "a message every 1 s" in between["detail"]
+
+
+@each_way
 @pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
 def test_where_the_pose_topic_is_not_recorded_the_one_with_poses_is_named(
     tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
 ) -> None:
     others = [text(T0, "up", "/rosout"), boolean(T0, True)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*others, pose_stamped(T0 + S, 1.0, 2.0, "/pose")])
+    two = [pose_stamped(T0 + S, 1.0, 2.0, name) for name in ("/pose", "/slam")]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*others, *two])
     reply = ask(tmp_path, recalls, tool, **given)
     assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
     assert "data.pose_topic is /odom, which these bags do not have" in reply["detail"]
     assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in reply["detail"]
-    assert "set data.pose_topic=/pose" in reply["detail"]
+    assert "set data.pose_topic to one of them" in reply["detail"]
     assert "/rosout" not in reply["detail"]
 
 

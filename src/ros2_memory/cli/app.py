@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from typer.core import TyperGroup
 
 INTERRUPTED: Final = 130
+TOOL_HELP: Final = "--tool-help"
+"""What `ask TOOL --help` is passed on as: help on the tool."""
+_HELP: Final = ("-h", "--help")
 
 
 class CommandEntry(NamedTuple):
@@ -144,7 +147,7 @@ app = typer.Typer(
     help="A robot's episodic memory: ask, inspect, export and maintain its bags.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": [*_HELP]},
     rich_markup_mode=None,
 )
 
@@ -184,7 +187,12 @@ class LazyCommand(TyperCommand):
         **extra: object,
     ) -> "Context":
         """Returns the context of the real command, which runs, completes and shows its help."""
-        return self._load().make_context(info_name, args, parent, **extra)
+        command = self._load()
+        if parent is not None and parent.params.get("verbose") and _takes(command, "verbose"):
+            args = [*args, "--verbose"]
+        if self._name == "ask" and args and not args[0].startswith("-"):
+            args = [TOOL_HELP if each in _HELP else each for each in args]
+        return command.make_context(info_name, args, parent, **extra)
 
     def _load(self) -> "Command":
         module, _, attribute = COMMANDS[self._name].path.rpartition(".")
@@ -199,6 +207,13 @@ class LazyCommand(TyperCommand):
             reporting = reported_errors(self._name)(loaded)
             parent.command(self._name, epilog=epilog(self._name))(reporting)
         return get_group(parent).commands[self._name]
+
+
+def _takes(command: "Command", option: str) -> bool:
+    """Returns whether a command has an option; of a group, whether its commands have it."""
+    commands = getattr(command, "commands", None)
+    of_all = [*commands.values()] if commands else [command]
+    return all(any(each.name == option for each in one.params) for one in of_all)
 
 
 def epilog(command: str) -> str:
@@ -232,8 +247,11 @@ def _options_of_all(
             "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
         ),
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="The same as after the command.")
+    ] = False,
 ) -> None:
-    del version
+    del version, verbose  # `LazyCommand` passes it on
 
 
 def demo(

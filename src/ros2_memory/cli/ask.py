@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Annotated, Final
 
 import anyio
@@ -11,6 +10,7 @@ import typer
 
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.bootstrap_fleet import build_fleet
+from ros2_memory.cli.app import TOOL_HELP
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
@@ -18,6 +18,7 @@ from ros2_memory.cli.options import (
     Recording,
     Sets,
     Verbose,
+    day_of,
     is_folder,
     load_to_look,
     open_memory,
@@ -32,9 +33,10 @@ from ros2_memory.cli.output import print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.arguments import TIME_KINDS
+from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.spec_tools import build_tools
 
@@ -44,6 +46,10 @@ _SETTING: Final = re.compile(
 )
 """A word that sets a setting; no argument of a tool is named so."""
 _OF_TYPE: Final = ("type", "items")
+_MOST_ROWS: Final = 10
+"""Waypoints that text shows."""
+_RECAP: Final = "recap"
+_TIMES_OF_RECAP: Final = ("last_s", "start", "end", "around")
 NEVER: Final = "never: no recorded message meets the condition"
 """Printed for `null`, the reply of tools that look for the last match."""
 
@@ -76,6 +82,7 @@ def ask(
     recording: Recording = None,
     settings: Sets = None,
     verbose: Verbose = False,
+    tool_help: Annotated[bool, typer.Option(TOOL_HELP, hidden=True)] = False,
 ) -> None:
     """Call any tool of the query server, without a server.
 
@@ -83,6 +90,9 @@ def ask(
     write times and durations as start=14:05 or seconds_ago=10m. --json prints exactly what an MCP
     client receives.
     """
+    if tool is not None and tool_help:
+        _print_help(tool)
+        return
     words = [*(given or ())]
     if tool is not None and _SETTING.fullmatch(tool):
         tool, words = None, [tool, *words]
@@ -91,19 +101,21 @@ def ask(
     of_settings = [each for each in words if _SETTING.fullmatch(each) or is_folder(each)]
     loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = build_fleet(loaded)
-    memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
+    memory = open_memory(loaded, verbose=verbose, scans=fleet is None, finds_poses=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     tools = {each.name: each for each in dispatcher.tools}
     if tool is None:
-        rows: list[JsonValue] = [_tool_row(each.name, each.schema) for each in dispatcher.tools]
+        rows: list[JsonValue] = [_tool_row(each) for each in dispatcher.tools]
         if as_json:
             print_line(json.dumps(rows))
         else:
             print_reply(stdout_console(), rows)
+            print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return
     schema = tools[tool].schema if tool in tools else {}
     asked = parse_arguments([each for each in words if each not in of_settings], schema)
     arguments = with_times(asked, schema, unix_from_ns(present(memory)))
+    arguments |= _newest_day(memory, tool, arguments)
     with spinner(f"asking {tool}"):
         (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
@@ -112,11 +124,19 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(stdout_console(), answer, unix_from_ns(present(memory)))
+        print_reply(stdout_console(), _without_waypoints(answer), unix_from_ns(present(memory)))
     if tool not in tools:
         typer.echo(f"tools: {', '.join(tools)}", err=True)
     if reply.is_error or is_error(answer):
         raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _newest_day(memory: Memory, tool: str, arguments: Mapping[str, object]) -> dict[str, object]:
+    """Returns the time of a `recap` that was asked without one: the newest day."""
+    if tool != _RECAP or not arguments.keys().isdisjoint(_TIMES_OF_RECAP):
+        return {}
+    start, end = day_of(memory, None).asked()
+    return {"start": unix_from_ns(start), "end": unix_from_ns(end)}
 
 
 def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]) -> list[Reply]:
@@ -168,7 +188,10 @@ def with_times(
 ) -> dict[str, object]:
     """Returns a tool's arguments, with times and durations as people write them in seconds.
 
-    Other text is passed on unchanged, and the tool reports its error. `now` is in Unix seconds.
+    `now` is in Unix seconds.
+
+    Raises:
+        InvalidArgumentsError: a text is no time.
     """
     properties = schema.get("properties")
     known = properties if isinstance(properties, dict) else {}
@@ -183,10 +206,7 @@ def _in_seconds(value: object, schema: object, now: float) -> object:
         return _in_seconds(value, items, now)
     if isinstance(value, str) and kind == "number":
         return parse_duration(value) or value
-    if isinstance(value, str) and kind == [*TIME_KINDS]:
-        with suppress(InvalidArgumentsError):
-            return parse_time(value, now)
-    return value
+    return parse_time(value, now) if isinstance(value, str) and kind == [*TIME_KINDS] else value
 
 
 def _from_json(text: str, otherwise: str | None) -> JsonValue:
@@ -203,11 +223,50 @@ def _takes_text(schema: Mapping[str, object], key: str) -> bool:
     return isinstance(known, dict) and known.get("type") == "string"
 
 
-def _tool_row(name: str, schema: Mapping[str, object]) -> JsonValue:
-    properties, required = schema.get("properties"), schema.get("required")
+def _without_waypoints(answer: JsonValue) -> JsonValue:
+    """Returns a reply with the number of its waypoints in their place, if they are many."""
+    waypoints = answer.get("waypoints") if isinstance(answer, dict) else None
+    if not isinstance(answer, dict) or not isinstance(waypoints, list):
+        return answer
+    if len(waypoints) <= _MOST_ROWS:
+        return answer
+    first, *_, last = waypoints
+    shown: dict[str, JsonValue] = {
+        "first_waypoint": first,
+        "last_waypoint": last,
+        "more_waypoints": f"{len(waypoints) - 2} (--json prints them, `plot path` draws them)",
+    }
+    return {key: each for key, each in answer.items() if key != "waypoints"} | shown
+
+
+def _tool_row(tool: Tool) -> JsonValue:
+    properties, required = tool.schema.get("properties"), tool.schema.get("required")
     names = list(properties) if isinstance(properties, dict) else []
     needed = required if isinstance(required, list) else []
+    purpose, _, _ = tool.description.removeprefix("Blocking. ").partition(". ")
     return {
-        "tool": name,
+        "tool": tool.name,
+        "purpose": purpose.partition(";")[0].rstrip("."),
         "arguments": ", ".join(each if each in needed else f"{each}?" for each in names),
     }
+
+
+def _print_help(name: str) -> None:
+    """Prints what a tool does, and its arguments.
+
+    Raises:
+        InvalidArgumentsError: there is no such tool.
+    """
+    tools = {each.name: each for each in build_tools(QuerySettings(), writing=True)}
+    if name not in tools:
+        raise InvalidArgumentsError(f"there is no tool {name}; the tools are {', '.join(tools)}")
+    tool = tools[name]
+    properties, required = tool.schema.get("properties"), tool.schema.get("required")
+    print_line(f"ros2-memory ask {name} key=value ... [PATH]\n\n{tool.description}\n")
+    for key, each in properties.items() if isinstance(properties, dict) else ():
+        shape = each if isinstance(each, dict) else {}
+        told = str(shape.get("description", ""))
+        if isinstance(examples := shape.get("examples"), list) and examples:
+            told += f" For example {json.dumps(examples[0])}."
+        needed = "" if isinstance(required, list) and key in required else "?"
+        print_line(f"  {key + needed:<20} {told.strip()}".rstrip())

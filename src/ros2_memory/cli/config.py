@@ -14,8 +14,8 @@ from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import (
     AsJson,
     BagDir,
-    Overrides,
-    load_with_sources,
+    Words,
+    load_given_with_sources,
     print_line,
     reported_errors,
 )
@@ -34,7 +34,7 @@ config = typer.Typer(
 @config.command("show", epilog=epilog("config"))
 @reported_errors("config show")
 def config_show(
-    overrides: Overrides = None,
+    words: Words = None,
     bag_dir: BagDir = None,
     sources: Annotated[bool, typer.Option("--sources", help="Show what set each key.")] = False,
     as_json: AsJson = False,
@@ -44,9 +44,10 @@ def config_show(
     Names of sections or keys, such as server or server.port, show those alone. A comment shows
     whether the server has a token, never the token itself.
     """
-    given = overrides or []
+    given = words or []
     named = [each for each in given if re.fullmatch(r"[a-z_][\w.]*", each)]
-    settings, source = load_with_sources(bag_dir, [each for each in given if each not in named])
+    rest = [each for each in given if each not in named]
+    settings, source = load_given_with_sources(bag_dir, rest)
     values = _chosen(dict(_keys(plain_values(settings))), named)
     if as_json:
         rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}

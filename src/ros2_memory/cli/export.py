@@ -70,12 +70,13 @@ def export(
     end: End = None,
     last: Last = None,
     latched: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--latched",
-            help="Also copy the latched messages valid at the start: maps, static transforms.",
+            "--latched/--no-latched",
+            help="Also copy the latched messages valid at the start: maps, static transforms "
+            "(default: for --mcap).",
         ),
-    ] = False,
+    ] = None,
     robot: Annotated[
         str | None,
         typer.Option(
@@ -101,7 +102,8 @@ def export(
     topics = _topics(view, topic or ())
     note_unread(view, window)
     with _progress(view, window) as report:
-        earlier = _latched_before(view, topics, window.start) if latched else []
+        with_latched = mcap is not None if latched is None else latched
+        earlier = _latched_before(view, topics, window.start) if with_latched else []
         within = view.stream.messages(topics, window)
         first = list(islice(within, 1))
         if earlier and not first:

@@ -39,6 +39,7 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
     WallClock,
+    ns_from_unix,
     unix_from_ns,
     unix_from_text,
 )
@@ -54,12 +55,16 @@ MB: Final = 1_000_000
 
 TIMES: Final = (
     "Unix seconds (1795163910.5), ISO 8601 (2026-11-20T08:30), a time of day (14:05), "
-    "yesterday 14:05, or how long ago (90s, 10m, 2h, 3d)"
+    "yesterday 14:05, now, or how long ago (90s, 10m, 2h, 3d)"
 )
-_AGO: Final = re.compile(r"(\d+(?:\.\d+)?) ?([smhd])(?: ago)?")
+_AGO: Final = re.compile(
+    r"(\d+(?:\.\d+)?) ?([smhd]|sec|seconds?|min|minutes?|hours?|days?)(?: ago)?"
+)
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+_LARGEST_UNIX_S: Final = 1e11
+"""A larger number is in milliseconds or nanoseconds."""
 _TIME_OF_DAY: Final = re.compile(
-    r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{3,6})?)?))?"
+    r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
 _WHOLE_MS: Final = re.compile(r".*:\d\d\.\d{3}")
 """A time as this program prints it: rounded down to the millisecond."""
@@ -158,6 +163,40 @@ def load_with_sources(
 def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
     """Loads the configuration as `load_with_sources` does, without the sources."""
     return load_with_sources(bag_dir, overrides)[0]
+
+
+def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> Settings:
+    """Loads the configuration as the server does, or where a PATH is given as `load_to_look` does.
+
+    Raises:
+        ConfigError: the configuration is refused.
+        InvalidArgumentsError: there is no such file or folder, or more than one is named.
+    """
+    if any(map(_is_path, words or ())):
+        return load_to_look(bag_dir, words)
+    return load_for(bag_dir, words)
+
+
+def load_given_with_sources(
+    bag_dir: Path | None, words: Sequence[str] | None
+) -> tuple[Settings, Sources]:
+    """Loads the configuration as `load_given` does, with who set each key.
+
+    Raises:
+        ConfigError: the configuration is refused.
+        InvalidArgumentsError: there is no such file or folder, or more than one is named.
+    """
+    if not any(map(_is_path, words or ())):
+        return load_with_sources(bag_dir, words)
+    settings = load_to_look(bag_dir, words)
+    _, overrides = _path_and_settings(words or ())
+    if settings.data.recording is not None:
+        overrides.append(f"data.recording={quoted(str(settings.data.recording))}")
+    own, looking = (
+        load_with_sources(settings.recording.bag_dir, [*more, *overrides])
+        for more in ((), _LOOKING)
+    )
+    return own if own[0] == settings else looking
 
 
 def load_to_look(
@@ -282,11 +321,14 @@ def open_memory(
     verbose: bool = False,
     scans: bool = True,
     setting: str | None = None,
+    finds_poses: bool = False,
 ) -> "Memory":
     """Returns the memory of the configured bags, with an index of the directory as it is now.
 
     Without an index where it `scans` not, because the robots of a fleet are asked.
-    `setting` is the one that names the bags, where it is another than `recording.bag_dir`.
+    `setting` is the one that names the bags, where it is another than `recording.bag_dir`. With
+    `finds_poses` the only topic of poses takes the place of a `data.pose_topic` that the bags do
+    not have; stderr names it.
     `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
     prints the count when the command ends.
 
@@ -316,6 +358,18 @@ def open_memory(
         raise InvalidArgumentsError(
             f"{snapshot.problem}; {_recordings_like(settings.data.recording, memory.index.bag_dir)}"
         )
+    if finds_poses and isinstance(settings.recorder, NullRecorderNode):
+        from ros2_memory.history.context import Call  # noqa: PLC0415 - as above
+        from ros2_memory.history.no_data import only_pose_topic  # noqa: PLC0415
+        from ros2_memory.history.view import View  # noqa: PLC0415
+
+        only = only_pose_topic(View(memory, Call()))
+        if only is not None:
+            missing = f"these bags have no {settings.data.pose_topic} (data.pose_topic)"
+            typer.echo(f"note: {missing}; positions are those of {only}", err=True)
+            chosen = replace(settings, data=replace(settings.data, pose_topic=only))
+            memory = build_memory(chosen, setting=setting)
+            memory.index.refresh()
     return memory
 
 
@@ -355,7 +409,7 @@ def parse_window(
 def parse_duration(text: str) -> float | None:
     """Returns the seconds of a duration as people write it (`90s`, `10m`, `2h`, `3d`) or None."""
     found = _AGO.fullmatch(text.strip().lower())
-    return None if found is None else float(found[1]) * _SECONDS_OF[found[2]]
+    return None if found is None else float(found[1]) * _SECONDS_OF[found[2][0]]
 
 
 def parse_time(text: str, now: float) -> float:
@@ -369,8 +423,16 @@ def parse_time(text: str, now: float) -> float:
         InvalidArgumentsError: the text is no time.
     """
     words = text.strip().lower()
+    if words == "now":
+        return now
     with suppress(ValueError):
-        return float(words)
+        number = float(words)
+        if abs(number) > _LARGEST_UNIX_S:
+            seconds = number / (1e9 if abs(number) > _LARGEST_UNIX_S * 1e4 else 1e3)
+            raise InvalidArgumentsError(
+                f"{text} is too large for Unix seconds; in seconds it is {seconds:.3f}"
+            )
+        return number
     ago = parse_duration(words)
     if ago is not None:
         return now - ago
@@ -378,9 +440,39 @@ def parse_time(text: str, now: float) -> float:
         if clock := _TIME_OF_DAY.fullmatch(words):
             midnight = datetime.fromtimestamp(now).astimezone().date()
             date = midnight - timedelta(days=clock[1] == "yesterday")
-            return datetime.combine(date, time.fromisoformat(clock[2] or "00:00")).timestamp()
+            of_day = clock[2] or "00:00"
+            whole, dot, fraction = of_day.partition(".")
+            of_day = f"{whole}.{fraction:0<6}" if dot else whole
+            return datetime.combine(date, time.fromisoformat(of_day)).timestamp()
         return unix_from_text(text)
     raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
+
+
+def day_of(memory: "Memory", day: str | None) -> TimeWindow:
+    """Returns a day of this machine's calendar, from midnight to midnight; None is the newest."""
+    newest = memory.index.snapshot().dating.latest
+    now = present(memory) if day is not None or newest is None else newest
+    at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
+    date = datetime.fromtimestamp(at).astimezone().date()
+    begin, end = (
+        datetime.combine(each, time.min).timestamp() for each in (date, date + timedelta(days=1))
+    )
+    return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
+
+
+def require_topic(topic: str, words: Sequence[str] | None, command: str) -> None:
+    """Checks that the first argument of a command is a topic, and no path of a bag.
+
+    Raises:
+        InvalidArgumentsError: it is a path.
+    """
+    if not Path(topic).exists() or any(Path(each).exists() for each in words or ()):
+        return
+    kind = "folder" if Path(topic).is_dir() else "file"
+    name = words[0] if words and "=" not in words[0] else "TOPIC"
+    raise InvalidArgumentsError(
+        f"{topic} is a {kind}, not a topic; write `ros2-memory {command} {name} {topic}`"
+    )
 
 
 @contextmanager
@@ -392,7 +484,9 @@ def reported_errors(command: str) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:
-        raise
+        # Or Python would write to the closed pipe once more when it exits, and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(EXIT_NEGATIVE) from None
     except (EpisodicError, OSError) as error:
         lines = "\n".join(map(with_local_times, str(error).split("\n")))
         print(f"ros2-memory {command}: {lines}", file=sys.stderr)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from contextlib import suppress
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 GIVE_TOPIC: Final = "give topic where the tool takes it"
+_OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|plan|marker")
+"""Names of topics whose poses are not those of the robot."""
 MOST_TRIED: Final = 20
 """Topics of unknown content that are looked into for poses."""
 _CLOCKS_DIFFER_NS: Final[Ns] = 60 * NS_PER_S
@@ -57,8 +60,49 @@ def resolve_topic(view: View, name: str) -> str:
     raise not_recorded(view, name)
 
 
+def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False) -> str | None:
+    """Returns the only topic with the robot's poses where `data.pose_topic` is not recorded.
+
+    With `degrees` that of the only satellite receiver, if there is none with poses. None where
+    there is more than one; goals and clicked points do not count.
+    """
+    if view.memory.limits.pose_topic in view.snapshot.timeline.topics():
+        return None
+    found = _topics_of_robot(view, what)
+    if not found and degrees:
+        found = _topics_of_robot(view, "geodetic")
+    return found[0] if len(found) == 1 else None
+
+
+def _topics_of_robot(view: View, what: str) -> list[str]:
+    names = dict.fromkeys(each.partition(" ")[0] for each in topics_with(view, what))
+    return [each for each in names if not _OF_OTHERS.search(each)]
+
+
+def pose_topic_or_only(
+    view: View, name: str | None, what: str = "position", *, degrees: bool = False
+) -> str:
+    """Returns what `resolve_pose_topic` does, or with a note the only other topic there is.
+
+    Raises:
+        NoDataError: as for `resolve_pose_topic`.
+    """
+    only = only_pose_topic(view, what, degrees=degrees) if name is None else None
+    if only is None:
+        return resolve_pose_topic(view, name, what, degrees=degrees)
+    view.notes.add(
+        f"by {only}, the only topic for it: data.pose_topic is {view.memory.limits.pose_topic}, "
+        "which these bags do not have"
+    )
+    return only
+
+
 def resolve_pose_topic(
-    view: View, name: str | None = None, what: str = "position", *, degrees: bool = False
+    view: View,
+    name: str | None = None,
+    what: str = "position",
+    *,
+    degrees: bool = False,
 ) -> str:
     """Returns the recorded topic for a question about the robot's motion.
 
@@ -255,6 +299,11 @@ def no_data_at(
     start = MIN_NS if before is None else max(at - before, MIN_NS)
     window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
     reason = between(view, window) if is_between else beyond(view, at)
+    if older and newer and around is None and reason is NoDataReason.GAP:
+        period = _usual_period(view, older)
+        if newer.time - older.time <= 2 * period:
+            reason = NoDataReason.BETWEEN_MESSAGES
+            detail.append(f"the topic has a message every {seconds(period)}")
     detail += _advice(view, reason)
     if _is_to_come(view, at):
         detail.append(_to_come(view, at))
@@ -262,6 +311,12 @@ def no_data_at(
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def _usual_period(view: View, found: StoredMessage) -> Ns:
+    """Returns the mean time between the messages of a topic in the recording of one of them."""
+    pace = view.snapshot.timeline.pace(found.record.channel.topic, found.bag.recording).topic
+    return (pace.last - pace.first) // max(pace.messages - 1, 1)
 
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:

@@ -74,7 +74,7 @@ def condition_of(
     types = _types_of(memory, pattern) if field else frozenset()
     if field and len(types) == 1:
         (type_name,) = types
-        field = memory.extractor.field_name(type_name, field.strip())
+        field = memory.extractor.own_path(field.strip(), type_name)
         value = level_number(value, field, type_name)
     return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
 

@@ -163,7 +163,7 @@ class TestMcap:
         assert cli.main(["export", "--mcap", str(out), "--end", str(T0 / NS_PER_S + 60)]) == 0
         assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
 
-    def test_what_latched_messages_held_at_the_start_comes_along_where_it_is_asked_for(
+    def test_what_latched_messages_held_at_the_start_comes_along_unless_it_is_refused(
         self, bag_dir: Path, tmp_path: Path
     ) -> None:
         mounts = [
@@ -176,8 +176,8 @@ class TestMcap:
         ]
         write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [*mounts, *driven(T0 + 3, 0)])
         words = ["export", "--start", str(T0 / NS_PER_S + 5), "--end", str(T0 / NS_PER_S + 6)]
-        assert cli.main([*words, "--mcap", str(tmp_path / "without.mcap")]) == 0
-        assert cli.main([*words, "--mcap", str(tmp_path / "with.mcap"), "--latched"]) == 0
+        assert cli.main([*words, "--mcap", str(tmp_path / "without.mcap"), "--no-latched"]) == 0
+        assert cli.main([*words, "--mcap", str(tmp_path / "with.mcap")]) == 0
         held = [row for row in read(tmp_path / "with.mcap") if row[0] == "/tf_static"]
         assert [at for _, at, _ in held] == [T0 + 1, T0 + 2]
         rest = [row for row in read(tmp_path / "with.mcap") if row[0] != "/tf_static"]

@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 import pytest
@@ -20,6 +21,7 @@ from ros2_memory import cli
 from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_time
 from ros2_memory.cli.output import format_time
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, log_entry, odom, text, write_mcap
 from tests.support.housekeepers import own_all
@@ -369,13 +371,64 @@ def test_times_and_durations_of_tools_may_be_words() -> None:
             "topic": {"type": "string"},
         }
     }
-    given_words = {"start": "10m", "timestamps": ["1s", "soon"], "seconds": "2h", "topic": "3d"}
+    given_words = {
+        "start": "10m",
+        "timestamps": ["1s", "1 hour ago"],
+        "seconds": "2h",
+        "topic": "3d",
+    }
     assert with_times(given_words, schema, 1_700_000_000.0) == {
         "start": 1_700_000_000.0 - 600,
-        "timestamps": [1_699_999_999.0, "soon"],
+        "timestamps": [1_699_999_999.0, 1_700_000_000.0 - 3600],
         "seconds": 7200.0,
         "topic": "3d",
     }
+    with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
+        with_times({"start": "soon"}, schema, 1_700_000_000.0)
+
+
+def test_one_parser_reads_all_times_and_knows_nanoseconds() -> None:
+    now = datetime(2026, 11, 20, 15, 0).astimezone().timestamp()
+    for written, ago_s in (("now", 0), ("30s ago", 30), ("2 hours ago", 7200), ("14:59:59.5", 0.5)):
+        assert parse_time(written, now) == now - ago_s
+    with pytest.raises(InvalidArgumentsError, match=r"in seconds it is 1795163910\.500"):
+        parse_time("1795163910500000000", now)
+
+
+def test_where_the_topic_is_forgotten_the_command_is_named(folder: Path, capsys: Capture) -> None:
+    for words in (["cat"], ["plot", "signal", "-o", "x.svg"]):
+        assert cli.main([*words, str(folder / "a")]) == 2
+        command = " ".join(words[:2] if words[0] == "plot" else words)
+        expected = f"is a folder, not a topic; write `ros2-memory {command} TOPIC {folder / 'a'}`"
+        assert expected in capsys.readouterr().err
+
+
+def test_help_on_a_tool_and_a_purpose_for_each(folder: Path, capsys: Capture) -> None:
+    _, shown = run(capsys, "ask", "visits", "--help")
+    assert "ros2-memory ask visits key=value" in shown
+    assert "  where?" in shown
+    _, shown = run(capsys, "ask", folder / "a", "--json")
+    assert all(each["purpose"] for each in json.loads(shown))
+
+
+def test_commands_take_a_path_and_the_log_is_shown_on_request(
+    folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+    assert run(capsys, "index", folder / "a")[0] == 0
+    code, shown = run(capsys, "config", "show", folder / "a", "--json")
+    assert (code, json.loads(shown)["recording.bag_dir"]) == (0, str(folder / "a"))
+    assert cli.main(["config", "show", "foo=[bar"]) == 2
+    assert "expecting" not in capsys.readouterr().err
+    assert cli.main(["-v", "info", str(folder / "a")]) == 0
+    assert "index_scanned" in capsys.readouterr().err
+
+
+def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, capsys: Capture) -> None:
+    _, shown = run(capsys, "ask", "recap", folder / "b", "--json")
+    reply = json.loads(shown)
+    assert reply["start"] <= T0 / NS_PER_S + 100 < reply["end"]
+    assert reply["end"] - reply["start"] >= 23 * 3600
 
 
 @pytest.mark.parametrize(

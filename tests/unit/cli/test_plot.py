@@ -23,6 +23,7 @@ from tests.unit.test_positions import fix
 
 pytest.importorskip("matplotlib", reason="needs the extra plot")
 
+from ros2_memory.cli.options import day_of
 from ros2_memory.cli.plot import scene
 from ros2_memory.cli.plot.without_poses import east_north
 
@@ -200,10 +201,10 @@ def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
 
 def test_a_day_is_one_of_this_machines_calendar(bags: Path) -> None:
     memory = memory_of(bags)
-    window = scene.day_of(memory, None)
+    window = day_of(memory, None)
     assert window.start <= T0 < window.stop
     assert 23 * 3600 * S <= window.stop - window.start <= 25 * 3600 * S
-    assert scene.day_of(memory, "2023-11-15T12:00").start == window.stop
+    assert day_of(memory, "2023-11-15T12:00").start == window.stop
 
 
 @pytest.mark.parametrize(

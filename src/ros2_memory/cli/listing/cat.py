@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
 from itertools import islice
-from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import typer
@@ -24,12 +23,13 @@ from ros2_memory.cli.options import (
     load_to_look,
     open_memory,
     parse_window,
+    require_topic,
 )
 from ros2_memory.cli.output import format_time, format_value, with_local_times
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import JsonValue
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.duplicates import StoredMessage
@@ -89,10 +89,7 @@ def cat(
         raise InvalidArgumentsError("give --csv or --json, not both")
     if limit is not None and tail is not None:
         raise InvalidArgumentsError("give --limit or --tail, not both")
-    if words and Path(topic).exists() and not Path(words[0]).exists():
-        raise InvalidArgumentsError(
-            f"the topic comes first: `ros2-memory cat {words[0]} {topic}`; {topic} is not a topic"
-        )
+    require_topic(topic, words, "cat")
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     view = View(memory, Call())
     name = resolve_topic(view, topic)
@@ -111,12 +108,20 @@ def cat(
         typer.echo(f"note: {with_local_times(note)}", err=True)
     if not count:
         typer.echo(
-            f"no message of {name} to show in this time; "
+            f"no message of {name} to show {_described(window)}; "
             "`ros2-memory topics` says when there are some",
             err=True,
         )
     if not count or not view.notes.complete:
         raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _described(window: TimeWindow) -> str:
+    """Returns a window in this machine's time, as far as it is bounded."""
+    first, last = window.asked()
+    since = f"from {format_time(unix_from_ns(first))} " if window.start > MIN_NS else ""
+    until = f"until {format_time(unix_from_ns(last))}" if window.stop < MAX_NS else ""
+    return f"{since}{until}".strip() or "at any time"
 
 
 def _extracted(

@@ -22,9 +22,9 @@ from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
     AsJson,
     BagDir,
-    Overrides,
     Verbose,
-    load_for,
+    Words,
+    load_given,
     open_memory,
     print_line,
 )
@@ -46,7 +46,7 @@ _BAR_WIDTH: Final = 40
 
 
 def index(
-    overrides: Overrides = None,
+    words: Words = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     verbose: Verbose = False,
@@ -57,7 +57,7 @@ def index(
     Fills the catalogue of the bags, with the settings of the server. The server also does this in
     the background; the catalogue changes only the speed of answers.
     """
-    settings = load_for(bag_dir, overrides)
+    settings = load_given(bag_dir, words)
     if for_server is not None:
         _fill_for_server(settings, for_server)
     elif settings.fleet.robots:

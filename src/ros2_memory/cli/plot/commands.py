@@ -18,18 +18,19 @@ from ros2_memory.cli.options import (
     Start,
     Verbose,
     Words,
+    day_of,
     load_to_look,
     open_memory,
     parse_window,
     print_line,
     reported_errors,
+    require_topic,
     spinner,
 )
 from ros2_memory.cli.output import with_local_times
 from ros2_memory.cli.plot.scene import (
     MOST_TOPICS,
     Stop,
-    day_of,
     event_lines,
     event_rows,
     opened,
@@ -98,7 +99,8 @@ def plot_path(
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
+    settings = load_to_look(bag_dir, words, recording)
+    memory = open_memory(settings, verbose=verbose, finds_poses=True)
     asked = opened(memory, parse_window(memory, start, end, last))
     with spinner("looking for the path"):
         path, subtitle, notes = path_in(asked, topic, frame)
@@ -133,6 +135,7 @@ def plot_signal(
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
     _check(out)
+    require_topic(topic, words, "plot signal")
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
@@ -164,7 +167,8 @@ def plot_timeline(
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
+    settings = load_to_look(bag_dir, words, recording)
+    memory = open_memory(settings, verbose=verbose, finds_poses=True)
     asked = opened(memory, parse_window(memory, start, end, last))
     with spinner("looking what was recorded when"):
         found = recap_in(asked)
@@ -200,7 +204,8 @@ def plot_recap(
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
+    settings = load_to_look(bag_dir, words, recording)
+    memory = open_memory(settings, verbose=verbose, finds_poses=True)
     if all(each is None for each in (start, end, last)):
         window = day_of(memory, day)
     elif day is None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from datetime import datetime, time, timedelta
+from datetime import datetime
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.cli.options import parse_time, present
 from ros2_memory.cli.output import format_duration
 from ros2_memory.cli.plot.without_poses import DrawnPath, path_without_poses
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
@@ -136,18 +135,6 @@ def opened(memory: Memory, window: TimeWindow) -> Scene:
             "nothing was recorded in this time: `ros2-memory info` shows what is recorded",
         )
     return Scene(memory, view, within)
-
-
-def day_of(memory: Memory, day: str | None) -> TimeWindow:
-    """Returns a day of this machine's calendar, from midnight to midnight."""
-    newest = memory.index.snapshot().dating.latest
-    now = present(memory) if day is not None or newest is None else newest
-    at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
-    date = datetime.fromtimestamp(at).astimezone().date()
-    begin, end = (
-        datetime.combine(each, time.min).timestamp() for each in (date, date + timedelta(days=1))
-    )
-    return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
 
 
 def recap_in(asked: Scene) -> Recap | None:
