@@ -1,6 +1,7 @@
 """`ros2-memory topics` and `info`: what is recorded, and how much of it."""
 
 import json
+import re
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -42,6 +43,7 @@ from ros2_memory.results import TopicRow
 _WHOLE_REPLY: Final = "server.max_reply_chars=1000000000"
 """A planner's context is short; a person's screen scrolls."""
 _TOLD_TWICE: Final = frozenset({"earliest_local", "latest_local", "now_local", "newest_age_s"})
+_OWN_LISTS: Final = re.compile(r"data_time_range (?:lists them|says why|has the details)")
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
@@ -242,10 +244,13 @@ def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
     """Returns how much is recorded, as `ros2 bag info` does."""
     bags = snapshot.bags
     kinds = sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})
+    first, last = snapshot.earliest, snapshot.latest
+    span = None if first is None or last is None else last - first
     held: dict[str, JsonValue] = {
         "recordings": len(recordings_of(snapshot)),
         "bags": len(bags),
         "storage": ", ".join(kinds) or None,
+        "duration_s": None if span is None else round(unix_from_ns(span), 3),
         "messages": sum(bag.summary.count for bag in bags),
         "topics": len(snapshot.timeline.topics()),
         "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
@@ -268,8 +273,19 @@ def _for_people(reply: JsonValue) -> dict[str, JsonValue]:
     has_recorder = row.get("recorder", "") is not None
     left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
     return {
-        key: value for key, value in row.items() if key not in left_out and value not in ([], 0)
+        key: _without_itself(value)
+        for key, value in row.items()
+        if key not in left_out and value not in ([], 0)
     }
+
+
+def _without_itself(value: JsonValue) -> JsonValue:
+    """Returns what a key holds, with this command's own lists where a sentence names the tool."""
+    if isinstance(value, str):
+        return _OWN_LISTS.sub("see below", value)
+    if isinstance(value, list):
+        return [_without_itself(each) if isinstance(each, str) else each for each in value]
+    return value
 
 
 def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, Ns]]:
