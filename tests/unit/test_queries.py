@@ -48,8 +48,8 @@ def span(start: float, end: float) -> TimeRange:
 @pytest.mark.parametrize(
     ("topic", "kind", "value", "field"),
     [
-        ("/bumper", "equals", True, "data"),
-        ("/odom", "near_position", {"x": 1, "y": 0}, "pose.pose.position"),
+        ("/bumper", "equals", True, "data.nothing"),
+        ("/odom", "near_position", {"x": 1, "y": 0}, "pose.pose.nothing"),
         ("/bumper", "near_position", {"x": 1, "y": 0}, None),
     ],
 )

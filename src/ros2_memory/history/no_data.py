@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 GIVE_TOPIC: Final = "give topic where the tool takes it"
+_DEFAULT_POSES: Final = "/odom"
+"""`data.pose_topic` where nobody chose another."""
 _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|plan|marker")
 """Names of topics whose poses are not those of the robot."""
 MOST_TRIED: Final = 20
@@ -64,9 +66,11 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     """Returns the only topic with the robot's poses where `data.pose_topic` is not recorded.
 
     With `degrees` that of the only satellite receiver, if there is none with poses. None where
-    there is more than one; goals and clicked points do not count.
+    there is more than one, or somebody chose `data.pose_topic`; goals and clicked points do not
+    count.
     """
-    if view.memory.limits.pose_topic in view.snapshot.timeline.topics():
+    configured = view.memory.limits.pose_topic
+    if configured != _DEFAULT_POSES or configured in view.snapshot.timeline.topics():
         return None
     found = _topics_of_robot(view, what)
     if not found and degrees:

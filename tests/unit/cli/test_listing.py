@@ -217,7 +217,7 @@ class TestRecordings:
         assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another program")
         assert rows["c"]["not_read"] == 1
         _, shown = run(capsys, "info", folder)
-        assert "1 damaged bag file; `ros2-memory info` lists" in " ".join(shown.split())
+        assert "1 damaged bag file; see below" in " ".join(shown.split())
 
     def test_one_without_a_message_is_named_too(self, folder: Path, capsys: Capture) -> None:
         write_mcap(folder / "caught_nothing" / "caught_nothing_0.mcap", [])
