@@ -33,6 +33,7 @@ NEWER = frozenset(
         "waiting_for",
         "held_back",
         "unshipped",
+        "failing_rules",
     }
 )
 """Keys that older recorders did not write."""
