@@ -59,12 +59,22 @@ def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MEMORY_BAG_DIR", raising=False)
 
 
-def test_where_the_poses_are_on_another_topic_it_names_the_option(
+def test_where_the_poses_are_on_several_other_topics_it_names_the_option(
     tmp_path: Path, capsys: Capture
 ) -> None:
-    write_mcap(tmp_path / "bag.mcap", [odom(T0, 0.0, 0.0, topic="/base/odometry")])
+    other = [odom(T0, 0.0, 0.0, topic=name) for name in ("/base/odometry", "/slam/odometry")]
+    write_mcap(tmp_path / "bag.mcap", other)
     assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 2
-    assert "set data.pose_topic=/base/odometry, or give --topic" in capsys.readouterr().err
+    assert "set data.pose_topic to one of them, or give --topic" in capsys.readouterr().err
+
+
+def test_where_the_poses_are_on_one_other_topic_it_is_drawn_and_named(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    driven = [odom(T0 + n * S, float(n), 0.0, topic="/base/odometry") for n in range(3)]
+    write_mcap(tmp_path / "bag.mcap", driven)
+    assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 0
+    assert "positions are those of /base/odometry" in capsys.readouterr().err
 
 
 def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> None:
