@@ -299,7 +299,7 @@ class ServerSettings:
     """
 
     name: Text
-    transport: Literal["stdio", "sse"]
+    transport: Literal["stdio", "sse", "http"]
     host: Text
     port: Port
     call_timeout_s: Positive

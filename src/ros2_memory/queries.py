@@ -37,6 +37,7 @@ from ros2_memory.history.coverage import (
     not_covered,
     note_edges,
     note_unread,
+    note_unrecorded,
     recording_gaps,
     unix_text,
 )
@@ -48,6 +49,7 @@ from ros2_memory.history.no_data import (
     no_data_between,
     pose_topic_or_only,
     require_bags,
+    require_recorded,
     resolve_topic,
     seconds,
     with_notes,
@@ -56,6 +58,7 @@ from ros2_memory.history.reverse_search import (
     ReverseSearch,
     compared_frames,
     condition_of,
+    may_be_elsewhere,
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near
@@ -139,6 +142,7 @@ def topic_range(
     total, chosen = view.pick(name, window, max_samples)
     if not chosen:
         raise no_data_between(view, (name,), window)
+    note_unrecorded(view, window)
     samples, types = _samples(view, chosen, window, fields)
     if len(types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
@@ -171,6 +175,7 @@ def position(
     """
     view, at, now = open_moment(memory, call, moment)
     name = pose_topic_or_only(view, topic, degrees=True)
+    _require_kind(view, name, "position", "geodetic")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
     message, type_name = decode(view, found), found.record.channel.type
@@ -208,6 +213,7 @@ def velocity(
     """Returns the robot's newest twist at or before a moment, within the tolerance (s)."""
     view, at, now = open_moment(memory, call, moment)
     name = pose_topic_or_only(view, topic, "velocity")
+    _require_kind(view, name, "velocity")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
     twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
@@ -262,6 +268,8 @@ def find_last_match(
     view = View(memory, call, now)
     until = _before(before_s)
     search = ReverseSearch(view, topic, condition)
+    if before_s is not None:
+        require_recorded(view, TimeWindow(MIN_NS, until))
     found = search.newest(until)
     if found is None:
         notes = _notes_on_never(view, search, until, condition, min_score)
@@ -301,6 +309,8 @@ def value_when(
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
     search = ReverseSearch(view, condition_topic, condition)
+    if before_s is not None:
+        require_recorded(view, TimeWindow(MIN_NS, until))
     found = search.newest(until)
     if found is None:
         notes = _notes_on_never(view, search, until, condition, min_score)
@@ -427,6 +437,7 @@ def trajectory_summary(
     path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
     if path is None:
         raise no_data_between(view, (name,), window)
+    note_unrecorded(view, window)
     if len(path.frames) > 1:
         view.notes.add(f"poses in several frames were joined: {', '.join(path.frames)}")
     note_robots(view, name, window)
@@ -476,7 +487,8 @@ def _notes_on_never(
 ) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null."""
     notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
-    return (*notes, *compared_frames(view, search.topics, condition)) if notes else ()
+    is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
+    return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 
 
 def _before(before_s: float | None) -> Ns:
@@ -513,6 +525,23 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
     return found
 
 
+def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
+    """Checks that a topic of types that are in the schema map can answer, before a time is sought.
+
+    Raises:
+        InvalidArgumentsError: none of its types carries the `what` that is asked for, or another.
+    """
+    extractor, types = view.memory.extractor, view.snapshot.timeline.types_of(topic)
+    if any(
+        not extractor.is_mapped(each) or extractor.kinds_of(each) & {what, *or_else}
+        for each in types
+    ):
+        return
+    newest = view.stream.newest(topic, TimeWindow.everything())
+    if newest is not None:
+        raise InvalidArgumentsError(describe_lack(view, what, newest))
+
+
 def _held(
     view: View, value: results.TopicValue, found: StoredMessage, at: Ns
 ) -> results.TopicValue:
@@ -534,22 +563,27 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
     """Returns a message as a reply shows it, with the notes on that message alone."""
+    return _decoded(view, found, fields)[1]
+
+
+def _decoded(view: View, found: StoredMessage, fields: Sequence[str]) -> tuple[object, Extracted]:
     with view.call.stages.timed("extract"):
         message = decode(view, found)
-        return view.memory.extractor.shown(message, found.record.channel.type, fields)
+        return message, view.memory.extractor.shown(message, found.record.channel.type, fields)
 
 
 def _value(
     view: View, found: StoredMessage, fields: Sequence[str], now: Ns | None
 ) -> results.TopicValue:
     """Returns a message as a reply shows it, with all notes of the view so far."""
-    shown = _extracted(view, found, fields)
+    message, shown = _decoded(view, found, fields)
     channel = found.record.channel
     return results.TopicValue(
         channel.topic,
         channel.type,
         Sample(found.time, shown.value),
         _age(found, now),
+        frame_id=view.memory.extractor.frame(message),
         notes=(*view.notes.sentences(), *shown.notes),
     )
 

@@ -97,7 +97,8 @@ class DataTimeRange(AnswerWithNotes):
 class TopicValue(AnswerWithNotes):
     """One message of one topic; with `latched` it is valid at any age.
 
-    `age` counts back from now for a relative question, else from the time asked about.
+    `age` counts back from now for a relative question, else from the time asked about. `frame_id`
+    is that of the message's header; empty where it has none.
     """
 
     topic: str
@@ -105,6 +106,7 @@ class TopicValue(AnswerWithNotes):
     sample: Sample
     age: Ns | None = None
     latched: bool = False
+    frame_id: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +242,7 @@ class DrivenInside(AnswerWithNotes):
     Attributes:
         topic: of the poses.
         frame_id: of the waypoints.
-        where: the region's name.
+        where: the region's name, or its bounds.
         visits: how often the robot was inside; `duration` is how long in all.
         start: log time at which the first visit began; None where there was none.
         end: at which the last one ended.
@@ -251,7 +253,7 @@ class DrivenInside(AnswerWithNotes):
 
     topic: str
     frame_id: str
-    where: str
+    where: JsonValue
     visits: int
     duration: Ns
     start: Ns | None
@@ -394,7 +396,7 @@ class Recap(AnswerWithNotes):
         counts: how many events of each kind there were, also of those that are left out.
         path_sum_m: the plain sum of distances, if noise adds much to it.
         gap_m: the path across gaps in the recording, in straight lines; None without a gap.
-        where: the region's name, where only what happened there was asked for.
+        where: the region's name, or its bounds, where only what happened there was asked for.
         visits: how often the robot was there; `inside` is how long in all.
         skipped: how much of the window the clock skipped.
     """
@@ -412,7 +414,7 @@ class Recap(AnswerWithNotes):
     counts: tuple[tuple[str, int], ...] = ()
     path_sum_m: float | None = None
     gap_m: float | None = None
-    where: str | None = None
+    where: JsonValue = None
     visits: int = 0
     inside: Ns = 0
     skipped: Ns = 0

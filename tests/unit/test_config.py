@@ -156,6 +156,7 @@ class TestEnvironment:
         [
             ("MEMORY_BAG_DIR", "/data/my 'bags', [1]", "recording", "bag_dir", None),
             ("MCP_TRANSPORT", "sse", "server", "transport", "sse"),
+            ("MCP_TRANSPORT", "http", "server", "transport", "http"),
             ("MCP_HOST", "0.0.0.0", "server", "host", "0.0.0.0"),  # noqa: S104
             ("MCP_PORT", "9300", "server", "port", 9300),
         ],
@@ -213,7 +214,7 @@ class TestEnvironment:
         [
             ("MCP_PORT", "http", ["server.port", "'http'", "must be a whole number"]),
             ("MCP_PORT", "70000", ["server.port", "70000", "65535"]),
-            ("MCP_TRANSPORT", "http", ["server.transport", "'http'", "stdio, sse"]),
+            ("MCP_TRANSPORT", "tcp", ["server.transport", "'tcp'", "stdio, sse, http"]),
             ("MEMORY_DEPLOYMENT", "moon", ["'moon'", "local, query_only, replay, robot"]),
             ("MEMORY_BAG_DIR", "${HOME}/bags", ["'${HOME}/bags'", "not expanded"]),
             ("ROS_VISION_INTERFACES_PATH", "/no/such", ["'/no/such'", "existing folder"]),

@@ -142,6 +142,11 @@ class Equals:
         return any(zone_map.can_contain_number(number) for number in self._numbers)
 
     @property
+    def is_text(self) -> bool:
+        """Whether the value is a text that spells neither a boolean nor a number."""
+        return isinstance(self.value, str) and _meaning(self.value) is None
+
+    @property
     def number_bounds(self) -> tuple[float, float] | None:
         """Between which numbers (inclusive) a leaf must be; None where it may be no number."""
         if isinstance(self.value, str) or self._boolean is not None:
@@ -190,14 +195,15 @@ class Beyond:
 class NearPosition:
     """A position (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
 
-    The frame is the value's own. A position without a finite x and y (and z, where one is asked)
-    never matches.
+    The frame is the value's own; `frame_id` is what the question says that it is, if it does. A
+    position without a finite x and y (and z, where one is asked) never matches.
     """
 
     x: float
     y: float
     z: float | None
     tolerance_m: float
+    frame_id: str | None = None
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any position in the value is near."""
@@ -434,9 +440,9 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
             f"'near_position' takes an object with x and y (and z) in metres as value,"
             f" not {_kind(value)}; {example}"
         )
-    if unknown := sorted(value.keys() - {"x", "y", "z"}):
+    if unknown := sorted(value.keys() - {"x", "y", "z", "frame_id"}):
         raise InvalidArgumentsError(
-            f"'near_position' knows x, y and z only, not {abbreviate(unknown)}; {example}"
+            f"'near_position' knows x, y, z and frame_id only, not {abbreviate(unknown)}; {example}"
         )
     x, y = _coordinate(value.get("x")), _coordinate(value.get("y"))
     z = None if value.get("z") is None else _coordinate(value["z"])
@@ -450,7 +456,13 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
         raise InvalidArgumentsError(
             f"the tolerance must be a finite number of metres, 0 or more, not {tolerance_m}"
         )
-    return NearPosition(x, y, z, float(tolerance_m))
+    frame_id = value.get("frame_id")
+    if frame_id is not None and not (isinstance(frame_id, str) and frame_id.strip()):
+        raise InvalidArgumentsError(
+            f"'frame_id' of 'near_position' must be the name of a frame, not {_kind(frame_id)};"
+            f" {example}"
+        )
+    return NearPosition(x, y, z, float(tolerance_m), frame_id)
 
 
 def _kind(value: JsonValue) -> str:
@@ -580,8 +592,19 @@ def _refusal_for_position(value: JsonValue) -> str:
 
 
 def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
-    """Returns why `contains` finds a number in none of these; None where it may."""
+    """Returns why these cannot match: numbers never equal a text, or contain a number.
+
+    None where one may.
+    """
     test = condition.test
+    if isinstance(test, Equals) and condition.field is not None and test.is_text:
+        kinds = {type(leaf) for each in targets for leaf in leaves(each)} - {type(None)}
+        if not kinds or kinds - {int, float}:
+            return None
+        return (
+            f"the field {condition.field!r} is a number, and equals asks for the text "
+            f"{abbreviate(test.value)}: give a number"
+        )
     if not isinstance(test, Contains) or not test.is_number:
         return None
     if condition.field is not None and any(

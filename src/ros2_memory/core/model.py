@@ -17,6 +17,7 @@ from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
+    NS_PER_US,
     START_SLACK_NS,
     Ns,
     ns_from_unix,
@@ -33,6 +34,11 @@ _CACHED_PATHS: Final = 2048
 
 Vector3: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
+
+
+def _whole_us(time: Ns) -> Ns:
+    """Returns a time rounded to whole microseconds, half of one up."""
+    return (time + NS_PER_US // 2) // NS_PER_US * NS_PER_US
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,10 +89,12 @@ class TimeWindow:
     def asked(self) -> tuple[Ns, Ns]:
         """Returns the inclusive bounds that were asked for, without the tolerance of floats.
 
+        They are whole microseconds, as a float of seconds states them.
+
         Of a window that was clamped to less than the tolerance, its start twice.
         """
-        start = self.start + START_SLACK_NS
-        return start, max(start, self.stop - 1 - AT_OR_BEFORE_SLACK_NS)
+        start = _whole_us(self.start + START_SLACK_NS)
+        return start, max(start, _whole_us(self.stop - 1 - AT_OR_BEFORE_SLACK_NS))
 
     def contains(self, at: Ns) -> bool:
         """Returns whether a time lies inside."""

@@ -111,7 +111,7 @@ def unix_from_text(text: str) -> float:
         read = datetime.fromisoformat(written if _ISO.fullmatch(written) else "")
         seconds = read.timestamp()
     except (ValueError, OverflowError, OSError):
-        raise ValueError("is not a valid time in ISO 8601") from None
+        raise ValueError("is not a valid time in ISO 8601, such as 2026-11-20T14:05:00") from None
     if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:
         raise ValueError(f"is a {_WEEKDAYS[read.weekday()]}, not a {weekday}")
     return seconds

@@ -51,6 +51,14 @@ THINGS: Final[Mapping[str, Vector3]] = {
 """The position of each object (m); nothing moves."""
 
 
+ROOMS: Final[Mapping[str, tuple[float, float, float, float]]] = {
+    "living room": (0.0, _HALL_WEST, 0.0, _NORTH),
+    "hall": (_HALL_WEST, _HALL_EAST, 0.0, _NORTH),
+    "kitchen": (_HALL_EAST, _EAST, 0.0, _NORTH),
+}
+"""The rooms: from and to which x, and from and to which y (m)."""
+
+
 def room_at(x: float) -> str:
     """Returns the name of the room at `x` (the rooms lie in a row from west to east)."""
     if x < _HALL_WEST:

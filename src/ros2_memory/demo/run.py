@@ -144,7 +144,7 @@ def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
         f"  bags     {recorder.directory}\n"
         f"           {options.duration_s:g} s of history in {recorder.splits} files of "
         f"{SPLIT_DURATION_S:g} s, the last one being written\n"
-        f"  server   {url}/sse\n"
+        f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
     )
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import http.client
+import json
 import os
+import shlex
 import socket
 import subprocess
 import sys
@@ -13,7 +15,10 @@ from contextlib import contextmanager
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
+import yaml
+
 from ros2_memory.core.errors import ConfigError, EpisodicError
+from ros2_memory.demo.floor_plan import ROOMS
 from ros2_memory.recorder.process.child import LAUNCHER
 
 if TYPE_CHECKING:
@@ -22,10 +27,13 @@ if TYPE_CHECKING:
 
 HOST: Final = "127.0.0.1"
 LOG_NAME: Final = "server.log"
+PLACES_NAME: Final = "places.yaml"
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
 _UP_WITHIN_S: Final = 30.0
 _DOWN_WITHIN_S: Final = 5.0
 _LOG_LINES_SHOWN: Final = 8
+_LONGEST_REPORT: Final = 1_000_000
+_ANOTHER_PORT: Final = "choose another with --port, or --port 0 for any"
 
 
 def free_port(wanted: int) -> int:
@@ -43,9 +51,7 @@ def free_port(wanted: int) -> int:
     except OSError as error:
         in_use = error.errno == errno.EADDRINUSE
         why = "is in use by another program" if in_use else f"cannot be opened ({error})"
-        raise ConfigError(
-            f"port {wanted} on {HOST} {why}; choose another with --port, or --port 0 for any"
-        ) from error
+        raise ConfigError(f"port {wanted} on {HOST} {why}; {_ANOTHER_PORT}") from error
 
 
 def server_environment(
@@ -65,7 +71,8 @@ def server_environment(
         "XDG_CACHE_HOME": cache,
         "MEMORY_CONFIG_OVERRIDES": (
             f"recorder=none storage=mcap reader.index_refresh_s=1 "
-            f"recording.split_duration_s={split_duration_s:g}"
+            f"recording.split_duration_s={split_duration_s:g} "
+            f"{shlex.quote(f'data.places_file={bag_dir / PLACES_NAME}')}"
         ),
     }
 
@@ -77,12 +84,16 @@ def running_server(
     """Yields a server that answers, and ends it after the block.
 
     Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
-    into a folder that is removed at the end: no one else uses it.
+    into a folder that is removed at the end: no one else uses it. The rooms of the flat are written
+    to `places.yaml` in the bag directory.
 
     Raises:
+        ConfigError: another server answers on the port.
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.
     """
     log_path = bag_dir / LOG_NAME
+    places_path = bag_dir / PLACES_NAME
+    places_path.write_text(yaml.safe_dump({"places": _places()}, sort_keys=False))
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
         environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
         with log_path.open("wb") as log:
@@ -108,9 +119,19 @@ def running_server(
             _end(process)
 
 
+def _places() -> dict[str, object]:
+    """Returns the rooms of the flat as a file of places has them."""
+    return {
+        name: {"x": [from_x, to_x], "y": [from_y, to_y]}
+        for name, (from_x, to_x, from_y, to_y) in ROOMS.items()
+    }
+
+
 def _wait_until_up(process: subprocess.Popen[bytes], port: int, log_path: Path) -> None:
     give_up = time.monotonic() + _UP_WITHIN_S
-    while not _healthy(port):
+    while (answering := _answering(port)) != process.pid:
+        if answering is not None:
+            raise ConfigError(f"port {port} on {HOST} is in use by another server; {_ANOTHER_PORT}")
         code = process.poll()
         if code is not None:
             raise EpisodicError(f"the server ended with exit code {code}{_last_words(log_path)}")
@@ -122,13 +143,21 @@ def _wait_until_up(process: subprocess.Popen[bytes], port: int, log_path: Path) 
         time.sleep(0.05)
 
 
-def _healthy(port: int) -> bool:
+def _answering(port: int) -> int | None:
+    """Returns the process id that the server on a port reports, 0 if it reports none.
+
+    Returns None if no server answers.
+    """
     connection = http.client.HTTPConnection(HOST, port, timeout=2.0)
     try:
         connection.request("GET", "/health")
-        return connection.getresponse().status == http.HTTPStatus.OK
+        reply = connection.getresponse()
+        report = json.loads(reply.read(_LONGEST_REPORT))
+        return int(report["pid"])
     except (OSError, http.client.HTTPException):
-        return False
+        return None
+    except (ValueError, KeyError, TypeError):
+        return 0
     finally:
         connection.close()
 

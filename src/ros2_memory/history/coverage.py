@@ -19,10 +19,10 @@ The first few of each kind are named, and the others counted:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
-from ros2_memory.bag_dir.layout import OWN_FOLDER
+from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
 from ros2_memory.bag_dir.state.lost_file import INTERRUPTIONS, read_losses
 from ros2_memory.bag_dir.state.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
@@ -37,6 +37,7 @@ from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
+    NS_PER_S,
     START_SLACK_NS,
     unix_from_ns,
     unix_rounded_up,
@@ -54,6 +55,9 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
+
+_EDGE_NS: Final = 20 * NS_PER_S
+"""So much of a window may lie before or after the memory without a note on what was recorded."""
 
 
 def note_unread(
@@ -334,6 +338,53 @@ def describe_misdated(faults: Sequence[ClockFault]) -> str:
     """Returns the sentence on bags that a wrong clock dated; the last ones are named."""
     names = [f"{short_name(fault.bag.path)} ({fault.description})" for fault in faults[-MAX_NAMED:]]
     return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
+
+
+def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | None:
+    """Returns between which times nothing was recorded, where all of a window lies in there.
+
+    None before and after the memory. An open end of the window is `MIN_NS` or `MAX_NS`. Bags that a
+    wrong clock dated count as recorded. Returns None where something of the window was.
+    """
+    snapshot = view.snapshot
+    earliest, latest = snapshot.earliest, snapshot.latest
+    if earliest is None or latest is None:
+        return None
+    if any(not is_carried(each.file) for each in snapshot.timeline.overlapping(asked)):
+        return None
+    start, end = asked.asked()
+    if end < earliest:
+        return None, earliest
+    if start > latest:
+        return latest, None
+    gaps = recording_gaps(view)
+    return next((each for each in gaps if each[0] <= start and end <= each[1]), None)
+
+
+def note_unrecorded(view: View, asked: TimeWindow) -> None:
+    """Adds a note on how much of a window was not recorded, up to now, if some was not.
+
+    None where only pauses are missing that are no gap, and as little before and after the memory.
+    """
+    earliest, latest, memory = view.snapshot.earliest, view.snapshot.latest, view.memory
+    if earliest is None or latest is None:
+        return
+    start, end = asked.asked()
+    start = max(start, min(0, earliest))
+    end = min(end, max(start, memory.now(memory.clock.now(), latest)))
+    outside = (min(end, earliest) - start, end - max(start, latest))
+    gaps = [last - first for first, last in recording_gaps(view, TimeWindow(start, end))]
+    missing = sum(max(each, 0) for each in (*outside, *gaps))
+    whole = end - start
+    window = f"between {unix_text(start)} and {unix_text(end)}"
+    if gap_around(view, asked) is not None:
+        view.notes.add(f"nothing was recorded {window}")
+    elif gaps or max(outside) > _EDGE_NS:
+        part = unix_from_ns(max(whole - missing, 0))
+        places = 0 if whole >= 100 * NS_PER_S else 1
+        view.notes.add(
+            f"recorded only {part:.{places}f} of {unix_from_ns(whole):.{places}f} s {window}"
+        )
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:

@@ -21,7 +21,13 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.context import short_name
-from ros2_memory.history.coverage import being_written, note_unread, unix_text
+from ros2_memory.history.coverage import (
+    being_written,
+    gap_around,
+    note_unread,
+    note_unrecorded,
+    unix_text,
+)
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
@@ -295,6 +301,9 @@ def no_data_at(
     detail = [f"no message of {' or '.join(topics)} {when} {unix_text(at)}", *elsewhere]
     if older:
         ago = seconds(at - older.time)
+        if tolerance is not None and ago == seconds(tolerance):
+            # Rounded it would read as near enough.
+            ago = f"{unix_from_ns(at - older.time):.6f} s"
         detail.append(f"the nearest older one is {ago} before it, at {unix_text(older.time)}")
     if newer:
         later = seconds(newer.time - at)
@@ -343,6 +352,40 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     if _is_to_come(view, start):
         detail.append(_to_come(view, start))
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def require_recorded(view: View, asked: TimeWindow) -> None:
+    """Checks that some of a window was recorded: else "never" and "none" would be false.
+
+    An end that is open is `MIN_NS` or `MAX_NS`. Where the start is not, a note says how much of the
+    window was not recorded.
+
+    Raises:
+        NoDataError: nothing of it was.
+    """
+    lies_in = gap_around(view, asked)
+    if lies_in is None:
+        if asked.start > MIN_NS:
+            note_unrecorded(view, asked)
+        return
+    start, end = asked.asked()
+    first, last = lies_in
+    if asked.start <= MIN_NS:
+        when = f"up to {unix_text(end)}"
+    elif asked.stop >= MAX_NS:
+        when = f"after {unix_text(start)}"
+    else:
+        when = f"between {unix_text(start)} and {unix_text(end)}"
+    detail = [f"nothing was recorded {when}"]
+    if first is not None and last is not None:
+        detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
+        reason = between(view, asked)
+    else:
+        reason = beyond(view, start)
+    detail += _advice(view, reason)
+    if _is_to_come(view, start):
+        detail.append(_to_come(view, start))
+    raise with_notes(view, asked, NoDataError(reason, "; ".join(detail)))
 
 
 def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataError:

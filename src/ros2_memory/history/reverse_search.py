@@ -8,23 +8,25 @@ decide which messages count is read, as without a catalogue: the answer is the s
 from __future__ import annotations
 
 import heapq
+import re
 from collections import OrderedDict
 from itertools import chain
 from threading import Lock
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
-from ros2_memory.analysis.conditions import NearPosition, parse_condition, refusal_for
+from ros2_memory.analysis.conditions import Equals, NearPosition, parse_condition, refusal_for
 from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, listed, match_topics
+from ros2_memory.core.text import Reason, abbreviate, listed, match_topics
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
+from ros2_memory.history.transforms import connects
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number
 
@@ -41,8 +43,13 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
-    from ros2_memory.storage.base import Record
+    from ros2_memory.storage.base import Record, Schema
 
+_ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
+_CONSTANT: Final = re.compile(
+    r"^[ \t]*[a-z]+[0-9]*[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)\b", re.MULTILINE
+)
+"""A constant in the text of a message definition, as ROS 2 writes it."""
 _MOST_TEMPLATES: Final = 16
 """Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
@@ -96,14 +103,47 @@ def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, .
 
 
 def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
-    """Returns the note on the frames in which `near_position` compared, where it found nothing."""
+    """Returns the note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
     frames = [(topic, _frames_of(view, topic)) for topic in topics[:_MOST_FRAMES]]
     named = [f"{', '.join(each)} ({topic})" for topic, each in frames if each]
     if not named:
         return ()
-    return (f"near_position compared x and y in the frame of each message: {listed(named)}",)
+    compared = f"near_position compared x and y in the frame of each message: {listed(named)}"
+    return (f"{compared}; {_ELSEWHERE}",)
+
+
+def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) -> bool:
+    """Returns whether positions of other tools' replies are in another frame than `near_position`.
+
+    They are in the map where transforms lead there.
+    """
+    target = view.memory.limits.map_frame
+    if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
+        return False
+    frames = {each for topic in topics[:_MOST_FRAMES] for each in _frames_of(view, topic)}
+    try:
+        return any(each != target and connects(view, (target, each)) for each in sorted(frames))
+    except QueryTimeoutError:
+        return True
+
+
+def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> None:
+    """Checks that positions of the topics are in the frame of a `near_position` that names one.
+
+    Raises:
+        InvalidArgumentsError: those of a topic are not.
+    """
+    test = condition.test
+    asked = test.frame_id if isinstance(test, NearPosition) else None
+    for topic in topics[:_MOST_FRAMES] if asked else ():
+        frames = _frames_of(view, topic)
+        if frames and asked not in frames:
+            raise InvalidArgumentsError(
+                f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
+                f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"
+            )
 
 
 def _frames_of(view: View, topic: str) -> list[str]:
@@ -121,6 +161,19 @@ def _frames_of(view: View, topic: str) -> list[str]:
     frames = {each.frame_id for each in seen if each.place is not None}
     pose = extractor.pose(message, type_name)
     return sorted(filter(None, frames or {own if pose is None else pose.frame_id}))
+
+
+def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
+    """Returns the constants of a message definition whose names have a word, with their values.
+
+    Only the one whose name is the field's and the word, where there is one.
+    """
+    wanted = "_".join(word.upper().split())
+    found = _CONSTANT.findall(schema.text.decode("utf-8", "replace")) if wanted else []
+    whole = {wanted, f"{field.upper()}_{wanted}"}
+    same = [(name, value) for name, value in found if name in whole]
+    some = same or [(name, value) for name, value in found if wanted in name]
+    return [f"{name} = {value}" for name, value in dict.fromkeys(some)]
 
 
 class _Truths:
@@ -159,6 +212,7 @@ class ReverseSearch:
         topics: the recorded topics that match.
 
     Raises:
+        InvalidArgumentsError: the condition names a frame in which a topic has no positions.
         NoDataError: there is no such topic.
     """
 
@@ -166,6 +220,7 @@ class ReverseSearch:
         self._view = view
         self._condition = condition
         self.topics = matching_topics(view, pattern)
+        _require_frame(view, self.topics, condition)
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
         self._truths = _TRUTHS.of(view.memory.extractor, condition)
@@ -250,8 +305,16 @@ class ReverseSearch:
         message = None if found is None else self._view.bags.decode(found)
         if found is None or message is None:
             return None
-        value = self._view.memory.extractor.exact(message, found.record.channel.type)
-        return refusal_for(self._condition, value)
+        schema = found.record.channel.schema
+        refusal = refusal_for(
+            self._condition, self._view.memory.extractor.exact(message, schema.name)
+        )
+        test = self._condition.test
+        if refusal is None or not isinstance(test, Equals) or not test.is_text:
+            return refusal
+        field = (self._condition.field or "").rpartition(".")[2]
+        constants = _constants_named(schema, field, str(test.value))
+        return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
     def _messages(self, part: SearchWindow) -> Iterator[StoredMessage]:
         """Returns the messages of a part, newest first.

@@ -276,7 +276,8 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
 
 def last_window(now: Ns, length: Ns) -> TimeWindow:
     """Returns the window of a length up to now, with the slack of a float of seconds."""
-    return TimeWindow(max(now - length, MIN_NS), min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
+    start = now - length - START_SLACK_NS
+    return TimeWindow(max(start, MIN_NS), min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
 
 
 def search_window(span: TimeRange, now: Ns) -> TimeWindow:

@@ -13,7 +13,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, Undecoda
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.coverage import note_unread, recording_gaps
+from ros2_memory.history.coverage import note_unread, note_unrecorded, recording_gaps
 from ros2_memory.history.driven_path import length_notes, pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.transforms import sessions_of
@@ -74,6 +74,8 @@ def compare(
     asked, other = TimeWindow.from_unix(start_s, end_s), _other(with_start_s, with_end_s)
     reach = min(max(asked.stop, other.stop), memory.clock.now())
     view = open_view(memory, call, reach)
+    for each in (asked, other):
+        note_unrecorded(view, each)
     windows = clamped(view, asked), clamped(view, other)
     frame, things = _things(view, windows, region)
     drives = [drive_in(view, each) for each in windows]

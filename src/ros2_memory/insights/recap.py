@@ -17,7 +17,12 @@ from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
+from ros2_memory.history.coverage import (
+    note_edges,
+    note_unread,
+    note_unrecorded,
+    recording_gaps,
+)
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.history.view import open_span
@@ -106,7 +111,7 @@ def recap_or_before(
     if span.around_s is None:
         return recap(memory, call, span, where=where, frame_id=frame_id, min_score=min_score)
     if where is not None:
-        raise InvalidArgumentsError("where bounds a time, and around is a moment: give one of them")
+        raise InvalidArgumentsError("where cannot be combined with around")
     return before(memory, call, span.around_s, span.before_s, frame_id)
 
 
@@ -135,6 +140,7 @@ def recap(
     """
     region = None if where is None else parse_where(memory.limits.places, where)
     view, window = open_span(memory, call, span)
+    note_unrecorded(view, window)
     start, end = window.asked()
     places = robot_places(view, window, frame_id)
     drive = drive_in(view, window)
@@ -148,7 +154,7 @@ def recap(
     events = [*_stops(drive, places), *_drops(drive), *reported]
     events += [
         Event("gap", begin, until, "nothing was recorded")
-        for begin, until in recording_gaps(view, window)
+        for begin, until in recording_gaps(view, TimeWindow(start, end))
     ]
     events += [*_clock_steps(view, window), *_silences(view, window)]
     events += [_goal(each, start, elapsed) for each in goals_in(view, window, found)]
@@ -189,7 +195,7 @@ def recap(
         answer = _with_way(view, answer, drive)
     else:
         answer = _with_way_there(view, answer, window, there)
-        answer = replace(answer, where=region.name or "where")
+        answer = replace(answer, where=region.shown)
         if stood is not None:
             answer = replace(answer, stood=there.length_of(drive.standstills))
     return replace(answer, notes=view.notes.sentences())

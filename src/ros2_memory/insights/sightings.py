@@ -29,14 +29,14 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.counts.sighting_runs import known_sightings
 from ros2_memory.history.coverage import note_unread, unix_text
-from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
     compared_frames,
     condition_of,
     unasked_limit,
 )
-from ros2_memory.history.transforms import newest_in_session, transform_at
+from ros2_memory.history.transforms import connects, newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.insights.goals import goals_asked
@@ -62,6 +62,8 @@ if TYPE_CHECKING:
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 """The robot may have moved since an older pose."""
+_MOST_TRIED: Final = 5
+"""Messages before the newest of a sighting that are tried for the place of the thing."""
 MAX_COUNTED: Final = 20_000
 """Sightings that are counted over time."""
 
@@ -124,7 +126,9 @@ def find_matches(
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
-    window = clamped(view, search_window(span, now))
+    asked = search_window(span, now)
+    require_recorded(view, asked)
+    window = clamped(view, asked)
     collected = _Sightings(limit, view.snapshot.timeline.is_log, oldest_first=oldest_first)
     scope = Scope(view, window, where, during)
     goals = goals_asked(view, matching_topics(view, topic), condition, scope)
@@ -171,13 +175,16 @@ def find_matches(
     if is_nothing:
         topics = matching_topics(view, topic)
         silences = describe_silences(view, topics, searched)
-        frames = compared_frames(view, topics, condition)
-        for sentence in (*silences, *unasked_limit(condition, min_score), *frames):
+        for sentence in (*silences, *unasked_limit(condition, min_score)):
             view.notes.add(sentence)
-    start = window.start if earliest is None else max(window.start, earliest)
-    end = window.stop if latest is None else min(window.stop, latest)
-    if end < start:  # all of it lies before or behind the memory
-        start, end = window.asked()
+    for sentence in (
+        *compared_frames(view, matching_topics(view, topic), condition),
+        *scope.compared_frames,
+    ):
+        view.notes.add(sentence)
+    start, end = window.asked()
+    start = start if earliest is None else min(max(start, earliest), end)
+    end = end if latest is None else max(min(end, latest), start)
     return Sightings(
         found,
         more=total is None or total > len(found),
@@ -411,7 +418,7 @@ def _sighting(
         messages=matches.messages,
         begun=matches.begun,
         robot=robot,
-        thing=_spot(view, thing, newest, robot),
+        thing=_spot_of(view, condition, matches, robot, thing=thing, frame_id=frame_id),
         matched=matched_texts(condition, value),
         score=None if thing is None else thing.score,
     )
@@ -480,14 +487,70 @@ def _robot(view: View, seen: StoredMessage, frame_id: str | None) -> Pose | None
     return with_place(view, there, found.time, found.bag.recording)
 
 
-def _spot(
-    view: View, thing: Detection | None, found: StoredMessage, robot: Pose | None
+def _spot_of(
+    view: View,
+    condition: Condition,
+    matches: _Matches,
+    robot: Pose | None,
+    *,
+    thing: Detection | None,
+    frame_id: str | None,
 ) -> LabelledPlace | None:
-    """Returns where the thing that matched was: in the map, the robot's frame, or its message's."""
+    """Returns where the thing of a sighting was, by its newest message that can be placed.
+
+    The newest message of all may be newer than the last transform: then one of those just before it
+    counts. A note says where none of them can be placed.
+    """
+    newest = matches.newest
+    spot = _spot(view, thing, newest, robot, frame_id)
+    targets = _targets(view, robot, frame_id)
+    if spot is None or spot.frame_id in targets:
+        return spot
+    try:
+        if not any(connects(view, (each, spot.frame_id)) for each in targets):
+            return spot
+    except QueryTimeoutError:
+        return spot
+    topic = newest.record.channel.topic
+    window = TimeWindow(matches.first, newest.time)
+    extractor = view.memory.extractor
+    before = view.stream.messages([topic], window, newest_first=True)
+    for found in islice(before, _MOST_TRIED):
+        message = view.bags.decode(found)
+        if message is None:
+            continue
+        value = condition.counted(extractor.exact(message, found.record.channel.type))
+        if condition.matches(value):
+            seen = _matching(detections_of(value, extractor.frame(message)), condition)
+            earlier = _spot(view, seen, found, robot, frame_id)
+            if earlier is not None and earlier.frame_id in targets:
+                return earlier
+    view.notes.add(
+        f"the place of the sighting at {unix_text(newest.time)} is in {spot.frame_id}: "
+        f"no transform leads to {' or '.join(targets)} at that time"
+    )
+    return spot
+
+
+def _targets(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str, ...]:
+    """Returns the frames that places are given in, the first that can be had."""
+    if frame_id is not None:
+        return (frame_id,)
+    frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
+    return tuple(dict.fromkeys(filter(None, frames)))
+
+
+def _spot(
+    view: View,
+    thing: Detection | None,
+    found: StoredMessage,
+    robot: Pose | None,
+    frame_id: str | None,
+) -> LabelledPlace | None:
+    """Returns where the thing of a message was: in a frame of `_targets`, or the message's own."""
     if thing is None or thing.place is None:
         return None
-    frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
-    for target in filter(None, frames):
+    for target in _targets(view, robot, frame_id):
         if target == thing.frame_id:
             return LabelledPlace(thing.label, thing.place, target)
         try:

@@ -26,7 +26,7 @@ from ros2_memory.analysis.motion.trajectory import (
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.counts.segment_fold import SegmentFold
-from ros2_memory.history.coverage import note_edges, note_unread, unix_text
+from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded, unix_text
 from ros2_memory.history.driven_path import POSES, add_poses
 from ros2_memory.history.no_data import (
     no_data_between,
@@ -87,6 +87,7 @@ def driven_inside(
     way = driven_way(view, name, window)
     if way is None:
         raise no_data_between(view, (name,), window)
+    note_unrecorded(view, window)
     inside = times_in_region(view, region, window)
     totals, waypoints = way.totals(inside), way.waypoints(inside, max_waypoints)
     elapsed = elapsed_in(view, window)
@@ -98,7 +99,7 @@ def driven_inside(
     return DrivenInside(
         name,
         frame_id or way.frames[0],
-        region.name or "where",
+        region.shown,
         len(inside),
         sum(elapsed.between(each.start, each.stop) for each in inside),
         inside[0].start if inside else None,

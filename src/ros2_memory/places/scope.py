@@ -11,7 +11,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.reverse_search import ReverseSearch, condition_of
+from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.where import parse_where, times_inside
 
@@ -59,6 +59,11 @@ class Scope:
             inside = times_in_region(view, region, window)
             self._inside = [(each.start, each.stop) for each in inside]
         self._states = None if during is None else _States(view, during)
+
+    @property
+    def compared_frames(self) -> tuple[str, ...]:
+        """The note on the frames in which the other condition compared positions, if it did."""
+        return () if self._states is None else self._states.compared_frames
 
     @property
     def is_bounded(self) -> bool:
@@ -133,6 +138,11 @@ class _States:
         self._known = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._values: list[bool] = []
+
+    @property
+    def compared_frames(self) -> tuple[str, ...]:
+        """The note on the frames in which the condition compared positions, if it did."""
+        return compared_frames(self._view, self._search.topics, self._condition)
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message then met the condition; False without one."""

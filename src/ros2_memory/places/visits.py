@@ -37,7 +37,7 @@ from ros2_memory.history.driven_path import (
     positions_of,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.no_data import require_recorded, resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
@@ -96,6 +96,7 @@ def visits(
     wall = memory.clock.now()
     view = open_view(memory, call, wall)
     window = search_window(TimeRange(start_s, end_s), wall)
+    require_recorded(view, window)
     topic = resolve_pose_topic(view)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
@@ -174,7 +175,7 @@ def asked_place(
     x, y = point
     if where is not None:
         if x is not None or y is not None:
-            raise InvalidArgumentsError("where is a place, and x and y are another: give one")
+            raise InvalidArgumentsError("give either where or x and y")
         return parse_where(limits.places, where, radius)
     if x is not None and y is not None:
         return Where(Circle(x, y, radius))

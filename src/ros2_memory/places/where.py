@@ -41,6 +41,18 @@ class Where:
     frame_id: str | None = None
     name: str | None = None
 
+    @property
+    def shown(self) -> JsonValue:
+        """The argument as a reply repeats it: a place's name, or the bounds."""
+        match self.region:
+            case _ if self.name is not None:
+                return self.name
+            case Circle(x, y, radius_m):
+                return {"x": x, "y": y, "radius_m": radius_m}
+            case region:
+                min_x, max_x, min_y, max_y = region.bounds
+                return {"x": [min_x, max_x], "y": [min_y, max_y]}
+
 
 def parse_where(
     places: Sequence[Place], value: JsonValue, default_radius_m: float | None = None
@@ -81,7 +93,7 @@ def _named(places: Sequence[Place], name: str) -> Where:
         if " ".join(place.name.split()).casefold() == asked:
             return Where(place.region, place.frame_id, place.name)
     known = ", ".join(sorted(each.name for each in places))
-    listed = f"there are: {known}" if known else f"none are named in {PLACES_SETTING}"
+    listed = f"there are: {known}" if known else f"none are named in {PLACES_SETTING}; {_EXPECTED}"
     raise InvalidArgumentsError(f"where: no place is named {abbreviate(name)}; {listed}")
 
 

@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
-from starlette.responses import PlainTextResponse
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import LogThrottle, get_logger
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 HEALTH_PATH: Final = "/health"
+MCP_PATH: Final = "/mcp"
 RECORDING_PATH: Final = "/health/recording"
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 AUTHENTICATED: Final = "ros2_memory.authenticated"
@@ -61,8 +62,10 @@ _SAME_SITE: Final = frozenset({"same-origin", "none"})
 """Values of Sec-Fetch-Site for a page of this server, or no page at all."""
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
 _SCHEME: Final = b"bearer "
+_REFUSED: Final = -32_001
+"""The code of a JSON-RPC error that a server defines itself."""
 _MISSING: Final = "A token is needed: send it as Authorization: Bearer TOKEN.\n"
-_QUESTIONS: Final = ("/sse", "/messages/", "/mcp")
+_QUESTIONS: Final = ("/sse", "/messages/", MCP_PATH)
 """How the paths begin that a limited token may use."""
 _FORBIDDEN: Final = PlainTextResponse(
     "The token is for questions about some robots alone.\n", status_code=403
@@ -140,7 +143,8 @@ class TokenGate:
             await self._app({**scope, AUTHENTICATED: False}, receive, send)
         else:
             self._log_refused(scope, is_wrong=bool(shown))
-            await _unauthorized(is_wrong=bool(shown))(scope, receive, send)
+            refusal = _unauthorized(is_wrong=bool(shown), speaks_mcp=scope["path"] == MCP_PATH)
+            await refusal(scope, receive, send)
 
     def _checked(self, header: bytes) -> tuple[bool, frozenset[str] | None]:
         """Returns whether a header has a token of this server, and the robots that it is for."""
@@ -169,14 +173,18 @@ def _digest(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
 
 
-def _unauthorized(*, is_wrong: bool) -> PlainTextResponse:
-    """Returns a 401 as in RFC 6750, section 3: with an error code only where a token was sent."""
+def _unauthorized(*, is_wrong: bool, speaks_mcp: bool) -> Response:
+    """Returns a 401 as in RFC 6750, section 3: with an error code only where a token was sent.
+
+    A client of MCP gets a JSON-RPC error, whose message it can show.
+    """
     challenge = 'Bearer realm="ros2-memory"' + (', error="invalid_token"' if is_wrong else "")
-    return PlainTextResponse(
-        _WRONG if is_wrong else _MISSING,
-        status_code=401,
-        headers={"WWW-Authenticate": challenge},
-    )
+    headers, why = {"WWW-Authenticate": challenge}, _WRONG if is_wrong else _MISSING
+    if not speaks_mcp:
+        return PlainTextResponse(why, status_code=401, headers=headers)
+    error = {"code": _REFUSED, "message": why.rstrip()}
+    body = {"jsonrpc": "2.0", "id": None, "error": error}
+    return JSONResponse(body, status_code=401, headers=headers)
 
 
 class ForgeryGuard:

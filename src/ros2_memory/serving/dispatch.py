@@ -30,7 +30,7 @@ from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
-from ros2_memory.serving.fair_queue import FairQueue
+from ros2_memory.serving.fair_queue import STOPPING, FairQueue
 from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.reply_size import to_json_text
@@ -240,6 +240,8 @@ class Dispatcher:
 
     def _timeout(self, name: str, wait: _Wait) -> EpisodicError:
         """Returns why there is no answer when the time of a call is up."""
+        if self._stopping.is_set():
+            return BusyError(STOPPING)
         if wait.ended_s is None:
             return BusyError(
                 f"{name} waited {self._call_timeout_s:g} s behind other calls and was not "
@@ -267,6 +269,9 @@ class Dispatcher:
         except NoDataError as error:
             return f"{error.code}: {error.reason}", self._replies.error(error)
         except QueryTimeoutError as error:
+            if self._stopping.is_set():
+                stopping = BusyError(STOPPING)
+                return stopping.code, self._replies.error(stopping)
             noted = QueryTimeoutError(f"{error}{wait.note()}", error.searched_back_to)
             return noted.code, self._replies.error(noted)
         except EpisodicError as error:

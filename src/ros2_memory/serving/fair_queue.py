@@ -25,6 +25,8 @@ T = TypeVar("T")
 _Turn: TypeAlias = "asyncio.Future[None]"
 """Done when a waiting query may begin; has an exception when it is refused."""
 
+STOPPING: Final = "the server is stopping; ask again when it runs again"
+_NO_THREAD: Final = "the machine starts no more threads for the server; ask again later"
 MOST_WAITING: Final = 256
 """Queries that may wait in one queue. Each holds its arguments in memory."""
 
@@ -40,6 +42,7 @@ class FairQueue:
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix=name)
         self._at_once = threads
         self._most_waiting = most_waiting
+        self._stopped = False
         self._waiting: dict[Hashable, deque[_Turn]] = {}
         self._running: Counter[Hashable] = Counter()
 
@@ -55,6 +58,7 @@ class FairQueue:
 
     def stop(self) -> None:
         """Accepts no more queries, and ends the threads when they are done."""
+        self._stopped = True
         self._threads.shutdown(wait=False)
 
     async def run(self, client: Hashable, query: Callable[[], T]) -> T:
@@ -73,10 +77,7 @@ class FairQueue:
             running = self._threads.submit(context.run, query)
         except RuntimeError as error:
             self._release(client)
-            raise BusyError(
-                "the server takes no questions, because it is stopping or out of threads; "
-                "ask again later"
-            ) from error
+            raise BusyError(STOPPING if self._stopped else _NO_THREAD) from error
         running.add_done_callback(lambda _: _call_soon(loop, partial(self._release, client)))
         return await asyncio.wrap_future(running)
 

@@ -5,6 +5,7 @@ The reply stays small whatever is wrong: all faults are counted, and the newest 
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -128,7 +129,9 @@ class FleetHealth:
         ]
         robots: JsonObject = {}
         for name in self._robots:
-            robots[name] = {key: value for key, value in reports[name].items() if key != "version"}
+            robots[name] = {
+                key: value for key, value in reports[name].items() if key not in {"version", "pid"}
+            }
         return _status(self._version, problems, {"robots": robots})
 
 
@@ -231,7 +234,7 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
     state: JsonObject = (
         {"status": "degraded", "problems": [*problems]} if problems else {"status": "ok"}
     )
-    return {**state, "version": version, **shown}
+    return {**state, "version": version, "pid": os.getpid(), **shown}
 
 
 def _short(text: str) -> str:

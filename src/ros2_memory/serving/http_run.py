@@ -9,6 +9,7 @@ import uvicorn
 
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.sd_notify import READY, STOPPING, notify
+from ros2_memory.serving.auth import MCP_PATH
 from ros2_memory.serving.connection_limits import ACCEPTED_AT_ONCE, BoundedConnection
 from ros2_memory.serving.listen import BACKLOG, bound
 from ros2_memory.serving.web_app import STREAM_PATH
@@ -60,7 +61,14 @@ class _Listener(uvicorn.Server):
             each.listen(BACKLOG)
             host, port = each.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
-            log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)
+            site = f"http://{shown}:{port}"
+            log.info(
+                "listening",
+                url=f"{site}{STREAM_PATH}",
+                mcp_url=f"{site}{MCP_PATH}",
+                host=host,
+                port=port,
+            )
         notify(READY)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

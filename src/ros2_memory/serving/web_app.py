@@ -20,6 +20,7 @@ from starlette.routing import Route
 from ros2_memory.serving.auth import (
     AUTHENTICATED,
     HEALTH_PATH,
+    MCP_PATH,
     RECORDING_PATH,
     ForgeryGuard,
     TokenGate,
@@ -48,7 +49,6 @@ GRACE_S: Final = 0.4
 THREADS: Final = 4
 """For work in the background, such as scans. anyio keeps an idle thread for a while."""
 
-_MCP_PATH: Final = "/mcp"
 _SESSION_HEADER: Final = "mcp-session-id"
 _INITIALIZE: Final = b'"initialize"'
 _PROGRESS: Final = b'"progressToken"'
@@ -132,7 +132,7 @@ def web_app(
 
     routes = [
         *streams.routes,
-        Route(_MCP_PATH, McpEndpoint(plain.handle_request, streaming.handle_request)),
+        Route(MCP_PATH, McpEndpoint(plain.handle_request, streaming.handle_request)),
         Route(HEALTH_PATH, show_health, methods=["GET"]),
         Route(RECORDING_PATH, show_recording, methods=["GET"]),
         *(page or ()),
@@ -281,7 +281,7 @@ class SessionIds:
         """Handles an ASGI connection."""
         is_post = scope["type"] == "http" and scope["method"] == "POST"
         has_session = any(name == _SESSION_HEADER.encode() for name, _ in scope.get("headers", ()))
-        if not is_post or scope["path"] != _MCP_PATH or has_session:
+        if not is_post or scope["path"] != MCP_PATH or has_session:
             await self._app(scope, receive, send)
             return
         initializes = False

@@ -15,6 +15,7 @@ from ros2_memory.core.regions import place_at
 from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
+from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
@@ -68,6 +69,7 @@ def find_things(
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     now = memory.now(wall, view.snapshot.latest)
     asked_for = search_window(span, now)
+    require_recorded(view, asked_for)
     window = clamped(view, asked_for)
     lowest = limits.min_score if min_score is None else min_score
     if lowest > 1:
@@ -338,4 +340,5 @@ def _notes(
         close = [each for each in names if asked in each or each in asked]
         close += difflib.get_close_matches(asked, names, 3)
         shown = [*dict.fromkeys(close)] or names
-        yield f"no detector reported {abbreviate(label)}; there are: {listed(shown)}"
+        meant = f"; did you mean {close[0]}?" if close else ""
+        yield f"no detector reported {abbreviate(label)}; there are: {listed(shown)}{meant}"

@@ -53,6 +53,11 @@ LONGEST_REASON_S: Final = 60.0
 """How far before a time `recap` looks for changes (`around`)."""
 
 
+_RELATIVE: Final = ("ago", "now")
+"""How texts end that are times before now."""
+_AGO: Final = "for a time before now give seconds_ago, seconds or last_s, where a tool has it"
+
+
 def _as_list(value: object) -> object:
     """Returns a list of names, which planners also send as JSON text or as one bare name."""
     if isinstance(value, str):
@@ -67,7 +72,12 @@ def _read_time(value: object) -> object:
     """Returns Unix seconds for a text that is a time; anything else as it is."""
     if not isinstance(value, str):
         return value
-    seconds = unix_from_text(value)
+    try:
+        seconds = unix_from_text(value)
+    except ValueError as error:
+        if not value.strip().endswith(_RELATIVE):
+            raise
+        raise ValueError(f"{error}; {_AGO}") from None
     if seconds > LATEST_UNIX_S:
         raise ValueError("is after the year 2262, up to which times are recorded")
     return seconds
@@ -236,7 +246,7 @@ _SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path to test."
 
 _By: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place"],
-    Field(description="Count for each, local time: {columns, rows}."),
+    Field(description="One row per local day, hour, weekday, or place."),
 ]
 
 
@@ -300,7 +310,7 @@ class RecapTime(TimeArgument):
     """A window that ends now, a window between two times, or the seconds before a time."""
 
     replaces = "span"
-    text = "in the last_s seconds, between two times, or before one"
+    text = "in the last_s seconds, between two times, or around a moment"
     either = ("last_s", "start", "around")
     last_s: Annotated[_Positive, Field(examples=[60])] | None = None
     start_s: _Time | None = Field(default=None, alias="start", examples=[1784023200])
@@ -308,7 +318,7 @@ class RecapTime(TimeArgument):
     around_s: _Time | None = Field(
         default=None,
         alias="around",
-        description="What changed before then.",
+        description="A moment: what changed shortly before and after it.",
         examples=[1784023230],
     )
     before_s: Annotated[
@@ -498,9 +508,9 @@ class MatchesArguments(ConditionArguments):
     )
     start_s: _Time | None = Field(default=None, alias="start")
     end_s: _Time | None = Field(default=None, alias="end")
-    oldest_first: Annotated[bool, Field(strict=True, description="List the first; count all.")] = (
-        False
-    )
+    oldest_first: Annotated[
+        bool, Field(strict=True, description="Oldest sightings first, with total.")
+    ] = False
     limit: _Limit = 5
     by: _By | None = None
     where: _Where | None = None

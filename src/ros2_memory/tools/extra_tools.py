@@ -32,7 +32,7 @@ _SIGHTINGS = ToolDeclaration(
     "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
     "goal: failed, aborted, "
     'succeeded. while: {{"topic": "/is_docked", "condition_type": '
-    '"equals", "value": false}} requires a condition on another topic too. '
+    '"equals", "value": false}} counts only while another topic meets a condition. '
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
     "position then, place: of the thing, score}}], total}}.",
@@ -47,14 +47,14 @@ _RECAP = ToolDeclaration(
     "What happened {when}: path, stops, speed drops, things in view, toggled booleans, goals, "
     "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
     "duration_s, text, in, score, before: what changed in the 10 s before}}], counts}}. With "
-    "around: {{before: [{{text, s_before}}], after, nearest first, recorded, robot, state}}.",
+    "around: {{before: [{{text, s_before}}], after (5 s), nearest first, recorded, robot, state}}.",
     RecapArguments,
     recap_or_before,
     blocking=True,
 )
 _STATUS = ToolDeclaration(
     (ToolName("memory_status", "State of the memory"),),
-    "Whether the recorder runs, how old the newest data is, which topics fell silent and when, "
+    "Whether the recorder runs, how old the newest data is, topics that fell silent, "
     "damaged files, how many days of data the disk budget holds, and the newest saved moments.",
     NoArguments,
     memory_status,
@@ -83,7 +83,8 @@ _THINGS = ToolDeclaration(
 _COMPARE = ToolDeclaration(
     (ToolName("compare", "Differences"),),
     "Differences between two time windows: things that moved, appeared, or were not seen again; "
-    "path, standstills, minutes in places, errors, silences. Equal values are left out. Reply: "
+    "path, standstills, minutes in places, errors, silences. Things go from the earlier "
+    "window to the later. Values within a tenth count as equal. Reply: "
     "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "
     "movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
     "farthest_apart, minutes, errors, silent_s}}.",

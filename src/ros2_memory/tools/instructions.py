@@ -42,8 +42,8 @@ Clocks, maps and frames of robots may differ: pass where by name.
 _REST: Final = """\
 - Positions are in metres, yaw_deg counter-clockwise from x, in frame_id ({pose_topic}: origin \
 usually where the robot was switched on; not a map). get_transform_* relates frames.
-- notes list what was thinned, skipped or estimated: report what matters. Narrow large values with \
-fields. Call tools marked Blocking one at a time.
+- notes list what was thinned, skipped or estimated: report what matters. Pass fields to get \
+only the parts you need. Call tools marked Blocking one at a time.
 """
 
 

@@ -190,6 +190,8 @@ def _match(answer: results.Match) -> JsonObject | None:
         "topic": found.topic,
         "type": found.type,
     }
+    if found.frame_id:
+        reply["frame_id"] = found.frame_id
     return with_notes(reply, _distinct(found.notes, answer.notes), found.age)
 
 
@@ -206,6 +208,10 @@ def _value_when(answer: results.ValueWhen) -> JsonObject | None:
         "condition_topic": matched.topic,
         "value_topic": None if held is None else held.topic,
     }
+    if matched.frame_id:
+        reply["matched_frame_id"] = matched.frame_id
+    if held is not None and held.frame_id:
+        reply["frame_id"] = held.frame_id
     if held is not None and held.latched:
         reply |= {"value_latched": True, "value_age_s": seconds(held.age or 0)}
     notes = _distinct(matched.notes, () if held is None else held.notes, answer.notes)
@@ -328,10 +334,9 @@ def _before(answer: results.Before) -> JsonObject:
     }
     if answer.more:
         reply["more"] = answer.more
-    if answer.after:
-        reply["after"] = [
-            {"text": each.text, "s_after": round(seconds(-each.before), 1)} for each in answer.after
-        ]
+    reply["after"] = [
+        {"text": each.text, "s_after": round(seconds(-each.before), 1)} for each in answer.after
+    ]
     reply["recorded"] = [*answer.recorded]
     if answer.robot is not None:
         robot = {**planar_pose(answer.robot), "frame_id": answer.robot.frame_id or None}

@@ -114,7 +114,7 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
 _DECLARATIONS = (
     ToolDeclaration(
         (ToolName("list_recorded_topics", "Recorded topics"),),
-        "Lists every recorded topic. Call this first if you do not know a topic's name. "
+        "Lists every recorded topic. Call it first if unsure of a name. "
         "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; if there are too "
         "many, the busiest.",
         TopicListArguments,
@@ -131,7 +131,7 @@ _DECLARATIONS = (
     ToolDeclaration(
         _at_and_ago("topic", "A topic's value", at="at_time"),
         "A topic's value {when}: its newest message at or before then, at most tolerance_s old "
-        "(default {tolerance}, too little for slow topics; latched topics: any age). "
+        "(default {tolerance}, too little for slow topics; latched: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
         at_each(queries.topic_value),
@@ -184,8 +184,8 @@ _DECLARATIONS = (
     ToolDeclaration(
         (ToolName("find_last_match", "Last match"),),
         "When a condition was last true, in all history. Reply: {{timestamp, value, topic, type, "
-        "age_s}}, or null if never ({{timestamp: null, value: null, notes}} if something could not "
-        "be read).",
+        "frame_id, age_s}}, or null if never ({{timestamp: null, value: null, notes}} if something "
+        "could not be read).",
         LastMatchArguments,
         queries.find_last_match,
         blocking=True,
@@ -195,7 +195,7 @@ _DECLARATIONS = (
         (ToolName("get_value_when", "A topic when another matched"),),
         "The value of value_topic when condition_topic last met a condition, "
         "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
-        "value_timestamp, condition_topic, value_topic}}, or null as find_last_match.",
+        "value_timestamp, condition_topic, value_topic, frame_id}}, or null as find_last_match.",
         ValueWhenArguments,
         queries.value_when,
         blocking=True,

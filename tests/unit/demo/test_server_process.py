@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 import socket
+import threading
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.demo.run import DemoOptions, run_demo
-from ros2_memory.demo.server_process import free_port, server_environment
+from ros2_memory.demo.server_process import free_port, running_server, server_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@contextmanager
+def serving(server: HTTPServer) -> Iterator[None]:
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        thread.join()
 
 
 def test_any_free_port_is_found() -> None:
@@ -22,6 +40,25 @@ def test_a_port_in_use_is_refused_with_its_number_and_the_way_out() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"):
             free_port(port)
+
+
+def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_path: Path) -> None:
+    class Theirs(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(b'{"status": "ok", "pid": 1}')
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Theirs) as theirs, serving(theirs):
+        port = theirs.server_port
+        with (
+            pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"),
+            running_server(tmp_path, port, split_duration_s=5.0),
+        ):
+            pass
 
 
 @pytest.mark.parametrize("port", [-1, 65536])

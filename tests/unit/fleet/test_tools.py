@@ -30,6 +30,7 @@ from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import FixedClock
 from tests.support.fleets import (
+    LENGTH_S,
     NOW,
     SEEN,
     START_S,
@@ -119,6 +120,24 @@ def test_a_robot_that_is_named_answers_as_alone_with_its_name(folder: Path, name
         assert found == expected
     else:
         assert found == {"robot_name": "r2", **expected}
+
+
+@pytest.mark.parametrize("tool", ["find_matches", "find_things", "visits"])
+def test_a_robot_that_recorded_nothing_then_is_named_and_the_others_answer(
+    tmp_path: Path, tool: str
+) -> None:
+    for name, shift_s in (("early", 0), ("late", 300)):
+        write_robot(replace(seeded(name), start_s=START_S + shift_s), tmp_path / name)
+    fleet = fleet_over(tmp_path, ("early", "late"), shared_map=True)
+    asked_of: dict[str, dict[str, object]] = {"find_matches": LAST, "visits": {"x": 1, "y": 2}}
+    given = asked_of.get(tool, {})
+    window = {"start": START_S, "end": START_S + LENGTH_S}
+    found = reply(fleet, tool, {**given, **window})
+    assert "error" not in found
+    [note] = [each for each in found["notes"] if each.startswith("no answer of")]
+    assert note.startswith("no answer of late: nothing was recorded between")
+    nobody = reply(fleet, tool, {**given, "start": START_S + 200, "end": START_S + 250})
+    assert (nobody["error"], nobody["reason"]) == ("no_data", "outside_range")
 
 
 def test_never_of_a_robot_that_is_named_is_an_object(folder: Path) -> None:

@@ -17,7 +17,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, boolean, detections, odom, write_mcap
+from tests.support.bags import Msg, battery, boolean, detections, odom, write_mcap
 from tests.support.memories import memory_of, recalling
 from tests.support.noting_reader import NotingReader
 
@@ -55,6 +55,16 @@ def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
     memory = recalling(memory_of(bag_dir, reader=reader), bag_dir)
     reader.asked.clear()
     return memory, reader
+
+
+def test_a_text_for_a_number_is_refused_with_the_constants_of_that_name(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.5)])
+    asked = (memory_of(tmp_path), Call(), "/battery_state", "equals")
+    with pytest.raises(InvalidArgumentsError, match=r"POWER_SUPPLY_STATUS_CHARGING = 1$"):
+        queries.find_last_match(*asked, "charging", field="power_supply_status")
+    with pytest.raises(InvalidArgumentsError, match=r"is a number.*: give a number$"):
+        queries.find_last_match(*asked, "asleep", field="power_supply_status")
+    assert queries.find_last_match(*asked, 2, field="power_supply_status").found is not None
 
 
 def last(

@@ -263,4 +263,4 @@ def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path, recalls
         ("warning of c: late", 1.7),
         ("warning of d: late", 2.4),
     ]
-    assert "after" not in before(tmp_path, 50.0, recalls=recalls)
+    assert before(tmp_path, 50.0, recalls=recalls)["after"] == []

@@ -28,6 +28,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
+from ros2_memory.places.scope import WhileCondition
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
@@ -183,12 +184,71 @@ def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recall
     memory = recalling(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
     place: JsonValue = {"x": 9.0, "y": 9.0}
     asked = (memory, Call(), "/odom", "near_position", place)
-    note = "near_position compared x and y in the frame of each message: odom (/odom)"
+    note = (
+        "near_position compared x and y in the frame of each message: odom (/odom); for a place in "
+        "another frame, such as the map, ask visits, or give where"
+    )
     assert note in find_matches(*asked).notes
+    found = find_matches(*asked[:2], "/odom", "near_position", {"x": 1.0, "y": 2.0})
+    assert (len(found.sightings), note in found.notes) == (1, True)
+    during = WhileCondition("/odom", "near_position", place)
+    assert note in find_matches(*asked[:2], "/seen", "contains", "x", during=during).notes
     # By the specification its reply is null where nothing is in doubt.
     assert queries.find_last_match(*asked).notes == ()
     (tmp_path / "broken.mcap").write_bytes(b"no bag")
     assert queries.find_last_match(memory_of(tmp_path), *asked[1:]).notes[-1] == note
+
+
+def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: Path) -> None:
+    moved = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 0.0, 0.0)))
+    write_mcap(tmp_path / "bag.mcap", [moved, odom(BEGIN, 1.0, 2.0)])
+    memory = memory_of(tmp_path)
+    place: JsonValue = {"x": 1.0, "y": 2.0, "frame_id": "odom"}
+    asked = (memory, Call(), "/odom", "near_position")
+    assert len(find_matches(*asked, place).sightings) == 1
+    found = queries.find_last_match(*asked, place).found
+    assert found is not None
+    assert found.frame_id == "odom"
+    elsewhere = queries.find_last_match(*asked, {"x": 6.0, "y": 2.0})
+    assert "in the frame of each message: odom" in elsewhere.notes[-1]
+    there: JsonValue = {"x": 6.0, "y": 2.0, "frame_id": "map"}
+    during = WhileCondition("/odom", "near_position", there)
+    for ask in (
+        lambda: find_matches(*asked, there),
+        lambda: queries.find_last_match(*asked, there),
+        lambda: find_matches(memory, Call(), "/odom", "contains", "x", during=during),
+    ):
+        with pytest.raises(InvalidArgumentsError, match=r'is "map".* is odom on /odom.*visits'):
+            ask()
+
+
+@each_way
+def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
+    tmp_path: Path, recalls: bool
+) -> None:
+    late = BEGIN + 2 * S + 1_800_000
+    placed = [
+        tf(BEGIN + at * S, transform(BEGIN + at * S, *pair, (0.5 * at, 0.0, 0.0)))
+        for at in range(3)
+        for pair in [("map", "odom"), ("odom", "base_link")]
+    ]
+    seen = [detections(at, ["cup"]) for at in (BEGIN, BEGIN + S, BEGIN + 2 * S, late)]
+    poses = [odom(BEGIN + at * S, 0.5 * at, 0.0) for at in range(3)]
+    write_mcap(tmp_path / "bag.mcap", [*placed, *seen, *poses])
+    memory = memory_of(tmp_path)
+    memory = recalling(memory, tmp_path) if recalls else memory
+    for frame_id in (None, "odom"):
+        answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", frame_id=frame_id)
+        [sighting] = answer.sightings
+        assert sighting.last == late
+        assert sighting.thing is not None
+        assert sighting.thing.frame_id == (frame_id or "map")
+        assert not any("is in base_link" in note for note in answer.notes)
+    (tmp_path / "bag.mcap").unlink()
+    far = [detections(late + at * S, ["cup"]) for at in range(60, 70)]
+    write_mcap(tmp_path / "bag.mcap", [*placed, *poses, *far])
+    answer = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "cup")
+    assert any("no transform leads to map" in note for note in answer.notes)
 
 
 def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_a_window_cuts_visits(tmp_path: Path) -> None:
         ({"where": {"x": 1.0}}, "give the name"),
         ({"where": {"x": 1.0, "y": 1.0, "z": 0}}, "has no"),
         ({"where": 5}, "give the name"),
-        ({"where": "corner", "x": 1.0}, "give one"),
+        ({"where": "corner", "x": 1.0}, "give either"),
         ({"x": 1.0}, "both"),
         ({"where": {"x": [0, 1], "y": [0, 1], "radius_m": 1}}, "radius_m and a range"),
         ({"where": "yard"}, "frame_id was"),

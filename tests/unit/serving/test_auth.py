@@ -73,6 +73,8 @@ async def test_who_shows_another_is_told_that_it_is_wrong(path: str, header: str
         'Bearer realm="ros2-memory", error="invalid_token"'
     )
     assert GOOD not in response.text
+    if path == "/mcp":
+        assert response.json()["error"]["message"] == "The token is not the one of this server."
     assert inside.seen == []
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -50,6 +51,7 @@ async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
     assert await Health(memory_at(tmp_path), "1.2.3")() == {
         "status": "ok",
         "version": "1.2.3",
+        "pid": os.getpid(),
         "bags": 0,
         "earliest": None,
         "latest": None,

@@ -249,7 +249,8 @@ def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) 
     write(tmp_path, looked(0, 20, HERE, ("headphones", 3.0, 0.5)))
     reply = ask(tmp_path, label="phone")
     assert reply["things"] == []
-    assert reply["notes"] == ['no detector reported "phone"; there are: headphones']
+    near = "there are: headphones; did you mean headphones?"
+    assert reply["notes"] == [f'no detector reported "phone"; {near}']
 
 
 def test_detections_without_a_place_are_reported(tmp_path: Path) -> None:

@@ -355,9 +355,12 @@ def test_one_moment_or_several_are_given() -> None:
 def test_what_is_no_time_is_told() -> None:
     told = refusal("get_position_at", timestamp="yesterday")
     assert told == (
-        'timestamp was "yesterday", which is not a valid time in ISO 8601; '
+        'timestamp was "yesterday", which is not a valid time in ISO 8601, such as '
+        "2026-11-20T14:05:00; "
         "expected Unix seconds or ISO 8601 text, e.g. 1784023200.5"
     )
+    for text in ("10 s ago", "now"):
+        assert "give seconds_ago, seconds or last_s" in refusal("get_position_at", timestamp=text)
     assert "is a Fri, not a Wed" in refusal("recap", start="Wed 2026-11-20", end=2e9)
     assert "is after the year 2262" in refusal("recap", start=0, end="2300-01-01")
     assert "has 21 times, more than 20" in refusal("get_position_at", timestamps=[1] * 21)
