@@ -142,11 +142,6 @@ class Equals:
         return any(zone_map.can_contain_number(number) for number in self._numbers)
 
     @property
-    def is_text(self) -> bool:
-        """Whether the value is a text that spells neither a boolean nor a number."""
-        return isinstance(self.value, str) and _meaning(self.value) is None
-
-    @property
     def number_bounds(self) -> tuple[float, float] | None:
         """Between which numbers (inclusive) a leaf must be; None where it may be no number."""
         if isinstance(self.value, str) or self._boolean is not None:
@@ -592,19 +587,8 @@ def _refusal_for_position(value: JsonValue) -> str:
 
 
 def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
-    """Returns why these cannot match: numbers never equal a text, or contain a number.
-
-    None where one may.
-    """
+    """Returns why `contains` finds a number in none of these; None where it may."""
     test = condition.test
-    if isinstance(test, Equals) and condition.field is not None and test.is_text:
-        kinds = {type(leaf) for each in targets for leaf in leaves(each)} - {type(None)}
-        if not kinds or kinds - {int, float}:
-            return None
-        return (
-            f"the field {condition.field!r} is a number, and equals asks for the text "
-            f"{abbreviate(test.value)}: give a number"
-        )
     if not isinstance(test, Contains) or not test.is_number:
         return None
     if condition.field is not None and any(

@@ -310,7 +310,7 @@ class ReverseSearch:
             self._condition, self._view.memory.extractor.exact(message, schema.name)
         )
         test = self._condition.test
-        if refusal is None or not isinstance(test, Equals) or not test.is_text:
+        if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
             return refusal
         field = (self._condition.field or "").rpartition(".")[2]
         constants = _constants_named(schema, field, str(test.value))

@@ -213,7 +213,7 @@ def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path)
     [thing] = ask(tmp_path, label="mug", end=BEGIN + 25)["things"]
     assert thing["still_there"] == {"seen_since": BEGIN + 59}
     assert thing["last_seen"] == BEGIN + 29  # bags count as a whole
-    assert ask(tmp_path, label="mug", end=BEGIN - 5)["things"] == []
+    assert ask(tmp_path, label="mug", end=BEGIN - 5)["reason"] == "outside_range"
 
 
 def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
