@@ -94,5 +94,5 @@ def test_an_engine_that_is_not_installed_is_named_with_its_extra(
         lambda name: None if name in {"daft", "duckdb"} else known(name),
     )
     for engine, extra in (("duckdb", "lake"), ("ray", "ray")):
-        with pytest.raises(ConfigError, match=rf"lake\.engine: .*ros2-memory\[{extra}\]"):
+        with pytest.raises(ConfigError, match=rf"lake\.engine: .*pip install '\.\[{extra}\]"):
             build_fleet(load_settings(overrides(tmp_path, engine), {}))

@@ -94,7 +94,7 @@ def test_a_recap_of_a_time_that_cuts_bags_differs_by_the_path_alone(robots: Robo
             each.pop("path_sum_m", None)
             each["notes"] = [note for note in each.get("notes", []) if "noisy" not in note]
         assert found == expected, given
-    assert kinds >= {"errors", "failed goals", "stops", "flips", "goals", "sights of things"}
+    assert kinds >= {"errors", "failed goals", "stops", "on/off changes", "goals", "sightings"}
 
 
 def test_what_changed_before_a_moment_needs_the_battery_alone(robots: Robots) -> None:
@@ -125,7 +125,7 @@ def test_events_are_known_where_digests_are_of_another_version(
     of_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory
     found = reply(fleet_of({"hall": of_lake}), "recap", {**ALL, "robot": "hall"})
     expected = reply(robots.mounted, "recap", {**ALL, "robot": "hall"})
-    reported = ("errors", "failed goals", "flips", "goals", "sights of things")
+    reported = ("errors", "failed goals", "on/off changes", "goals", "sightings")
     assert [found["counts"].get(each) for each in reported] == [
         expected["counts"].get(each) for each in reported
     ]
