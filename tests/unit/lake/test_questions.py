@@ -107,6 +107,8 @@ def test_the_newest_match_of_each_robot_is_the_same(robots: Robots) -> None:
     assert len(expected["matches"]) == 3
     for one, other in zip(expected["matches"], found["matches"], strict=True):
         [mine], [its] = (each.pop("value")["detections"] for each in (one, other))
+        # A lake has no headers: each detection has its own frame.
+        del one["frame_id"]
         assert other == one
         assert (its["label"], its["score"]) == (mine["label"], mine["score"])
 
@@ -163,6 +165,8 @@ def test_chosen_messages_answer_as_those_of_the_bags(
     ):
         found, expected = (reply(each, tool, given) for each in (over_lake, mounted))
         assert "error" not in expected
+        for each in (expected, *expected.get("matches", ())):
+            each.pop("frame_id", None)  # a lake has no headers
         assert rounded(found) == rounded(expected), tool
 
 
