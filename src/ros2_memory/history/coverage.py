@@ -362,7 +362,9 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
 
 
 def note_unrecorded(view: View, asked: TimeWindow) -> None:
-    """Adds a note on how much of a window was not recorded, up to now, if some was not.
+    """Adds a note on how much of a window was not recorded, if some was not.
+
+    It ends now at the latest, or where the memory does if its end is open (`MAX_NS`).
 
     None where only pauses are missing that are no gap, and as little before and after the memory.
     """
@@ -371,7 +373,8 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
         return
     start, end = asked.asked()
     start = max(start, min(0, earliest))
-    end = min(end, max(start, memory.now(memory.clock.now(), latest)))
+    until = latest if asked.stop >= MAX_NS else memory.now(memory.clock.now(), latest)
+    end = min(end, max(start, until))
     outside = (min(end, earliest) - start, end - max(start, latest))
     gaps = [last - first for first, last in recording_gaps(view, TimeWindow(start, end))]
     missing = sum(max(each, 0) for each in (*outside, *gaps))
