@@ -561,12 +561,10 @@ def build_dispatcher(
     from ros2_memory.tools.spec_tools import build_tools, readable_tools
 
     server = settings.server
-    # Where nothing records, nothing would ever save a moment.
-    records = not isinstance(settings.recorder, NullRecorderNode)
     tools = build_tools(
         memory.limits,
         additions=server.tools == "all",
-        writing=server.write_tools and (records or memory.heartbeat() is not None),
+        writing=server.write_tools,
     )
     if fleet is not None:
         from ros2_memory.fleet.tools import fleet_tools

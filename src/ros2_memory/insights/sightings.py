@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.conditions import NearPosition, matched_texts
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -507,7 +508,8 @@ def _spot_of(
     if spot is None or spot.frame_id in targets:
         return spot
     try:
-        if not any(connects(view, (each, spot.frame_id)) for each in targets):
+        near = TimeWindow.around(newest.time, TF_CACHE_NS)
+        if not any(connects(view, (each, spot.frame_id), near) for each in targets):
             return spot
     except QueryTimeoutError:
         return spot
