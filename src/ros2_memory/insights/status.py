@@ -40,6 +40,8 @@ _MIN_MESSAGES: Final = 5
 """A topic with fewer messages has no usual period."""
 _GROWTH_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """Growth is measured over the newest data of this length."""
+_LEAST_GROWTH_NS: Final[Ns] = NS_PER_S
+"""Of less data no growth is reported: some latched messages would make terabytes a day."""
 
 
 def memory_status(memory: Memory, call: Call) -> Status:
@@ -190,7 +192,7 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
             grown += bag.size
             since = min(bag.start, latest if since is None else since)
     span = 0 if latest is None or since is None else latest - since
-    per_day = grown * _GROWTH_NS // span if span > 0 else None
+    per_day = grown * _GROWTH_NS // span if span >= _LEAST_GROWTH_NS else None
     return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes)
 
 

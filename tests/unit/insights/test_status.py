@@ -246,6 +246,16 @@ def test_where_nothing_is_recorded_there_is_no_budget_and_nothing_grows(tmp_path
     assert budget["used_gb"] >= 0
 
 
+def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t, True) for t in range(2)])
+    kept = RetentionLimits(max_total_bytes=10**9, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=kept))
+    beating(tmp_path, RecorderState.RECORDING, 1)
+    answer = memory_status(memory, Call())
+    assert answer.budget.used > 0
+    assert answer.budget.per_day is None
+
+
 def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
     size = (tmp_path / "bag.mcap").stat().st_size
