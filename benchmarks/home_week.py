@@ -94,7 +94,8 @@ def calls(days: int) -> list[Asked]:
     start, end = START_S, START_S + days * DAY
     week: dict[str, JsonValue] = {"start": start, "end": end}
     today: dict[str, JsonValue] = {"start": end - DAY, "end": end}
-    yesterday: dict[str, JsonValue] = {"start": max(end - 2 * DAY, start), "end": end - DAY}
+    begin = max(end - 2 * DAY, start)
+    yesterday: dict[str, JsonValue] = {"start": begin, "end": begin + DAY}
     rectangle: JsonValue = {"x": [7, 12], "y": [5, 9]}
     circle: JsonValue = {"x": 6.0, "y": 8.3, "radius_m": 1.0}
     off_dock = condition(messages.DOCKED.topic, "equals", value=False)

@@ -81,7 +81,7 @@ class TestRefusals:
         edit(own_config / "config.yaml", "max_age_h: 168", "max_age_h: -1")
         message = refusal(
             "data.now=walls",
-            MCP_TRANSPORT="http",
+            MCP_TRANSPORT="carrier_pigeon",
             MEMORY_CONFIG_OVERRIDES="server.call_timeout_s=0",
             MEMORY_CONFIG_DIR=str(own_config),
         )
