@@ -76,14 +76,16 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
     absent = []
     for path in snapshot.metadata_folders:
         try:
-            folder = _folder(bag_dir, Path(path), snapshot.scanned_at)
+            folder = _folder(bag_dir, path, snapshot.scanned_at)
         except FileNotFoundError:
             continue
         except (OSError, ValueError):
             absent.append(Absent(path, unreadable=True))
             continue
         if folder is not None:
-            is_own = _may_be_deleted(own, bag_dir, Path(path))
+            # Asked only where the first file is missing: it takes longer than all else here.
+            begins = folder.present.issuperset(folder.listing.names[:1])
+            is_own = not begins and _may_be_deleted(own, bag_dir, Path(path))
             absent.append(_compare(path, folder, bags[path], messages[path], is_own=is_own))
     return [each for each in absent if each.files or each.messages or each.unreadable]
 
@@ -152,15 +154,16 @@ def _compare(path: str, folder: _Folder, bags: int, messages: int, *, is_own: bo
     return Absent(path, tuple(missing), lost)
 
 
-def _folder(bag_dir: Path, folder: Path, now: int) -> _Folder | None:
+def _folder(bag_dir: Path, folder: str, now: int) -> _Folder | None:
     """Reads a folder with a metadata.yaml; None while that is being written.
 
     Raises:
         OSError: the folder or the file cannot be read.
         ValueError: metadata.yaml is not a regular file.
     """
-    status = os.lstat(folder / METADATA_FILE)
-    changed = folder.stat().st_mtime_ns
+    # As texts: a path for each folder takes longer than to look at it.
+    status = os.lstat(f"{folder}/{METADATA_FILE}")
+    changed = os.stat(folder).st_mtime_ns  # noqa: PTH116
     if not settled(status.st_mtime_ns, now):
         return None
     # A folder that changed just now may change again within the same mtime: it is not cached.
@@ -169,8 +172,8 @@ def _folder(bag_dir: Path, folder: Path, now: int) -> _Folder | None:
 
 
 @lru_cache(maxsize=_MAX_CACHED_FOLDERS)
-def _read_folder(bag_dir: Path, folder: Path, _stamp: tuple[int, int, int]) -> _Folder:
-    with opened(bag_dir, folder) as descriptor:
+def _read_folder(bag_dir: Path, folder: str, _stamp: tuple[int, int, int]) -> _Folder:
+    with opened(bag_dir, Path(folder)) as descriptor:
         names = os.listdir(descriptor)  # noqa: PTH208 - of a descriptor
         listing = read_listing(METADATA_FILE, descriptor)
     present = frozenset(bare_name(name) for name in names if bag_kind(name))
