@@ -40,7 +40,7 @@ from tests.support.ros_recordings import (
     summary_of,
 )
 from tests.support.shared_bags import RECORDED, needs_recorded
-from tests.timing import in_time
+from tests.timing import each_in_time, in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -225,6 +225,7 @@ def test_a_sigint_that_was_ignored_before_it_began_ends_it_all_the_same(
 
 
 @pytest.mark.parametrize("text", ["/od", "^(/odom)$"])
+@each_in_time
 def test_a_topic_is_recorded_whose_name_contains_a_match(
     env: dict[str, str], tmp_path: Path, text: str
 ) -> None:
@@ -273,6 +274,7 @@ def test_its_help_exits_with_0_and_an_unknown_option_with_2(quiet: dict[str, str
     assert wrong.returncode == 2
 
 
+@each_in_time
 def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     with Recording(quiet, tmp_path / "a", "-e", "/odom") as recording:
@@ -281,6 +283,7 @@ def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Pat
     assert recording.said == said
 
 
+@each_in_time
 def test_what_a_killed_recorder_leaves_in_shared_memory_is_removed_with_its_environment(
     real: RealRecorder | None, tmp_path: Path
 ) -> None:
@@ -298,6 +301,7 @@ def test_what_a_killed_recorder_leaves_in_shared_memory_is_removed_with_its_envi
     assert not any(file.exists() for file in own)
 
 
+@each_in_time
 def test_parents_of_the_directory_are_created(quiet: dict[str, str], tmp_path: Path) -> None:
     deep = tmp_path / "bags" / "of" / "a"
     with Recording(quiet, deep, "-e", "/odom") as recording:
@@ -307,6 +311,7 @@ def test_parents_of_the_directory_are_created(quiet: dict[str, str], tmp_path: P
 
 
 @needs_recorded
+@each_in_time
 def test_a_recording_of_nothing_is_as_the_real_one(quiet: dict[str, str], tmp_path: Path) -> None:
     with Recording(quiet, tmp_path / "never", "-e", "/never") as recording:
         recording.await_said("Recording...")
@@ -321,6 +326,7 @@ def test_a_recording_of_nothing_is_as_the_real_one(quiet: dict[str, str], tmp_pa
     assert own == same
 
 
+@each_in_time
 def test_a_silent_robot_leaves_its_last_split_open_until_it_speaks_again(
     quiet: dict[str, str], tmp_path: Path
 ) -> None:
@@ -337,6 +343,7 @@ def test_a_silent_robot_leaves_its_last_split_open_until_it_speaks_again(
     assert [len(in_file(split)) for split in recording.splits()] == [1, 1]
 
 
+@each_in_time
 def test_an_override_is_a_whole_profile_or_is_refused(
     quiet: dict[str, str], tmp_path: Path
 ) -> None:
@@ -363,6 +370,7 @@ def test_an_override_is_a_whole_profile_or_is_refused(
                 assert not recording.directory.exists()
 
 
+@each_in_time
 def test_publishers_that_cannot_meet_what_was_asked_are_not_recorded_and_warned_of(
     quiet: dict[str, str], tmp_path: Path
 ) -> None:
@@ -425,6 +433,7 @@ def test_closed_splits_that_vanish_do_not_disturb_it(started: dict[str, Recordin
     assert metadata(recording.directory)["relative_file_paths"][0] == first.name
 
 
+@each_in_time
 def test_a_full_disk_is_no_error_and_it_goes_on_once_there_is_room(
     env: dict[str, str], tmp_path: Path
 ) -> None:
@@ -494,6 +503,7 @@ def test_whole_files_are_compressed_once_they_are_closed(started: dict[str, Reco
         assert reader.message_count == metadata(recording.directory)["message_count"] > 20
 
 
+@each_in_time
 def test_with_sim_time_nothing_is_recorded_before_the_clock_and_its_time_is_the_log_time(
     quiet: dict[str, str], tmp_path: Path
 ) -> None:

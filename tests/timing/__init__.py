@@ -13,6 +13,9 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import pytest
@@ -98,6 +101,23 @@ def driven(drive: Callable[[Watch], T], judge: Callable[[T], object]) -> T:
 def in_time(test: Callable[[], None]) -> None:
     """Runs what a test does by the clock, and once more where that breaks a promise."""
     driven(lambda _: test(), lambda _: None)
+
+
+def each_in_time(test: Callable[..., None]) -> Callable[..., None]:
+    """Decorates a test with `tmp_path`: each of its drives, by `in_time`, has a folder of its own.
+
+    For tests of programs that find each other over DDS, which on a busy machine may not.
+    """
+
+    @wraps(test)
+    def driven_in_time(**given: object) -> None:
+        def once() -> None:
+            folder = Path(mkdtemp(dir=str(given["tmp_path"])))
+            test(**{**given, "tmp_path": folder})
+
+        in_time(once)
+
+    return driven_in_time
 
 
 def is_broken_promise(error: Exception) -> bool:
