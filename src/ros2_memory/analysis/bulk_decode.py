@@ -39,7 +39,7 @@ class RowTemplate(Protocol):
 
     @property
     def angles(self) -> tuple[str, ...]:
-        """The fields of angles whose ranges are wanted, which only single messages tell exactly."""
+        """Fields of angles whose ranges are wanted: exact only where a message is decoded alone."""
 
     def matching(
         self, first: Record, records: Sequence[Record], among: Sequence[int]
@@ -206,7 +206,7 @@ class JsonRows:
     def _decode(self, record: Record) -> JsonRow:
         message, type_name = self._reader.decode(record), record.channel.type
         shown = self._extractor.shown(message, type_name)
-        # Escaped letters are among what UTF-8 holds as it is.
+        # The text for replies is ASCII with escapes; a column of UTF-8 has the letters themselves.
         text = _AS_JSON(shown.value) if "\\" in shown.text else shown.text
         return JsonRow(text, self._extractor.pose(message, type_name))
 

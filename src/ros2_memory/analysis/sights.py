@@ -194,7 +194,7 @@ class Sights:
             and all(np.array_equal(a, b) for a, b in zip(self.tables, other.tables, strict=True))
         )
 
-    __hash__ = None  # type: ignore[assignment]
+    __hash__ = None  # type: ignore[assignment]  # compared by arrays, so not hashable
 
 
 def no_sights() -> Sights:

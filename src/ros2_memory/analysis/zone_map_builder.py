@@ -176,5 +176,5 @@ def _sort(
         elif isinstance(node, list):
             waiting.extend(node)
         # NaN is equal to nothing; `isnan` takes no whole number that is beyond a float.
-        elif node is not None and node == node:  # noqa: PLR0124
+        elif node is not None and node == node:  # noqa: PLR0124 - false for NaN
             numbers.append(node)

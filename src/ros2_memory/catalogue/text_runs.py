@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MAX_TEXTS: Final = 32
 MAX_TEXT_CHARS: Final = 400
 MAX_MESSAGES: Final = 4_096
-"""Of more texts, longer ones in all, or more messages of a bag nothing is stored."""
+"""Nothing is stored of a bag with more texts, more characters in them, or more messages."""
 
 
 class TextRuns(NamedTuple):
@@ -48,7 +48,7 @@ class TextRunsBuilder:
         self._is_given_up = False
 
     def give_up(self) -> None:
-        """Takes a message whose texts are not known: nothing is any more."""
+        """Stores nothing for this topic, since the texts of a message are unknown."""
         self._is_given_up = True
 
     def add(self, time: Ns, texts: Collection[str]) -> None:
@@ -91,7 +91,7 @@ def decode_text_runs(packed: bytes) -> TextRuns:
     """Decodes what `encode_text_runs` encoded.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: the bytes are not valid.
     """
     head, _, rest = packed.partition(b"\n")
     size, *texts = json.loads(head)

@@ -265,8 +265,8 @@ def _print_help(name: str) -> None:
     print_line(f"ros2-memory ask {name} key=value ... [PATH]\n\n{tool.description}\n")
     for key, each in properties.items() if isinstance(properties, dict) else ():
         shape = each if isinstance(each, dict) else {}
-        told = str(shape.get("description", ""))
+        described = str(shape.get("description", ""))
         if isinstance(examples := shape.get("examples"), list) and examples:
-            told += f" For example {json.dumps(examples[0])}."
+            described += f" For example {json.dumps(examples[0])}."
         needed = "" if isinstance(required, list) and key in required else "?"
-        print_line(f"  {key + needed:<20} {told.strip()}".rstrip())
+        print_line(f"  {key + needed:<20} {described.strip()}".rstrip())

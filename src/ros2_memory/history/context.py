@@ -104,8 +104,8 @@ class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
     `recall` holds digests of the bags. Every answer is the same with it and without. `stated` is
-    given where messages are not there as they were, but what was kept of them: it returns what a
-    message states, or None for one that can be decoded. Positions inside of bags are thinned there.
+    set for a lake, which stores what messages state instead of the messages: it returns that, or
+    None for a message that can be decoded. The poses of a lake are thinned.
     """
 
     index: SnapshotSource

@@ -25,7 +25,7 @@ _KIND_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts
 
 
 class TypedValue(NamedTuple):
-    """A value: JSON of what is no scalar, and the scalars by their paths."""
+    """A message as columns: its scalars by dot-path and type, and `rest`, JSON of all else."""
 
     rest: str
     flags: Mapping[str, Scalar]

@@ -66,7 +66,7 @@ class Hole(NamedTuple):
 
 
 class UnmarkedError(Exception):
-    """A value has a number that is computed of others."""
+    """A value has a number that is computed from others."""
 
 
 class HoledJson(ReplyJson):

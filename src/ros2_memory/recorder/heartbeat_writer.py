@@ -29,7 +29,7 @@ class HeartbeatWriter:
         events: where a heartbeat that cannot be written is reported.
         age_held: describes bags that are kept though their dates make them too old, or None.
         held_back: describes splits that are not served for a fault, or None.
-        failing_rules: describes each rule of what is excluded that cannot be evaluated.
+        failing_rules: why each rule of `recording.exclude_when` that fails cannot be evaluated.
         unshipped: describes bags that were deleted though they were in no lake and had to be, or
             None.
         expected: gives the topics that are to be recorded by name.

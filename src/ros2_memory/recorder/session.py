@@ -195,7 +195,7 @@ class RecordingSession:
 
     @property
     def last_output(self) -> str:
-        """The end of what the child printed besides information, for a report on its death."""
+        """The last warnings and errors of the child, at most 600 characters; not its INFO lines."""
         return " | ".join(self._last_lines)[-600:]
 
     def age_s(self, now: ClockReading) -> float:

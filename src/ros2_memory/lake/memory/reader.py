@@ -64,7 +64,7 @@ _STATES: Final = (
     " WHERE topic_key = $key AND topic = $topic AND kind IN ('events', $kind) AND bag_id = $bag"
 )
 _MOST_EMPTY: Final = 64
-"""Messages that state nothing, of a topic in a bag, which stand for all of them."""
+"""Records made for the messages of a topic in a bag that state nothing, at most."""
 
 
 class LakeReader(BagReader):
