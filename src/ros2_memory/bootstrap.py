@@ -81,7 +81,7 @@ def build_reader(settings: Settings, *, cache_mb: int | None = None) -> BagReade
         ConfigError: it cannot be built.
     """
     own: dict[str, object] = {} if cache_mb is None else {"cache_mb": cache_mb}
-    return _instantiated("storage", settings.storage, BagReader, **own)  # type: ignore[type-abstract]  # only compared with
+    return instantiated("storage", settings.storage, BagReader, **own)  # type: ignore[type-abstract]  # only compared with
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
@@ -93,10 +93,21 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
         ConfigError: it cannot be built.
     """
     node = settings.recorder
-    return _instantiated("recorder", node, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
+    return instantiated("recorder", node, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
 
 
-def _instantiated(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:
+def instantiated(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:
+    """Returns an adapter of a port, built by Hydra of a section of the configuration.
+
+    Args:
+        key: of the section.
+        node: the section.
+        port: what the adapter must be.
+        collaborators: arguments of its constructor that are not plain values.
+
+    Raises:
+        ConfigError: it cannot be built.
+    """
     try:
         # `all`: the adapter receives plain lists, not OmegaConf's. `partial`: collaborators do not
         # go through a configuration, which would copy them.

@@ -44,10 +44,10 @@ def build_fleet(settings: Settings) -> Fleet | None:
     _require_only_reading(settings)
     shared = shared_parts(settings)
     lake = None
-    if settings.lake.engine != "none":
+    if settings.lake.engine is not None:
         from ros2_memory.bootstrap_lake import open_lake
 
-        lake = open_lake(settings)
+        lake = open_lake(settings, settings.lake.engine)
     robots = []
     for name, bag_dir in fleet.robots.items():
         own = robot_settings(settings, name)

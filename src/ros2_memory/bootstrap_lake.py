@@ -12,8 +12,15 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from ros2_memory.bootstrap import build_backfill, build_memory, digest_config, shared_parts
+from ros2_memory.bootstrap import (
+    build_backfill,
+    build_memory,
+    digest_config,
+    instantiated,
+    shared_parts,
+)
 from ros2_memory.bootstrap_fleet import robot_settings
+from ros2_memory.config import RayNode
 from ros2_memory.core.errors import BagError, ConfigError
 
 if TYPE_CHECKING:
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bootstrap import SharedParts
-    from ros2_memory.config import Settings
+    from ros2_memory.config import DuckdbNode, Settings
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.engines.base import LakeEngine
@@ -91,41 +98,43 @@ def _secrets_of(path: Path) -> dict[str, str]:
     return {str(name): str(value) for name, value in found.items()}
 
 
-def open_lake(settings: Settings) -> Lake:
-    """Returns the lake with the engine of the settings, open until this process ends.
+def open_lake(settings: Settings, node: DuckdbNode | RayNode) -> Lake:
+    """Returns the lake with an engine of the settings, open until this process ends.
 
     Raises:
         ConfigError: its place or an extra is missing.
         LakeError: it cannot be opened.
     """
     location = lake_location(settings)
+    engine = engine_of(node)
     from ros2_memory.lake.files import Lake
 
     opened = ExitStack()
     atexit.register(opened.close)
-    catalog = opened.enter_context(location.opened())
-    engine = _engine_of(settings)
     # DuckDB complains at the end about objects that the garbage collector may not look at.
     opened.callback(gc.unfreeze)
     opened.callback(engine.close)
+    catalog = opened.enter_context(location.opened())
     return Lake(catalog, engine, location.namespace, location.translated)
 
 
-def _engine_of(settings: Settings) -> LakeEngine:
-    wanted = {"duckdb": ("duckdb", "lake"), "ray": ("daft", "ray")}
-    name, extra = wanted.get(settings.lake.engine, wanted["duckdb"])
-    if find_spec(name) is None:
+def engine_of(node: DuckdbNode | RayNode) -> LakeEngine:
+    """Returns the engine of the settings.
+
+    Raises:
+        ConfigError: its extra is missing, or it cannot be built.
+    """
+    option, needed, extra = (
+        ("ray", "daft", "ray") if isinstance(node, RayNode) else ("duckdb", "duckdb", "lake")
+    )
+    if find_spec(needed) is None:
         raise ConfigError(
-            f"lake.engine: {settings.lake.engine} needs the optional part of this package (no "
-            f"{name}): pip install '.[{extra}]'"
+            f"lake: {option} needs the optional part of this package (no {needed}): "
+            f"pip install '.[{extra}]'"
         )
-    if settings.lake.engine == "ray":
-        from ros2_memory.lake.engines.ray_engine import RayEngine
+    from ros2_memory.lake.engines.base import LakeEngine
 
-        return RayEngine()
-    from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
-
-    return DuckdbEngine()
+    return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
 
 
 def build_robots(settings: Settings) -> list[RobotBags]:

@@ -335,31 +335,6 @@ class FleetSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
-class LakeSettings:
-    """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
-
-    `engine` is what a fleet's server asks it with; `none` for a server that asks no lake.
-    Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
-    """
-
-    engine: Literal["none", "duckdb", "ray"]
-    warehouse: Annotated[Text, AfterValidator(_without_password)] | None
-    catalog: Literal["sql", "rest"]
-    uri: Annotated[Text, AfterValidator(_without_password)] | None
-    state_dir: AnyPath | None
-    properties: Annotated[dict[Text, Text], AfterValidator(_without_secrets)]
-    secrets_file: AnyPath | None
-    messages: tuple[Text, ...]
-    commit_interval_s: Tolerance
-    grace_h: Tolerance
-
-    def __post_init__(self) -> None:
-        """Refuses a REST catalogue without an address."""
-        if self.catalog == "rest" and self.uri is None:
-            raise ValueError("must have in uri the address of the catalogue, with catalog=rest")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class LoggingSettings:
     """What is logged, and in which format."""
 
@@ -429,6 +404,48 @@ class NullRecorderNode(AdapterNode):
     """`recorder=none`: nothing is recorded."""
 
     target: Literal["ros2_memory.recorder.null.NullRecorder"] = Field(alias="_target_")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class DuckdbNode(AdapterNode):
+    """`lake=duckdb`: DuckDB inside of this process."""
+
+    target: Literal["ros2_memory.lake.engines.duckdb_engine.DuckdbEngine"] = Field(alias="_target_")
+    memory_mb: Count
+    threads: Count | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class RayNode(AdapterNode):
+    """`lake=ray`: Daft on a Ray cluster."""
+
+    target: Literal["ros2_memory.lake.engines.ray_engine.RayEngine"] = Field(alias="_target_")
+    address: Annotated[Text, AfterValidator(_without_password)] | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class LakeSettings:
+    """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
+
+    `engine` is what a fleet's server asks it with; None for a server that asks no lake.
+    Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
+    """
+
+    engine: Annotated[DuckdbNode | RayNode, Field(discriminator="target")] | None
+    warehouse: Annotated[Text, AfterValidator(_without_password)] | None
+    catalog: Literal["sql", "rest"]
+    uri: Annotated[Text, AfterValidator(_without_password)] | None
+    state_dir: AnyPath | None
+    properties: Annotated[dict[Text, Text], AfterValidator(_without_secrets)]
+    secrets_file: AnyPath | None
+    messages: tuple[Text, ...]
+    commit_interval_s: Tolerance
+    grace_h: Tolerance
+
+    def __post_init__(self) -> None:
+        """Refuses a REST catalogue without an address."""
+        if self.catalog == "rest" and self.uri is None:
+            raise ValueError("must have in uri the address of the catalogue, with catalog=rest")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -571,7 +588,7 @@ class Settings:
 
 _NODES: Final = {
     get_args(get_type_hints(node)["target"])[0]: node
-    for node in (McapNode, Rosbag2Node, Ros2BagNode, NullRecorderNode)
+    for node in (McapNode, Rosbag2Node, Ros2BagNode, NullRecorderNode, DuckdbNode, RayNode)
 }
 """The class of an adapter's section by its `_target_`."""
 

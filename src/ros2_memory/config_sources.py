@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from hydra._internal.defaults_list import DefaultsList  # Hydra has no public name for it
 
-GROUPS: Final = ("deployment", "storage", "recorder")
+GROUPS: Final = ("deployment", "storage", "recorder", "lake")
 """The config groups: folders of files of which one each is chosen."""
 INTERFACES_VARIABLE: Final = "ROS_VISION_INTERFACES_PATH"
 

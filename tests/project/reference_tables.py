@@ -17,7 +17,7 @@ import yaml
 from pydantic import TypeAdapter
 
 from ros2_memory.cli.app import COMMANDS, COMMON_EXIT_CODES
-from ros2_memory.config import Ros2BagNode, Rosbag2Node, Settings
+from ros2_memory.config import DuckdbNode, RayNode, Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.tools.arguments import TIME_KINDS
@@ -42,6 +42,13 @@ LEVELS: Final = {
     "fail_once": "error",
     "remark": "warning",
 }
+OPTIONS: Final[Mapping[str, tuple[str, str, type]]] = {
+    "lake/duckdb.yaml": ("lake", "engine", DuckdbNode),
+    "lake/ray.yaml": ("lake", "engine", RayNode),
+    "recorder/ros2bag.yaml": ("recorder", "", Ros2BagNode),
+    "storage/rosbag2.yaml": ("storage", "", Rosbag2Node),
+}
+"""Options of groups that have keys of their own: the section of these, and what holds them."""
 VARIES: Final = {"used_gb", "size_gb", "growth_gb_per_day", "full_in_days", "keeps_days"}
 """Sizes depend on the compressor's version by some bytes, so they are shown and not compared."""
 
@@ -178,8 +185,11 @@ def documented_settings() -> str:
     rows = []
     for key, default, meaning in (
         *_keys(folder / "config.yaml", ""),
-        *_keys(folder / "recorder" / "ros2bag.yaml", "recorder."),
-        *_keys(folder / "storage" / "rosbag2.yaml", "storage."),
+        *(
+            key
+            for option, (group, _, _) in OPTIONS.items()
+            for key in _keys(folder / option, f"{group}.")
+        ),
     ):
         told = meaning.replace(" | ", ", ")
         rows.append([f"`{key}`", _kind(_schema_of(key)), f"`{default}`", told])
@@ -197,12 +207,16 @@ def _keys(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
 
 
 def _schema_of(key: str) -> Mapping[str, Any]:
-    section_name, _, name = key.partition(".")
-    model = {"recorder": Ros2BagNode, "storage": Rosbag2Node}.get(section_name, Settings)
-    schema: Any = TypeAdapter(model).json_schema()
-    if model is Settings:
-        schema = schema["$defs"][schema["properties"][section_name]["$ref"].rpartition("/")[2]]
-    found: Mapping[str, Any] = schema["properties"][name]
+    above, _, name = key.rpartition(".")
+    for group, inner, node in OPTIONS.values():
+        own: Mapping[str, Any] = TypeAdapter(node).json_schema()["properties"]
+        if above == f"{group}.{inner}".rstrip(".") and name in own:
+            break
+    else:
+        schema = TypeAdapter(Settings).json_schema()
+        of_section = schema["properties"][above]["$ref"].rpartition("/")[2]
+        own = schema["$defs"][of_section]["properties"]
+    found: Mapping[str, Any] = own[name]
     return found
 
 
@@ -215,12 +229,11 @@ def configured_keys() -> set[str]:
         if isinstance(members, dict)
         for name in members
     }
-    for group, file in (("recorder", "ros2bag"), ("storage", "rosbag2")):
-        text = (ROOT / "config" / group / f"{file}.yaml").read_text(encoding="utf-8")
-        own = yaml.safe_load(text)
+    for file, (group, inner, _) in OPTIONS.items():
+        own = yaml.safe_load((ROOT / "config" / file).read_text(encoding="utf-8"))
         keys |= {
-            f"{group}.{name}"
-            for name, value in own.items()
+            f"{group}.{inner}.{name}" if inner else f"{group}.{name}"
+            for name, value in (own[inner] if inner else own).items()
             if name != "_target_" and not str(value).startswith("${")
         }
     return keys

@@ -33,7 +33,8 @@ def keys(cls: type, prefix: str = "") -> Iterator[str]:
             yield from keys(kind, f"{name}.")
         else:
             section = name.partition(".")[0]
-            yield section if section in {"storage", "recorder"} else name
+            is_chosen = section in {"storage", "recorder"} or name == "lake.engine"
+            yield section if is_chosen else name
 
 
 @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)

@@ -87,7 +87,7 @@ class TestDefaults:
             },
             "fleet": {"robots": {}, "places": None, "shared_map": False, "tokens": {}},
             "lake": {
-                "engine": "none",
+                "engine": None,
                 "warehouse": None,
                 "catalog": "sql",
                 "uri": None,

@@ -86,7 +86,7 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         seen = f"{location.warehouse}; its newest commit is from {iso_local(committed)}"
         yield in_order("lake", seen)
     # A server that asks the lake ships nothing.
-    if settings.lake.engine == "none":
+    if settings.lake.engine is None:
         yield from _check_writer(location, has_bags=committed is not None)
         for name, bag_dir in settings.fleet.robots.items():
             yield from _check_receipts(name, bag_dir)

@@ -10,9 +10,12 @@ import anyio
 import pytest
 
 from ros2_memory.bootstrap_fleet import build_fleet
-from ros2_memory.config import load_settings
+from ros2_memory.bootstrap_lake import engine_of
+from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.history.context import Call
+from ros2_memory.lake.engines.base import DataFiles
+from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.fleets import SEEN
 from tests.support.lakes import robot_bags, ship, write_bag
@@ -26,7 +29,7 @@ def overrides(folder: Path, engine: str) -> list[str]:
     return [
         "deployment=fleet",
         f"fleet.robots={{{robots}}}",
-        f"lake.engine={engine}",
+        f"lake={engine}",
         f"lake.warehouse={folder / 'lake'}",
     ]
 
@@ -85,6 +88,23 @@ async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: P
     ]
 
 
+def test_an_engine_has_the_settings_of_its_group(tmp_path: Path) -> None:
+    given = [*overrides(tmp_path, "duckdb"), "lake.engine.memory_mb=64", "lake.engine.threads=1"]
+    node = load_settings(given, {}).lake.engine
+    assert isinstance(node, DuckdbNode)
+    engine = engine_of(node)
+    [row] = engine.select(
+        "SELECT current_setting('memory_limit') AS memory, current_setting('threads') AS threads",
+        {"bags": DataFiles(TABLES["bags"].arrow_schema(), (), {})},
+        {},
+    ).to_pylist()
+    engine.close()
+    assert row == {"memory": "64.0 MiB", "threads": 1}
+    with pytest.raises(ConfigError, match=r"^lake\.engine\.address: unknown key; use one of: _tar"):
+        load_settings([*given, "lake.engine.address=auto"], {})
+    assert load_settings(["deployment=fleet", "fleet.robots={r: /r}"], {}).lake.engine is None
+
+
 def test_an_engine_that_is_not_installed_is_named_with_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,5 +114,5 @@ def test_an_engine_that_is_not_installed_is_named_with_its_extra(
         lambda name: None if name in {"daft", "duckdb"} else known(name),
     )
     for engine, extra in (("duckdb", "lake"), ("ray", "ray")):
-        with pytest.raises(ConfigError, match=rf"lake\.engine: .*pip install '\.\[{extra}\]"):
+        with pytest.raises(ConfigError, match=rf"lake: .*pip install '\.\[{extra}\]"):
             build_fleet(load_settings(overrides(tmp_path, engine), {}))

@@ -30,10 +30,10 @@ class DuckdbEngine(LakeEngine):
 
     Args:
         memory_mb: how much memory it may use.
-        threads: how many threads; 0 for one for each core.
+        threads: how many threads; None for one for each core.
     """
 
-    def __init__(self, memory_mb: int = 1024, threads: int = 0) -> None:
+    def __init__(self, memory_mb: int = 1024, threads: int | None = None) -> None:
         settings: dict[str, str | bool | int | float | list[str]] = {
             **_SETTINGS,
             "memory_limit": f"{memory_mb}MiB",
