@@ -168,6 +168,11 @@ def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Grou
             if latest and min(latest.values()) < oldest:
                 latest = {path: last for path, last in latest.items() if last >= oldest}
             belongs = _belongs(each.first, recording, latest)
+            if recording not in latest:
+                # Another recording may have gone on in a new bag, and so in a new group.
+                while len(groups) > 1 and _reaches(groups[-2], oldest, recording):
+                    newest = groups.pop()
+                    groups[-1] += newest
         if belongs:
             groups[-1].append(each)
         else:
@@ -196,6 +201,11 @@ def _belongs(first: Ns, recording: Path, latest: Mapping[Path, Ns]) -> bool:
         first < last if path == recording else first <= last + COPY_HORIZON_NS
         for path, last in latest.items()
     )
+
+
+def _reaches(group: Sequence[BagSpan], oldest: Ns, recording: Path) -> bool:
+    """Whether a bag of another recording ends at a time or after it."""
+    return any(each.last >= oldest and each.bag.recording != recording for each in group)
 
 
 @dataclass(frozen=True, slots=True)
