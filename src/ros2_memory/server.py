@@ -164,7 +164,14 @@ def _parts_of_one(
     return _Parts(
         server,
         Health(memory, package_version(), backfill),
-        partial(_in_background, memory, backfill, settings.reader.index_refresh_s, overrides),
+        partial(
+            _in_background,
+            memory,
+            backfill,
+            settings.reader.index_refresh_s,
+            overrides,
+            has_page=page is not None,
+        ),
         page,
     )
 
@@ -243,15 +250,22 @@ def _helper(overrides: Sequence[str], *options: str) -> list[str]:
 
 
 async def _in_background(
-    memory: Memory, backfill: Backfill, every_s: float, overrides: Sequence[str]
+    memory: Memory,
+    backfill: Backfill,
+    every_s: float,
+    overrides: Sequence[str],
+    *,
+    has_page: bool,
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
     import anyio
 
     from ros2_memory.serving.backfill import keep_backfilled
-    from ros2_memory.serving.health import keep_fresh
+    from ros2_memory.serving.health import keep_fresh, read_listings
 
     async with anyio.create_task_group() as tasks:
+        if has_page:
+            tasks.start_soon(read_listings, memory)
         tasks.start_soon(keep_fresh, memory, every_s)
         tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s)
 

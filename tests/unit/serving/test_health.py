@@ -15,8 +15,9 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.index import listed_splits
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.serving.health import NAMED, Health, keep_fresh
+from ros2_memory.serving.health import NAMED, Health, keep_fresh, read_listings
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
@@ -68,6 +69,23 @@ async def test_the_span_of_the_memory_is_told(tmp_path: Path) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a"), text(T0 + NS_PER_S, "b")])
     reply = await Health(memory_at(tmp_path), "1")()
     assert (reply["bags"], reply["earliest"], reply["latest"]) == (1, 1784023200.0, 1784023201.0)
+
+
+async def test_listings_are_read_before_the_first_question(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    listing = tmp_path / "r" / "metadata.yaml"
+    listing.write_text(
+        "rosbag2_bagfile_information:\n  files:\n    - path: r_0.mcap\n    - path: r_1.mcap\n"
+    )
+    for each in (listing, listing.parent):  # what changed just now is read anew
+        os.utime(each, (T0 / NS_PER_S - 60, T0 / NS_PER_S - 60))
+    memory = memory_at(tmp_path, seconds=3600)
+    await read_listings(memory)
+    monkeypatch.setattr(listed_splits, "read_listing", None)
+    [absent] = listed_splits.absent_splits(memory.index.snapshot(), tmp_path)
+    assert absent.files == ("r_1.mcap",)
 
 
 async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
