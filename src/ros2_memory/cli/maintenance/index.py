@@ -6,13 +6,15 @@ time from the process that answers.
 
 import ctypes
 import json
+import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Annotated, Final
+from typing import Annotated, Final, Protocol
 
 import typer
 
@@ -32,7 +34,7 @@ from ros2_memory.cli.output import progress_bar
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging
-from ros2_memory.core.model import JsonValue
+from ros2_memory.core.model import BagFile, JsonValue
 from ros2_memory.core.text import counted
 from ros2_memory.serving.backfill import Backfill, Progress
 
@@ -42,7 +44,24 @@ NICENESS: Final = 15
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _BATCH: Final = 64
 """Bags digested before the program looks which others closed meanwhile."""
+_SHARED: Final = 512
+"""A second process takes half of more bags than these."""
+_FREE_CORES: Final = 1.5
+"""Cores less the load average, from which on there is room for two."""
+_LOOK_S: Final = 2.0
 _BAR_WIDTH: Final = 40
+
+
+class Worker(Protocol):
+    """Another process that digests its share of the bags."""
+
+    def is_alive(self) -> bool:
+        """Returns whether it goes on."""
+        ...
+
+    def join(self, timeout: float | None = None) -> None:
+        """Waits for its end, at most `timeout` seconds."""
+        ...
 
 
 def index(
@@ -108,7 +127,9 @@ def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None =
             known = progress.closed - progress.waiting
             bar.update(task, completed=known, total=progress.closed)
 
-        return fill_catalogue(backfill, show)
+        missing = len(memory.index.snapshot().bags) - len(backfill.catalogue.paths())
+        with _second_worker(settings, missing) as worker:
+            return fill_catalogue(backfill, show, worker)
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
@@ -117,34 +138,93 @@ def _fill_for_server(settings: Settings, server: int) -> None:
     configure_logging(
         settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
     )
-    backfill = build_backfill(settings, build_memory(settings))
+    fill_catalogue(_low_priority_backfill(settings))
+
+
+def _low_priority_backfill(settings: Settings) -> Backfill:
+    """Returns what fills the catalogue in a process that other programs go before."""
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
-    fill_catalogue(backfill)
+    return build_backfill(settings, build_memory(settings))
+
+
+@contextmanager
+def _second_worker(settings: Settings, missing: int) -> Iterator[Worker | None]:
+    """Runs a second process that digests half of the bags, where many miss and a core is free.
+
+    It ends with the block.
+    """
+    free = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
+    if missing <= _SHARED or free < _FREE_CORES:
+        yield None
+        return
+    # Not forked: SQLite forbids that a connection is used on both sides.
+    worker = multiprocessing.get_context("spawn").Process(
+        target=_digest_second_share, args=(settings, os.getpid()), daemon=True
+    )
+    worker.start()
+    try:
+        yield worker
+    finally:
+        worker.terminate()
+        worker.join()
+
+
+def _digest_second_share(settings: Settings, parent: int) -> None:
+    """Digests the second worker's bags, until none of them waits."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends both
+    # What cannot be digested waits for the first process, which reports it.
+    configure_logging("error", settings.logging.format)
+    if _end_with_parent(parent):
+        _digest(_low_priority_backfill(settings), is_own=lambda bag: is_second(bag.file))
+
+
+def is_second(file: str) -> bool:
+    """Whether a bag is the second worker's: every other one, in no order."""
+    return bool(zlib.crc32(file.encode()) & 1)
 
 
 def fill_catalogue(
-    backfill: Backfill, show: Callable[[Progress], None] = lambda _: None
+    backfill: Backfill,
+    show: Callable[[Progress], None] = lambda _: None,
+    worker: Worker | None = None,
 ) -> Progress:
     """Digests until no bag waits, the newest first, and returns the progress at the end.
 
-    A bag that changed a few seconds ago is left for a later run.
+    A bag that changed a few seconds ago is left for a later run. While a second worker runs, its
+    bags are left to it; it may end at any time.
     """
+    total = 0
+    while worker is not None and worker.is_alive():
+        total += _digest(backfill, show, is_own=lambda bag: not is_second(bag.file))
+        show(backfill.progress())
+        worker.join(_LOOK_S)
+    total += _digest(backfill, show)
+    backfill.prune()
+    backfill.precompute()
+    if total >= _BATCH:
+        backfill.catalogue.compact()
+    return backfill.progress()
+
+
+def _digest(
+    backfill: Backfill,
+    show: Callable[[Progress], None] = lambda _: None,
+    *,
+    is_own: Callable[[BagFile], bool] = lambda _: True,
+) -> int:
+    """Digests until none of the process's own bags waits; returns how many it digested."""
     done, total = 1, 0
     while done:
         progress = backfill.progress()
-        waiting = backfill.waiting()[:_BATCH]
+        waiting = [bag for bag in backfill.waiting() if is_own(bag)][:_BATCH]
         left = backfill.renew(waiting)
         done = len(waiting) - len(left)
         for number, bag in enumerate(left, done):
             show(replace(progress, waiting=progress.waiting - number))
             done += backfill.digest(bag)
         total += done
-    backfill.prune()
-    backfill.precompute()
-    if total >= _BATCH:
-        backfill.catalogue.compact()
-    return backfill.progress()
+    return total
 
 
 def as_object(progress: Progress) -> dict[str, JsonValue]:
