@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Memory
 
 FIRST_S: Final = 2.0
 AGAIN_S: Final = 0.2
@@ -196,6 +197,12 @@ def speeds(settings: Settings, asked: Sequence[Asked]) -> Iterator[Speed]:
             yield pool.apply(speed, (settings, each))
 
 
+def _import_all(settings: Settings, memory: Memory) -> None:
+    """Imports what a server and its first call import, so that forks have it."""
+    server = build_server(settings, memory)
+    asyncio.run(server.dispatcher.answer("get_position_at", {"timestamp": START_S}))
+
+
 def speed(settings: Settings, asked: Asked) -> Speed:
     """Returns how long a call takes the first time, and again; days are those of the robot."""
     os.environ["TZ"] = "UTC"
@@ -308,6 +315,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{bags} bags of {size / 1e6:.0f} MB; digested in {time.process_time() - begun:.0f} s")
     measured: list[Speed] = []
     if not given.no_speed:
+        _import_all(settings, memory)
         print("\n| call | first, s | again, s | processor, s | characters | |")
         print("|---|---|---|---|---|---|")
         chosen = [each for each in calls(scale.days) if given.only in each.words]

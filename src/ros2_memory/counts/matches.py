@@ -162,8 +162,8 @@ class _WithoutLabel:
                 builder.join(TopicEvents(each.first, each.last))
             elif events is not None:
                 builder.join(replace(events, left_out=0))
-        first = min(each.first for each in group.bags)
-        last = max(each.last for each in group.bags)
+        first = group.first
+        last = group.last
         return Digested(builder.events() or NO_EVENTS, first, last)
 
     def _may_have_it(self, digests: SegmentDigests) -> set[int]:

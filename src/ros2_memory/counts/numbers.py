@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.counts.bins import By
     from ros2_memory.counts.field_numbers import FieldNumbers, Numbers, NumberTable
     from ros2_memory.history.bag_fold import Share
+    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.results import BinColumn, Bins
@@ -138,16 +139,19 @@ def _counted_in(
         known = found.get(piece, _Held(0, first, last))
         found[piece] = _Held(known.messages + count, min(known.first, first), max(known.last, last))
 
-    for group in share.groups(view, topic, window):
-        begin = min(each.first for each in group.bags)
-        end = max(each.last for each in group.bags)
-        piece = bisect_right(edges, begin)
-        if group.is_inside and (piece == len(edges) or end < edges[piece]):
-            add(piece, view.count_in(topic, group), begin, end)
-            continue
-        for piece, times in groupby(group.times(), key=partial(bisect_right, edges)):
-            here = [*times]
-            add(piece, len(here), here[0], here[-1])
+    def is_uncut(group: Group) -> bool:
+        begin, end = (bisect_right(edges, at) for at in (group.first, group.last))
+        return group.is_inside and begin == end
+
+    for whole in share.groups(view, topic, window):
+        for group in [whole] if is_uncut(whole) else view.apart(topic, whole):
+            if is_uncut(group):
+                piece = bisect_right(edges, group.first)
+                add(piece, view.count_in(topic, group), group.first, group.last)
+                continue
+            for piece, times in groupby(group.times(), key=partial(bisect_right, edges)):
+                here = [*times]
+                add(piece, len(here), here[0], here[-1])
     return [*found.values()]
 
 

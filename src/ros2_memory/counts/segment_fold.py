@@ -135,7 +135,12 @@ class SegmentFold(Generic[T, R]):
         found: list[Digested[T]] = []
         since: Ns | None = None
         left_unread = False
-        for group in reversed(share.groups(view, topic, window)):
+        groups = (
+            each
+            for group in reversed(share.groups(view, topic, window))
+            for each in (reversed(view.apart(topic, group)) if self._is_cut(group) else (group,))
+        )
+        for group in groups:
             is_usable = group.is_whole and not self._is_cut(group)
             known = stored.of(group) if is_usable else None
             if known is not None and not self._lacks(known[0]):
@@ -147,7 +152,7 @@ class SegmentFold(Generic[T, R]):
                 left_unread = True
                 continue
             if reading.is_over:
-                since = max(each.last for each in group.bags) + 1
+                since = group.last + 1
                 break
             found.extend(reversed([*self._made(view, group, stored)]))
         return (self.reduce(found[::-1]) if found else None), since, left_unread
@@ -176,9 +181,8 @@ class SegmentFold(Generic[T, R]):
         return self.leaves_out is not None and self.leaves_out(digest)
 
     def _is_cut(self, group: Group) -> bool:
-        first = min(each.first for each in group.bags)
-        last = max(each.last for each in group.bags)
-        return last - first > self.cut_ns and self._piece(first) != self._piece(last)
+        is_long = group.last - group.first > self.cut_ns
+        return is_long and self._piece(group.first) != self._piece(group.last)
 
     def _piece(self, at: Ns) -> int:
         return bisect_right(self.edges, at)

@@ -252,8 +252,8 @@ class _Runs:
     def _of_group(self, group: Group, stored: StoredDigests[TextRuns]) -> _Met | None:
         if group.is_whole:
             if not group.may_be_relatched and not self._may_match(group):
-                first = min(each.first for each in group.bags)
-                last = max(each.last for each in group.bags)
+                first = group.first
+                last = group.last
                 return _Met(group, first, last, 1, 0, 0)
             known = stored.of(group)
             if known is not None:

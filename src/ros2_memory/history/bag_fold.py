@@ -167,7 +167,7 @@ def _found_crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, 
         group = next(filter(crosses, groups_of(view.stream, topic, near)), None)
         if group is None:
             return ()
-        last = max(each.last for each in group.bags)
+        last = group.last
         if last <= end:
             return tuple(each for each in group.bags if each.first >= begin)
         end = last

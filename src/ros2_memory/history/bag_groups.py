@@ -53,6 +53,8 @@ class Group:
 
     Attributes:
         bags: in order.
+        first: log time of the first message of the bags, in the window or not.
+        last: of the last one.
         may_be_relatched: whether bags outside of the group decide which of the messages count.
     """
 
@@ -69,6 +71,8 @@ class Group:
         self._topic = topic
         self._window = window
         self.bags = bags
+        self.first = min(each.first for each in bags)
+        self.last = max(each.last for each in bags)
         self.may_be_relatched = may_be_relatched
         self._has_duplicates = may_be_relatched or (
             len(bags) > 1 and len({each.bag.recording for each in bags}) > 1
@@ -84,6 +88,10 @@ class Group:
     def is_whole(self) -> bool:
         """Whether all messages lie in the window, and no crash cut a bag short."""
         return self.is_inside and all(each.bag.state is BagState.CLOSED for each in self.bags)
+
+    def of(self, bag: BagSpan) -> Group:
+        """Returns one bag of it as a group."""
+        return Group(self._stream, self._topic, self._window, [bag])
 
     def messages(self) -> Iterator[StoredMessage]:
         """Returns the messages of the group in log-time order, each one once."""

@@ -11,6 +11,7 @@ import json
 from bisect import bisect_left
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
@@ -33,11 +34,11 @@ from ros2_memory.history.no_data import require_bags
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Sessions
     from ros2_memory.index.timeline import Timeline
 
@@ -101,7 +102,7 @@ class View:
         if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
             return group.count()
         files = {each.bag.file for each in group.bags}
-        count = sum(known.count for each in group.bags for known in each.bag.summary.of(topic))
+        count = _stated(topic, group.bags)
         for span in bag_overlaps(group.bags):
             window = TimeWindow(*span)
             if not files.issuperset(
@@ -111,6 +112,22 @@ class View:
             for stored, once in self._overlap_census(topic, window).values():
                 count -= stored.count - once.count
         return count
+
+    def apart(self, topic: str, group: Group) -> Sequence[Group]:
+        """Returns a group for each bag of one whose bags follow each other and hold no copy.
+
+        So recordings that begin when another ends are not read together; else the group itself.
+        """
+        bags = group.bags
+        if (
+            len(bags) == 1
+            or group.may_be_relatched
+            or not group.is_whole
+            or any(before.last >= after.first for before, after in pairwise(bags))
+            or self.count_in(topic, group) < _stated(topic, bags)
+        ):
+            return [group]
+        return [group.of(each) for each in bags]
 
     def census(self, topic: str) -> dict[str, Census]:
         """Returns what is recorded of a topic under each of its types, each message counted once.
@@ -171,6 +188,11 @@ class View:
             }
             self.bags.cache_answer(question, bags, json.dumps(answer))
         return counted
+
+
+def _stated(topic: str, bags: Sequence[BagSpan]) -> int:
+    """Returns how many messages of a topic bags hold, duplicates too."""
+    return sum(known.count for each in bags for known in each.bag.summary.of(topic))
 
 
 def _decode_overlap(start: Ns, answer: str) -> dict[str, tuple[Census, Census]]:

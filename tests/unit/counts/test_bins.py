@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from random import Random
@@ -300,6 +301,34 @@ def test_messages_of_recordings_that_overlap_are_counted_by_what_the_topic_list_
     with monkeypatch.context() as patch:
         patch.delattr(MergedStream, "merged")
         assert ask(known) == answer
+
+
+@pytest.mark.parametrize("copied", [False, True])
+def test_recordings_that_follow_each_other_at_a_full_hour_are_read_where_they_hold_a_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: bool
+) -> None:
+    edge = BEGIN // S // 3600 * 3600 + 3600
+    moves = [odom((edge + at) * S, float(at), 0.0) for at in range(-20, 20)]
+    copy = replace(moves[19], log_time=edge * S - S // 2, publish_time=moves[19].published)
+    write_mcap(tmp_path / "rec_0" / "rec_0_0.mcap", moves[:20])
+    write_mcap(tmp_path / "rec_1" / "rec_1_0.mcap", [copy] * copied + moves[20:])
+    plain = memory_of(tmp_path, limits=LATEST)
+    known = recalling(plain, tmp_path)
+    list_recorded_topics(known, Call())
+
+    def ask(memory: Memory, *fields: str) -> Bins:
+        return count_range(memory, Call(), "/odom", everything(), "hour", fields=fields)
+
+    counts, numbers = ask(plain), ask(plain, "position.x")
+    assert [each for each in column(counts, "count").values() if each] == [20, 20]
+    assert whole(numbers, "position.x.mean") == -0.5
+    with monkeypatch.context() as patch:
+        if not copied:
+            patch.delattr(MergedStream, "merged")
+        assert ask(known) == counts
+    if not copied:
+        monkeypatch.setattr(segment_fold, "READING_S", -1.0)
+    assert ask(known, "position.x") == numbers
 
 
 def _counts_by_group(memory: Memory) -> Iterator[tuple[int, int]]:
