@@ -137,7 +137,10 @@ def test_the_server_imports_nothing_that_records_deletes_or_is_for_people(
     )
     ((*there,),) = imported(program, env)
     observing = {"opentelemetry.sdk", "prometheus_client", "ros2_memory.observability.prometheus"}
-    absent = DELETING | RECORDING | PEOPLE | FLEET | observing | {"httpx", "jsonschema"}
+    asked = {
+        f"ros2_memory.{room}" for room in ("counts", "insights.recap", "queries", "things.find")
+    }
+    absent = DELETING | RECORDING | PEOPLE | FLEET | observing | {"httpx", "jsonschema"} | asked
     assert absent & {*there} == set()
 
 

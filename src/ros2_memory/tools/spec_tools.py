@@ -3,19 +3,15 @@
 A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
 `ToolName`s differ. The order of the declarations is the order in which clients see the tools.
 """
+# ruff: noqa: PLC0415 - `ToolDeclaration` says why
 
 from __future__ import annotations
 
 from functools import partial
 from typing import TYPE_CHECKING
 
-from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
-from ros2_memory.counts.numbers import count_range
-from ros2_memory.counts.path import count_path
-from ros2_memory.insights.at_each import at_each
-from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
@@ -36,10 +32,11 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
+    from ros2_memory import results
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.view import TimeRange
-    from ros2_memory.tools.declaration import Tool
+    from ros2_memory.tools.declaration import Query, Tool
 
 
 def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
@@ -75,7 +72,9 @@ def build_tools(
 def _list_topics(
     memory: Memory, call: Call, *, pattern: str | None
 ) -> tuple[results.TopicRow, ...]:
-    rows = queries.list_recorded_topics(memory, call)
+    from ros2_memory.queries import list_recorded_topics
+
+    rows = list_recorded_topics(memory, call)
     if pattern is None or not rows:
         return rows
     matched = {*match_topics([row.topic for row in rows], pattern)}
@@ -100,8 +99,81 @@ def _trajectory(
     max_waypoints: int,
 ) -> results.TrajectorySummary | results.DrivenInside:
     """Returns the whole way, or what was driven inside of a region."""
-    query = queries.trajectory_summary if where is None else partial(driven_inside, where=where)
+    from ros2_memory.places.driven_inside import driven_inside
+    from ros2_memory.queries import trajectory_summary
+
+    query = trajectory_summary if where is None else partial(driven_inside, where=where)
     return query(memory, call, span, topic=topic, frame_id=frame_id, max_waypoints=max_waypoints)
+
+
+def _data_time_range() -> Query:
+    from ros2_memory.queries import data_time_range
+
+    return data_time_range
+
+
+def _topic_value() -> Query:
+    from ros2_memory.insights.at_each import at_each
+    from ros2_memory.queries import topic_value
+
+    return at_each(topic_value)
+
+
+def _topic_range() -> Query:
+    from ros2_memory.queries import topic_range
+
+    return topic_range
+
+
+def _position() -> Query:
+    from ros2_memory.insights.at_each import at_each
+    from ros2_memory.queries import position
+
+    return at_each(position)
+
+
+def _velocity() -> Query:
+    from ros2_memory.insights.at_each import at_each
+    from ros2_memory.queries import velocity
+
+    return at_each(velocity)
+
+
+def _transform() -> Query:
+    from ros2_memory.insights.at_each import at_each
+    from ros2_memory.queries import transform
+
+    return at_each(transform)
+
+
+def _frames() -> Query:
+    from ros2_memory.queries import frames
+
+    return frames
+
+
+def _find_last_match() -> Query:
+    from ros2_memory.queries import find_last_match
+
+    return find_last_match
+
+
+def _value_when() -> Query:
+    from ros2_memory.queries import value_when
+
+    return value_when
+
+
+def _count_range() -> Query:
+    from ros2_memory.counts.numbers import count_range
+
+    return count_range
+
+
+def _count_path() -> Query:
+    from ros2_memory.counts.path import count_path
+
+    return count_path
 
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
@@ -118,7 +190,7 @@ _DECLARATIONS = (
         "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; if there are too "
         "many, the busiest.",
         TopicListArguments,
-        _list_topics,
+        lambda: _list_topics,
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded time range"),),
@@ -126,7 +198,7 @@ _DECLARATIONS = (
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, times "
         "in Unix s and local ISO, null if nothing is recorded.",
         NoArguments,
-        queries.data_time_range,
+        _data_time_range,
     ),
     ToolDeclaration(
         _at_and_ago("topic", "A topic's value", at="at_time"),
@@ -134,7 +206,7 @@ _DECLARATIONS = (
         "(default {tolerance}, too little for slow topics; latched: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
-        at_each(queries.topic_value),
+        _topic_value,
     ),
     ToolDeclaration(
         (
@@ -146,8 +218,8 @@ _DECLARATIONS = (
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
         "max, max_at}}}} of all messages}}.",
         TopicRangeArguments,
-        queries.topic_range,
-        count=count_range,
+        _topic_range,
+        count=_count_range,
     ),
     ToolDeclaration(
         _at_and_ago("position", "Robot position"),
@@ -155,7 +227,7 @@ _DECLARATIONS = (
         "(counter-clockwise from x), timestamp, topic, frame_id}}; for NavSatFix latitude, "
         "longitude and altitude, and x, y, z are null.",
         PositionArguments,
-        at_each(queries.position),
+        _position,
     ),
     ToolDeclaration(
         _at_and_ago("velocity", "Robot velocity"),
@@ -163,7 +235,7 @@ _DECLARATIONS = (
         "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}. In the robot's own frame "
         "x is forward and positive angular z turns left.",
         MotionArguments,
-        at_each(queries.velocity),
+        _velocity,
     ),
     ToolDeclaration(
         _at_and_ago("transform", "Transform"),
@@ -171,14 +243,14 @@ _DECLARATIONS = (
         "interpolated. Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, "
         "parent, child, clock}}.",
         TransformArguments,
-        at_each(queries.transform),
+        _transform,
     ),
     ToolDeclaration(
         (ToolName("list_frames", "Frames"),),
         "Lists every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
         "static}}]}}.",
         NoArguments,
-        queries.frames,
+        _frames,
         blocking=True,
     ),
     ToolDeclaration(
@@ -187,7 +259,7 @@ _DECLARATIONS = (
         "frame_id, age_s}}, or null if never ({{timestamp: null, value: null, notes}} if something "
         "could not be read).",
         LastMatchArguments,
-        queries.find_last_match,
+        _find_last_match,
         blocking=True,
         shows_example=True,
     ),
@@ -197,7 +269,7 @@ _DECLARATIONS = (
         "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
         "value_timestamp, condition_topic, value_topic, frame_id}}, or null as find_last_match.",
         ValueWhenArguments,
-        queries.value_when,
+        _value_when,
         blocking=True,
     ),
     ToolDeclaration(
@@ -209,8 +281,8 @@ _DECLARATIONS = (
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
         "...}}; with where: only the path inside it, and visits.",
         TrajectoryArguments,
-        _trajectory,
+        lambda: _trajectory,
         blocking=True,
-        count=count_path,
+        count=_count_path,
     ),
 )
