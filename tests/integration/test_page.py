@@ -139,7 +139,7 @@ def test_a_time_that_was_chosen_stays_and_is_in_the_address(page: Browser, serve
     page.awaits(POSED)
     assert abs(page.run("return map.moment.x") - 5.0) < 0.5
     page.run("document.getElementById('back').click()")
-    assert page.text("#moment-title") == "Now"
+    assert page.text("#moment-title") == "When recording ended"
     assert "at=" not in page.run("return location.hash")
 
 
@@ -166,7 +166,10 @@ def test_the_timeline_is_dragged_and_zoomed_and_the_address_has_the_span(page: B
     page.run("document.getElementById('timeline').focus()")
     page.keys("-")
     page.awaits("return state.span.end - state.span.start > arguments[0]", length * 0.7)
-    page.press("#live")
+    page.run(
+        "const length = document.getElementById('length'); length.value = '3600';"
+        "length.dispatchEvent(new Event('change'));"
+    )
     page.awaits("return location.hash.startsWith('#last=')")
     page.awaits(LOOKED)
 
@@ -225,6 +228,64 @@ def test_a_number_is_plotted_below_the_timeline(page: Browser, served: Served) -
     page.awaits("return document.querySelector('.uplot canvas') !== null")
 
 
+def test_what_the_server_had_no_time_for_is_kept_and_asked_for_again(page: Browser) -> None:
+    """The newest look has neither events nor a path: those that are shown stay until they come."""
+    kept = page.run(
+        "const late = { ...state.view, since: state.view.start + 1 };"
+        "delete late.events; delete late.path; const next = continued(state.view, late);"
+        "const caught = continued(next, { ...state.view, since: state.view.start + 1 });"
+        "return [next.events.length, next.path.t.length, next.owed - state.view.start, caught.owed]"
+    )
+    shown = page.run("return [state.view.events.length, state.view.path.t.length, state.view.owed]")
+    assert kept[:2] == shown[:2]
+    assert abs(kept[2] - 1) < 1e-3
+    assert kept[3] is None is shown[2]
+
+
+def test_no_name_on_the_map_covers_another_or_a_thing(page: Browser) -> None:
+    """Two things far from all others have their names; of twelve in one place some have none."""
+    drawn = page.run(
+        "const drawn = []; const { fillText } = CanvasRenderingContext2D.prototype;"
+        "const { x, y } = map.centre;"
+        "const thing = (label, dx, dy) => ({ label, x: x + dx, y: y + dy });"
+        "map.things = [thing('west', -8, 1), thing('east', 8, 1),"
+        " ...Array.from({ length: 12 }, (_, n) => thing(`crowded ${n}`, n / 50, 1))];"
+        "map.view = { ...map.view, places: [{ name: 'room', corners: ["
+        "[x - 9, y - 3], [x + 9, y - 3], [x + 9, y + 3], [x - 9, y + 3]] }] };"
+        "CanvasRenderingContext2D.prototype.fillText = function (text, left, base) {"
+        " drawn.push([text, left, base - 11, this.measureText(text).width]); };"
+        "map.drawn(); CanvasRenderingContext2D.prototype.fillText = fillText;"
+        "const boxes = drawn.filter(([text]) => /[a-z]{2}/.test(text));"
+        "const things = map.things.map((each) => [map.px(each.x) - 4, map.py(each.y) - 4, 8, 8]);"
+        "map.show(state.view); return [boxes, things];"
+    )
+    names = {text for text, *_ in drawn[0]}
+    assert {"west", "east", "room"} <= names
+    assert 0 < len(names) - 3 < 12
+    boxes = [(x, y, w, 14) for _, x, y, w in drawn[0]]
+    for n, (x, y, w, h) in enumerate(boxes):
+        for left, top, wide, high in [*boxes[:n], *drawn[1]]:
+            assert x >= left + wide or left >= x + w or y >= top + high or top >= y + h
+
+
+def test_the_skip_link_goes_to_the_timeline_and_leaves_the_span(page: Browser) -> None:
+    before = page.run("return location.hash")
+    page.keys(TAB + ENTER)
+    assert page.run(FOCUSED) == "timeline"
+    assert page.run("return location.hash") == before
+
+
+def test_a_clock_that_was_set_often_takes_one_row(page: Browser) -> None:
+    rows = page.run(
+        "const steps = [1, 2, 3, 4].map((t) => ({ kind: 'clock step', t, text: `set by ${t} s` }));"
+        "return [...bundled([...steps, { kind: 'gap', t: 0, end: 1, text: 'a gap' }], () => {})]"
+        ".map((each) => each.querySelectorAll('li').length || each.textContent)"
+    )
+    assert rows[0] == 4
+    assert rows[1].startswith("a gap")
+    assert page.run("return [0.002, 0.53, 12.345].map(size)") == ["2 MB", "530 MB", "12.3 GB"]
+
+
 def write_odd_history(bag_dir: Path) -> None:
     """Short bags with 22 gaps, 60 topics of long names, things of long names, damaged files."""
     long = "/" + "/".join(["the_namespace_of_a_robot"] * 6)
@@ -266,8 +327,9 @@ def test_of_bags_that_nobody_records_it_shows_neither_a_recorder_nor_a_budget(od
 
 
 def test_it_says_that_ago_counts_from_the_newest_recorded_moment(odd: Browser) -> None:
-    newest = odd.run("return clock(state.view.range.latest)")
-    assert f"recorded until {newest}" in odd.text("#summary")
+    newest = odd.run("return dated(state.view.range.latest)")
+    assert f"recorded until {newest}, " in odd.text("#summary")
+    assert odd.run("return document.getElementById('live').hidden")
     assert f"counts from the newest recorded moment, {newest}" in odd.text("#state")
 
 
@@ -454,6 +516,9 @@ def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> 
         show(chromium, server)
         chromium.awaits("return state.view.catalogue === null")
         assert chromium.run("return state.view.robot.x") == 20
+        assert chromium.text("#moment-title") == "Now"
+        assert "newest data" in chromium.text("#moment-time")
+        assert chromium.run("return !document.getElementById('live').hidden")
         chromium.run("window.mine = 1")
         drive(bag_dir, "two", begin + 20 * NS_PER_S, 10, x=20.0)
         chromium.awaits("return state.view.robot.x === 30")

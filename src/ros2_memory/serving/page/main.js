@@ -5,6 +5,7 @@ const FILLING_MS = 4000;
 const REST_MS = 200;
 const OVERLAP_S = 15;  // of the newest events, some go on
 const STATUS_MS = 60000;
+const LIVE_S = 600;  // a bag may be readable only when it is closed
 const MOST_DUTY = 100;  // things are looked up in at most a hundredth of the time
 
 const state = {
@@ -84,7 +85,9 @@ async function look(isMore = false, isPatient = false) {
     const isOld = Date.now() - statusAt > STATUS_MS;
     given.set("version", isOld ? "" : view.version);
     if (!isOld) given.set("status", "0");
-    given.set("since", Math.max(Math.min(view.end, view.range.latest) - OVERLAP_S, view.start));
+    const since = Math.max(Math.min(view.end, view.range.latest) - OVERLAP_S, view.start);
+    given.set("since", view.owed === null ? since : Math.min(since, view.owed));
+    if (view.owed !== null) given.set("patient", "1");
     if (Date.now() - thingsAt < MOST_DUTY * (view.things_ms || 0)) given.set("things", "0");
   }
   isLooking = true;
@@ -138,7 +141,7 @@ function always(reply, range) {
     (span) => ({ kind: "thing", ...span, text: `${label} in view` })));
 }
 function whole(reply) {
-  return { path: null, paths: [], robot: null, places: [], moments: [], ...reply, things: reply.things || [],
+  return { path: null, paths: [], robot: null, places: [], moments: [], owed: null, ...reply, things: reply.things || [],
     events: reply.events || [], isWhole: Boolean(reply.events && reply.path !== undefined) };
 }
 /* What is shown, with an answer about what came since. */
@@ -146,6 +149,8 @@ function continued(view, reply) {
   const next = { ...view, ...reply, things: reply.things || view.things };
   next.range = reply.range || { ...view.range, now: reply.now, latest: reply.latest };
   const since = reply.since;
+  // Since when the server had no time to answer all: the next look asks for that again.
+  next.owed = reply.events && reply.path !== undefined ? null : since;
   const older = view.path ? lastBefore(view.path.t, since - 0.001) + 1 : 0;
   const path = reply.path || null;
   next.path = path || view.path;
@@ -168,7 +173,7 @@ function continued(view, reply) {
     if (begun && each.end !== undefined) begun.end = Math.max(begun.end || 0, each.end);
     return !begun;
   });
-  next.events = [...kept, ...more];
+  next.events = reply.events ? [...kept, ...more] : view.events;
   // Totals of the newest minute are not those of the span.
   for (const key of ["distance_m", "counts", "max_speed", "stood_s"]) next[key] = view[key];
   return next;
@@ -205,19 +210,37 @@ function show(reply, isMore) {
   showKey();
   showSpan();
   showControls();
-  if (state.t === null && !line.stretch && !map.chosen) showNow(at("moment"), view, chooseThing);
+  if (state.t === null && !line.stretch && !map.chosen) showLatest();
   else if (!isMore && state.t !== null) pointed(state.t, true);
   place(state.hovered === null ? state.t : state.hovered);
   remember();
 }
+/* How old the newest data is, also where "now" is when that was recorded; below 0: of a simulation. */
+function ageOf({ range, status }) {
+  const halted = status.latest !== null && status.now === status.latest;
+  return (halted ? Date.now() / 1000 : range.now) - range.latest;
+}
+/* Whether new data comes, or may come within minutes. */
+function isLive(view) {
+  return view.range.latest !== null && (view.status.recorder_alive || Math.abs(ageOf(view)) < LIVE_S);
+}
+function newestOf(view) {
+  const age = ageOf(view);
+  if (isLive(view)) return `newest data ${ago(age)}`;
+  return `recorded until ${dated(view.range.latest)}${age > LIVE_S ? `, ${ago(age)}` : ""}`;
+}
 function showSummary() {
   const { range, status } = state.view;
   const sound = status.trust === "nothing is known to be missing";
-  const halted = status.latest !== null && status.now === status.latest;
-  const newest = range.latest === null ? "nothing is recorded"
-    : halted ? `recorded until ${clock(range.latest)}` : `newest data ${ago(range.now - range.latest)}`;
-  const parts = [state.recording ? `only ${state.recording}` : recorderOf(status), newest, sound ? "nothing is known to be missing" : "see State"];
-  at("summary").textContent = plain(parts.filter(Boolean).join(" \u00b7 "));
+  const newest = range.latest === null ? "nothing is recorded" : newestOf(state.view);
+  const parts = [state.recording ? `only ${state.recording}` : recorderOf(status), newest].filter(Boolean);
+  at("summary").replaceChildren(plain(`${parts.join(" \u00b7 ")} \u00b7 `), sound
+    ? "nothing is known to be missing" : el("span", { class: "warn" }, "! something is missing: see State"));
+  if (range.latest !== null && at("back").hidden && state.hovered === null) headOfNow();
+}
+function headOfNow() {
+  const { view } = state;
+  head(isLive(view) ? "Now" : "When recording ended", isLive(view) ? newestOf(view) : dated(view.range.latest));
 }
 /* Which recordings there are, and where those shown are plainly of several robots. */
 function showRecordings(view) {
@@ -226,7 +249,7 @@ function showRecordings(view) {
   const hidden = (view.recordings_total || 0) - rows.length;
   const named = (each) => `${each.name}${each.holds ? ` (${counted(each.holds, "recording")})` : ""}, `
     + `${clock(each.start)}, ${lasting(each.end - each.start)}`;
-  const all = hidden > 0 ? `all; newest ${rows.length} listed` : "all";
+  const all = hidden > 0 ? `all (newest ${rows.length} listed)` : "all";
   const options = [["", all], ...rows.map((each) => [each.name, named(each)])];
   if (!options.some(([value]) => value === state.recording)) {
     options.splice(1, 0, [state.recording, state.recording]);
@@ -275,16 +298,17 @@ function showKey() {
 }
 function pathKey(view, one) {
   return [one("path", view.distance_m === null || view.distance_m === undefined
-    ? "path" : `path, ${far(view.distance_m)}`), one("now", "robot now"),
+    ? "path" : `path, ${far(view.distance_m)}`), one("now", isLive(view) ? "robot now" : "robot at the end"),
   one("robot", "at the time pointed at")];
 }
 function showSpan() {
   const { start, end } = state.span;
-  const to = day(start) === day(end) ? timeOfDay(end) : clock(end);
-  at("span-text").textContent = `${clock(start)} to ${to} (${lasting(end - start)})`;
+  const to = date(start) === date(end) ? timeOfDay(end) : dated(end);
+  at("span-text").textContent = `${dated(start)} to ${to} (${lasting(end - start)})`;
 }
 function showControls() {
   at("live").setAttribute("aria-pressed", String(state.last !== null));
+  at("live").hidden = !isLive(state.view);
   const length = at("length");
   const value = state.last === null ? "other" : String(state.last);
   const known = [...length.options].some((each) => each.value === value);
@@ -313,11 +337,11 @@ function pointed(t, isChosen) {
   turn++;
   if (!isChosen && (line.stretch || map.chosen)) return;
   if (shown === null) {
-    head("Now", "");
-    showNow(at("moment"), state.view, chooseThing);
+    headOfNow();
+    showLatest();
     return;
   }
-  head("At this time", clock(shown), state.t !== null);
+  head("At this time", dated(shown), state.t !== null);
   restLater = setTimeout(() => ask({ t: shown.toFixed(3) },
     (answer) => {
       map.correct(answer);
@@ -325,9 +349,14 @@ function pointed(t, isChosen) {
     }),
   isChosen ? 0 : REST_MS);
 }
+function showLatest() {
+  showNow(at("moment"), state.view, chooseThing, chooseStretch);
+}
 function head(title, text, isChosen = false) {
   at("moment-title").textContent = plain(title);
-  at("moment-time").textContent = plain(text);
+  // The age of the newest data changes all the time: it is not read out.
+  at("moment-time").setAttribute("aria-live", title === "Now" ? "off" : "polite");
+  if (at("moment-time").textContent !== plain(text)) at("moment-time").textContent = plain(text);
   at("back").hidden = !isChosen;
 }
 async function ask(given, then) {
@@ -416,6 +445,11 @@ at("live").addEventListener("click", () => {
     showControls();
   }
   look();
+});
+// Not by its address, which has what is shown.
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault();
+  at("timeline").focus();
 });
 at("back").addEventListener("click", () => pointed(null, true));
 at("map-in").addEventListener("click", () => map.zoom(1.4));

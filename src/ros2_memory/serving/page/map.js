@@ -176,7 +176,8 @@ class RobotMap {
       return;
     }
     const { t, path } = this.timeNear(x, y);
-    tip(t === null ? "" : `${this.isApart ? `${path.name}, ` : ""}${clock(t)}`, event);
+    const place = t === null ? this.placeAt(x, y) : null;
+    tip(place ? place.name : t === null ? "" : `${this.isApart ? `${path.name}, ` : ""}${clock(t)}`, event);
     this.told.time(t, false);
   }
   click(x, y) {
@@ -208,7 +209,7 @@ class RobotMap {
     const low = { x: xs.reduce((a, b) => Math.min(a, b)), y: ys.reduce((a, b) => Math.min(a, b)) };
     const high = { x: xs.reduce((a, b) => Math.max(a, b)), y: ys.reduce((a, b) => Math.max(a, b)) };
     this.centre = { x: (low.x + high.x) / 2, y: (low.y + high.y) / 2 };
-    this.scale = Math.min((width - 70) / Math.max(high.x - low.x, 1),
+    this.scale = Math.min((width - Math.min(70, width / 8)) / Math.max(high.x - low.x, 1),
       (height - 60) / Math.max(high.y - low.y, 1));
   }
 
@@ -219,11 +220,10 @@ class RobotMap {
     c.font = "12px system-ui, sans-serif";
     c.lineJoin = "round";
     this.drawGrid(c, width, height);
-    this.taken = [];
     this.drawPlaces(c);
     this.drawPath(c);
     this.drawStops(c);
-    this.drawThings(c, width, height);
+    this.drawNames(c, width, height, this.drawThings(c, width, height));
     const { robot } = this.view;
     if (this.isApart) {
       this.moments.forEach((each, n) => each && this.drawRobot(c, each, colour(ofPath(n)), true));
@@ -266,35 +266,86 @@ class RobotMap {
   }
   drawPlaces(c) {
     c.lineWidth = 1;
-    const names = [];
     for (const each of this.view.places || []) {
       c.beginPath();
-      let top = [0, 0];
       if (each.circle) {
         const [x, y, r] = each.circle;
         c.arc(this.px(x), this.py(y), Math.max(r * this.scale, 2), 0, 2 * Math.PI);
-        top = [x, y + r];
       } else {
         for (const [x, y] of each.corners) c.lineTo(this.px(x), this.py(y));
         c.closePath();
-        top = [each.corners.reduce((sum, [x]) => sum + x, 0) / each.corners.length,
-          Math.max(...each.corners.map(([, y]) => y))];
       }
       c.fillStyle = colour("place");
       c.fill();
       c.strokeStyle = colour("place-line");
       c.stroke();
-      const name = plain(each.name).slice(0, 24);
-      const wide = c.measureText(name).width;
-      const box = { x: this.px(top[0]) - wide / 2, y: this.py(top[1]) + 4, w: wide, h: 14 };
-      names.push([name, box]);
     }
-    c.fillStyle = colour("soft");
-    for (const [name, box] of names) {
-      if (this.taken.some((one) => meet(one, box))) continue;
-      this.taken.push(box);
-      c.fillText(name, box.x, box.y + 11);
+  }
+  /* Names of places and things go where they cover nothing; what finds no room shows on pointing. */
+  drawNames(c, width, height, things) {
+    const { robot, places = [] } = this.view;
+    const taken = new Map();
+    const mark = (x, y, r) => taken.set(`${Math.round(x)} ${Math.round(y)}`,
+      { x: x - r, y: y - r, w: 2 * r, h: 2 * r });
+    for (const each of this.stops) mark(this.px(each.x), this.py(each.y), 5);
+    for (const each of things) mark(each.px, each.py, 6);
+    if (robot && this.paths.length) mark(this.px(robot.x), this.py(robot.y), 12);
+    const boxes = [...taken.values()];
+    const named = (text, ink, w, spots) => {
+      const box = spots.map(([x, y]) => ({ x, y, w, h: 14 }))
+        .find((one) => one.x >= 2 && one.x + w < width - 2 && one.y >= 2 && one.y < height - 34
+          && !boxes.some((other) => meet(other, one)));
+      if (!box) return;
+      boxes.push(box);
+      c.lineWidth = 3;
+      c.strokeStyle = colour(ink === "ink" ? "card" : "place");
+      c.strokeText(text, box.x, box.y + 11);
+      c.fillStyle = colour(ink);
+      c.fillText(text, box.x, box.y + 11);
+    };
+    const name = (each) => {
+      const { px: x, py: y } = each;
+      const text = plain(each.label).slice(0, 24);
+      const w = c.measureText(text).width;
+      named(text, "ink", w, [[x + 9, y - 7], [x - 9 - w, y - 7], [x - w / 2, y - 21], [x - w / 2, y + 7],
+        [x + 6, y - 19], [x + 6, y + 5], [x - 6 - w, y - 19], [x - 6 - w, y + 5]]);
+    };
+    things.filter((each) => this.isChosen(each)).forEach(name);
+    c.font = `600 ${c.font}`;
+    for (const each of places) {
+      const text = plain(each.name).slice(0, 24);
+      const w = c.measureText(text).width;
+      const [left, top, right, bottom] = this.boundsOf(each);
+      const [x, y] = [(left + right) / 2 - w / 2, (top + bottom) / 2 - 7];
+      const inside = [[x, top + 5], [x, bottom - 19], [x, y], [left + 6, top + 5], [right - w - 6, top + 5],
+        [left + 6, bottom - 19], [right - w - 6, bottom - 19], [left + 6, y], [right - w - 6, y]];
+      const beside = [[x, top - 17], [x, bottom + 3], [right + 5, y], [left - w - 5, y]];
+      named(text, "place-ink", w, right - left > w + 8 ? inside : beside);
     }
+    c.font = c.font.replace("600 ", "");
+    things.filter((each) => !this.isChosen(each)).forEach(name);
+  }
+  /* The box around a place in pixels: left, top, right, bottom. */
+  boundsOf(place) {
+    const corners = place.circle ? [-1, 1].map((sign) => [place.circle[0] + sign * place.circle[2],
+      place.circle[1] + sign * place.circle[2]]) : place.corners;
+    const [xs, ys] = [corners.map(([x]) => this.px(x)), corners.map(([, y]) => this.py(y))];
+    return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  }
+  /* The smallest place around a point of the canvas, by its box. */
+  placeAt(x, y) {
+    let best = null;
+    let least = Infinity;
+    for (const each of this.view.places || []) {
+      const [left, top, right, bottom] = this.boundsOf(each);
+      const large = (right - left) * (bottom - top);
+      if (x >= left && x <= right && y >= top && y <= bottom && large < least) { least = large; best = each; }
+    }
+    return best;
+  }
+  isChosen(thing) {
+    const { chosen } = this;
+    return Boolean(chosen && chosen.label === thing.label && chosen.x === thing.x && chosen.y === thing.y);
   }
   drawPath(c) {
     this.paths.forEach((path, index) => {
@@ -332,17 +383,15 @@ class RobotMap {
       c.stroke();
     }
   }
-  /* The newest things have their names, as far as there is room beside all markers. */
+  /* Draws the things; returns those that are in sight, and where. */
   drawThings(c, width, height) {
     const shown = this.things.map((each) => ({ ...each, px: this.px(each.x), py: this.py(each.y) }))
       .filter(({ px, py }) => px > -20 && py > -20 && px < width + 20 && py < height + 20);
-    const isChosen = (each) => this.chosen && this.chosen.label === each.label
-      && this.chosen.x === each.x && this.chosen.y === each.y;
     for (const each of shown) {
       const { px: x, py: y } = each;
       c.fillStyle = colour("seen");
-      c.strokeStyle = colour(isChosen(each) ? "ink" : "card");
-      c.lineWidth = isChosen(each) ? 2.5 : 1.5;
+      c.strokeStyle = colour(this.isChosen(each) ? "ink" : "card");
+      c.lineWidth = this.isChosen(each) ? 2.5 : 1.5;
       c.beginPath();
       c.moveTo(x, y - 6);
       c.lineTo(x + 6, y);
@@ -351,25 +400,8 @@ class RobotMap {
       c.closePath();
       c.fill();
       c.stroke();
-      this.taken.push({ x: x - 6, y: y - 6, w: 12, h: 12 });
     }
-    for (const each of shown) {
-      const { px: x, py: y } = each;
-      const name = plain(each.label).slice(0, 24);
-      const w = c.measureText(name).width;
-      const boxes = [[x + 9, y - 7], [x - 9 - w, y - 7], [x - w / 2, y - 21], [x - w / 2, y + 7]]
-        .map(([left, top]) => ({ x: left, y: top, w, h: 14 }))
-        .filter((box) => box.x >= 0 && box.x + w < width - 2);
-      const free = boxes.find((box) => !this.taken.some((one) => meet(one, box)));
-      const box = free || (isChosen(each) ? boxes[0] : null);
-      if (!box) continue;
-      this.taken.push(box);
-      c.lineWidth = 3;
-      c.strokeStyle = colour("card");
-      c.strokeText(name, box.x, box.y + 11);
-      c.fillStyle = colour("ink");
-      c.fillText(name, box.x, box.y + 11);
-    }
+    return shown;
   }
   drawRobot(c, robot, fill, isFilled) {
     c.save();

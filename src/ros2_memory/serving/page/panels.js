@@ -5,7 +5,13 @@ const ONE = { gaps: "gap", "clock steps": "clock step", silences: "silence", err
   "failed goals": "failed goal", stops: "stop", "on/off changes": "on/off change", "speed drops": "speed drop",
   goals: "goal", sightings: "sighting" };
 const MISSED = "not_seen_where_expected";
+const PROBLEMS = ["error", "failed goal", "gap", "clock step", "silence"];
+const FEW = 2;  // of one kind of problem, of which more are bundled
+const LATEST = 4;
 
+/* A time as short as the span that is shown allows. */
+const when = (unix) => (date(state.span.start) === date(state.span.end) && date(unix) === date(state.span.end)
+  ? timeOfDay(unix) : clock(unix));
 function robotRows(robot, extra = []) {
   const rows = [];
   if (robot) rows.push(entry("Robot", metres(robot)));
@@ -58,7 +64,7 @@ function showSightings(host, answer, point) {
   const rows = answer.sightings.map((each) => {
     const where = each.place || each.robot;
     const place = where ? `${each.place ? "" : "robot at "}${metres(where)}` : "";
-    return pair(link(clock(each.last_seen), () => point(each.last_seen)),
+    return pair(link(when(each.last_seen), () => point(each.last_seen)),
       `${place}${each.in ? ` in ${each.in}` : ""}`);
   });
   const total = answer.total === null ? "there are more" : `${answer.total} in all`;
@@ -68,23 +74,26 @@ function showSightings(host, answer, point) {
     ...listing(rows, 10), ...notesOf(answer.notes));
 }
 /* What is known of now without another question. */
-function showNow(host, view, choose) {
+function showNow(host, view, choose, point) {
   const { robot, path, range } = view;
   const newest = view.things.filter((each) => range.latest - each.last <= 5);
   const frame = path && path.frame ? [entry("Frame", bdi(path.frame))] : [];
   const seen = newest.map((each) => pair(link(each.label, () => choose(each)), metres(each)));
+  const events = view.events.filter((each) => each.kind !== "thing").slice(-LATEST).reverse();
   host.replaceChildren(
     ...(robot ? [el("dl", {}, ...robotRows(robot, frame))] : [soft("Where the robot is, is not known.")]),
-    el("h3", {}, "In view"), ...(seen.length ? listing(seen, 8) : [soft("Nothing.")]));
+    el("h3", {}, "In view"), ...(seen.length ? listing(seen, AT_ONCE) : [soft("Nothing.")]),
+    ...(events.length ? [el("h3", {}, "What happened last"), ...listing(eventRows(events, point))] : []));
 }
 
 function showThings(host, view, choose) {
   const now = view.range.now;
+  const seen = (each) => (isLive(view) ? ago(now - each.last) : when(each.last));
   const rows = view.things.map((each) => pair(
     el("span", {}, link(each.label, () => choose(each)), each.in ? ` in ${plain(each.in)}` : "",
       each.state === MISSED ? el("span", { class: "warn" }, " not seen where expected") : ""),
-    `${metres(each)} \u00b7 ${ago(now - each.last)}`));
-  host.replaceChildren(...(rows.length ? listing(rows, 8)
+    `${metres(each)} \u00b7 ${seen(each)}`));
+  host.replaceChildren(...(rows.length ? listing(rows, 10)
     : [soft(view.events.some((each) => each.kind === "thing")
       ? "What was seen has no place on the map. The timeline shows when it was in view."
       : "Nothing was seen in this time.")]));
@@ -92,16 +101,29 @@ function showThings(host, view, choose) {
 function eventRows(events, point) {
   return events.map((each) => pair(
     link(each.in ? `${each.text} in ${each.in}` : each.text, () => point(each)),
-    `${clock(each.t)}${each.end > each.t ? `, ${lasting(each.end - each.t)}` : ""}`));
+    `${when(each.t)}${each.end > each.t ? `, ${lasting(each.end - each.t)}` : ""}`));
 }
 function showEvents(host, view, point) {
   const shown = view.events.filter((each) => each.kind !== "thing").reverse();
   const counts = Object.entries(view.counts || {})
     .map(([kind, n]) => `${n} ${n === 1 ? ONE[kind] || kind : kind}`).join(", ");
+  const isProblem = (each) => PROBLEMS.includes(each.kind);
+  const [problems, others] = [shown.filter(isProblem), shown.filter((each) => !isProblem(each))];
   host.replaceChildren(...(counts ? [soft(counts)] : []),
-    ...(shown.length ? listing(eventRows(shown, point), 8)
-      : [soft(view.isWhole ? "No events." : "Not known yet.")]),
+    ...(problems.length ? [el("h3", {}, "Problems"), ...listing(bundled(problems, point))] : []),
+    ...(problems.length && others.length ? [el("h3", {}, "All else")] : []),
+    ...listing(eventRows(others, point), problems.length ? 4 : 8),
+    ...(shown.length ? [] : [soft(view.isWhole ? "No events." : "Not known yet.")]),
     ...notesOf(view.notes));
+}
+/* Rows of events, the newest first; of a clock that was set often, one row for all. */
+function bundled(events, point) {
+  const steps = events.filter((each) => each.kind === "clock step");
+  if (steps.length <= FEW) return eventRows(events, point);
+  return events.filter((each) => each.kind !== "clock step" || each === steps[0])
+    .map((each) => (each === steps[0] ? el("li", {}, el("details", {},
+      el("summary", {}, `the clock was set ${steps.length} times, last at ${when(each.t)}`),
+      el("ul", {}, ...eventRows(steps, point)))) : eventRows([each], point)[0]));
 }
 
 /* Topics of one kind, which may be many, in one line. */
@@ -139,13 +161,13 @@ function showState(host, status, range) {
       : `${lasting(range.latest - range.earliest)} in ${counted(range.bags, "bag")}`),
     entry("Gaps", String(range.gaps.length)));
   if (own) {
-    list.append(entry("Budget", `${budget.used_gb} of ${budget.max_gb} GB`,
+    list.append(entry("Budget", `${size(budget.used_gb)} of ${size(budget.max_gb)}`,
       el("meter", { min: 0, max: budget.max_gb, value: budget.used_gb, "aria-label": "Budget used" })));
-    if (budget.foreign_gb) list.append(entry("Foreign bags", `${budget.foreign_gb} GB`));
+    if (budget.foreign_gb) list.append(entry("Foreign bags", size(budget.foreign_gb)));
     if (budget.growth_gb_per_day !== null) {
-      list.append(entry("Growth", `${budget.growth_gb_per_day} GB a day`));
+      list.append(entry("Growth", `${size(budget.growth_gb_per_day)} a day`));
     }
-  } else list.append(entry("Size", `${budget.used_gb} GB`));
+  } else list.append(entry("Size", size(budget.used_gb)));
   if (budget.full_in_days !== undefined) list.append(entry("Full in", `${budget.full_in_days} days`));
   for (const each of status.rules || []) {
     const last = each.last_ago_s === undefined ? "" : `, ${ago(each.last_ago_s)}`;
@@ -170,7 +192,7 @@ function showState(host, status, range) {
     ...faults("Bags with a wrong clock", "clock_faults", range),
     ...notesOf([...new Set([...(range.notes || []), ...(status.notes || [])])]));
   const since = halted ? "the newest recorded moment" : "the time of this look";
-  parts.push(soft(`\u201cAgo\u201d counts from ${since}, ${clock(status.now)}. Time zone: ${ZONE}.`));
+  parts.push(soft(`\u201cAgo\u201d counts from ${since}, ${dated(status.now)}. Time zone: ${ZONE}.`));
   host.replaceChildren(...parts);
 }
 

@@ -44,11 +44,15 @@ function lasting(seconds) {
   if (s < 119.5) return Math.round(s) + " s";
   if (s < 7170) return Math.round(s / 60) + " min";
   if (s < 171000) return (s / 3600).toFixed(1) + " h";
-  return (s / 86400).toFixed(1) + " d";
+  if (s < 60 * 86400) return (s / 86400).toFixed(1) + " d";
+  if (s < 730 * 86400) return Math.round(s / 86400) + " d";
+  return (s / 31557600).toFixed(1) + " years";
 }
 const ago = (seconds) => (seconds < 0.5 ? "now" : `${lasting(seconds)} ago`);
 const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 const DAY = new Intl.DateTimeFormat(undefined, { weekday: "short", day: "numeric", month: "short" });
+const DATE = new Intl.DateTimeFormat(undefined,
+  { weekday: "short", day: "numeric", month: "short", year: "numeric" });
 const CLOCK = new Intl.DateTimeFormat(undefined,
   { hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
 const MINUTE = new Intl.DateTimeFormat(undefined,
@@ -56,6 +60,11 @@ const MINUTE = new Intl.DateTimeFormat(undefined,
 const day = (unix) => DAY.format(unix * 1000);
 const timeOfDay = (unix) => CLOCK.format(unix * 1000);
 const clock = (unix) => `${day(unix)}, ${timeOfDay(unix)}`;
+/* With the year, unless it is this one. */
+const date = (unix) => (new Date(unix * 1000).getFullYear() === new Date().getFullYear() ? DAY : DATE)
+  .format(unix * 1000);
+const dated = (unix) => `${date(unix)}, ${timeOfDay(unix)}`;
+const size = (gb) => (gb >= 1 ? `${Number(gb.toPrecision(3))} GB` : `${Number((gb * 1000).toPrecision(3))} MB`);
 const far = (m) => (m < 10000 ? `${m.toFixed(1)} m` : `${(m / 1000).toFixed(1)} km`);
 const centimetres = (metres) => (Math.round(metres * 100) / 100 || 0).toFixed(2);  // never -0.00
 const metres = (place) => `x\u00a0${centimetres(place.x)}, y\u00a0${centimetres(place.y)}\u00a0m`;

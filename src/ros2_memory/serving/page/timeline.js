@@ -227,10 +227,10 @@ class Timeline {
       if (x > GUTTER + 20 && x < room - 20) c.fillText(text, x, Math.min(bottom + 14, height - 14));
     }
     c.textAlign = "left";
-    c.fillText(day(start), GUTTER, Math.min(bottom + 29, height - 2));
+    c.fillText(date(start), GUTTER, Math.min(bottom + 29, height - 2));
     if (day(start) !== day(end)) {
       c.textAlign = "right";
-      c.fillText(day(end), room, Math.min(bottom + 29, height - 2));
+      c.fillText(date(end), room, Math.min(bottom + 29, height - 2));
       c.textAlign = "left";
     }
   }
@@ -267,8 +267,8 @@ class Timeline {
       const isMark = lane === "events";
       c.fillStyle = colour(isMark ? COLOURS[each.kind] || "accent" : lane);
       if (isMark && wide > 2 && each.kind !== "flip") {
-        c.globalAlpha = 0.3;
-        c.fillRect(left, middle - 3, wide, 6);
+        c.globalAlpha = 0.5;
+        c.fillRect(left, middle - 1, wide, 2);
         c.globalAlpha = 1;
       }
       if (isMark) c.fillRect(left - 1.5, top + 3, 3, LANE - 6);
