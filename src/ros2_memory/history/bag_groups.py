@@ -56,6 +56,7 @@ class Group:
         first: log time of the first message of the bags, in the window or not.
         last: of the last one.
         may_be_relatched: whether bags outside of the group decide which of the messages count.
+        has_duplicates: whether some message may be in two of the bags, so that all are to be read.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class Group:
         self.first = min(each.first for each in bags)
         self.last = max(each.last for each in bags)
         self.may_be_relatched = may_be_relatched
-        self._has_duplicates = may_be_relatched or (
+        self.has_duplicates = may_be_relatched or (
             len(bags) > 1 and len({each.bag.recording for each in bags}) > 1
         )
         self._known_positions: list[MessagePosition] | None = None
@@ -99,7 +100,7 @@ class Group:
 
     def count(self) -> int:
         """Returns how many messages of the window the group holds."""
-        if self._has_duplicates:
+        if self.has_duplicates:
             return sum(1 for _ in self.messages())
         if len(self.bags) == 1 and self.is_inside:
             return sum(each.count for each in self.bags[0].bag.summary.of(self._topic))
@@ -107,7 +108,7 @@ class Group:
 
     def times(self) -> list[Ns]:
         """Returns the log times of the messages of the window, in order."""
-        if self._has_duplicates:
+        if self.has_duplicates:
             return [each.time for each in self.messages()]
         return [*self._log_times()]
 
@@ -115,7 +116,7 @@ class Group:
         """Yields the messages at these indices of the group, which must ascend."""
         if not indices:
             return
-        if self._has_duplicates:
+        if self.has_duplicates:
             wanted = set(indices)
             yield from (each for index, each in enumerate(self.messages()) if index in wanted)
             return

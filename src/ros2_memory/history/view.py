@@ -97,12 +97,14 @@ class View:
         """Returns how many messages of the window a group of the topic's bags holds.
 
         Where whole recordings overlap it is what their bags hold, less what the catalogue counted
-        twice: only what it does not know is read.
+        twice: only what it does not know is read. Where it counted nothing twice, the messages of
+        the group are found without reading all of them.
         """
         if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
             return group.count()
         files = {each.bag.file for each in group.bags}
         count = _stated(topic, group.bags)
+        twice = 0
         for span in bag_overlaps(group.bags):
             window = TimeWindow(*span)
             if not files.issuperset(
@@ -110,8 +112,10 @@ class View:
             ):
                 return group.count()
             for stored, once in self._overlap_census(topic, window).values():
-                count -= stored.count - once.count
-        return count
+                twice += stored.count - once.count
+        if not twice:
+            group.has_duplicates = False
+        return count - twice
 
     def apart(self, topic: str, group: Group) -> Sequence[Group]:
         """Returns a group for each bag of one whose bags follow each other and hold no copy.

@@ -236,7 +236,11 @@ class McapBags:
         chunks = list(self._chunks_with(file, index, wanted, window))
         verify = sum([chunk.length for chunk in chunks]) <= _VERIFIED_BYTES
         for chunk in chunks:
-            data = self._readable_data(file, chunk) if verify else None
+            held = chunk.channels.intersection(wanted)
+            # What is cached was compared when it was read: the records need not be decompressed.
+            known = [self._indexes.get((file.key, chunk.offset, each)) for each in held]
+            is_new = verify and not all(isinstance(each, Column) for each in known)
+            data = self._readable_data(file, chunk) if is_new else None
             columns += self._chunk_columns(file, chunk, wanted, data)
         return columns
 
