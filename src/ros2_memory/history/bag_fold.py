@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import sha256
 from itertools import count, groupby
 from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -140,6 +141,115 @@ def _entries_of(
     if before is None or after is None:
         return None
     return [*digests.numbers.values()], before, after
+
+
+@dataclass(frozen=True, slots=True)
+class _Count:
+    """How many messages of a topic a share holds, each counted once.
+
+    Attributes:
+        messages: the number.
+        since: from this log time on, bags decide which of them count.
+    """
+
+    messages: int
+    since: Ns
+
+
+_Searched: TypeAlias = "tuple[ref[Segment], ...]"
+_Counts: TypeAlias = "dict[tuple[str, str], tuple[_Count, _Searched]]"
+_COUNTS: Final[WeakKeyDictionary[Segment, _Counts]] = WeakKeyDictionary()
+"""By segment, topic and key of a share: its count, and the segments that decided it."""
+
+
+def counted_once(view: View, topic: str) -> int:
+    """Returns how many messages of a topic there are; one that was received again counts once.
+
+    For this, messages are read. So what each segment holds stays in memory and in the catalogue for
+    as long as the bags stay in which the originals were searched for: a robot that records adds a
+    bag every few seconds.
+    """
+    everything = TimeWindow.everything()
+    total = 0
+    for each in shares_of(view, topic, everything):
+        share = replace(each, timeline="")
+        segment, key = share.segment, (topic, share.key)
+        known = _COUNTS.get(segment, {}).get(key)
+        is_known = known is not None and _searched(view, share, known[0]) == known[1]
+        if known is not None and is_known and not view.call.stores_joined:
+            total += known[0].messages
+            continue
+        view.bags.check_deadline()
+        is_sure, count = _stored_count(view, topic, share) or _read_count(view, topic, share)
+        if is_sure:
+            _COUNTS.setdefault(segment, {})[key] = count, _searched(view, share, count)
+        total += count.messages
+    return total
+
+
+def _searched(view: View, share: Share, count: _Count) -> _Searched:
+    """Returns the segments with bags that decide what of a share counts."""
+    window = TimeWindow(min(count.since, share.first), share.last + 1)
+    return tuple(map(ref, view.snapshot.timeline.segments_in(window)))
+
+
+def _read_count(view: View, topic: str, share: Share) -> tuple[bool, _Count]:
+    """Counts the messages of a share; returns also whether all of it could be read."""
+    before = view.notes.keys()
+    view.stream.originals_since = MAX_NS
+    with view.notes.isolated():
+        groups = share.groups(view, topic, TimeWindow.everything())
+        messages = sum(group.count() for group in groups)
+        is_whole = view.notes.complete and view.notes.keys() == before
+    count = _Count(messages, view.stream.originals_since)
+    is_sure = is_whole and not view.call.used_active
+    asked = _count_asked(view, topic, share)
+    if is_sure and asked is not None and view.call.stores_joined:
+        name, digests, entries = asked
+        deciding = _entries_hash(view, share, count)
+        if deciding:
+            stored = json.dumps([count.messages, count.since, deciding]).encode()
+            digests.catalogue.store_joined(name, entries, stored)
+    return is_sure, count
+
+
+def _stored_count(view: View, topic: str, share: Share) -> tuple[bool, _Count] | None:
+    """Returns the count of a share that the catalogue has, where the same bags decide it still."""
+    asked = _count_asked(view, topic, share)
+    if asked is None:
+        return None
+    name, digests, entries = asked
+    stored = digests.catalogue.joined(name, entries)
+    try:
+        messages, since, deciding = json.loads(stored or b"")
+        count = _Count(int(messages), int(since))
+    # A damaged file can hold anything.
+    except (ValueError, TypeError):
+        return None
+    return (True, count) if deciding == _entries_hash(view, share, count) else None
+
+
+def _count_asked(
+    view: View, topic: str, share: Share
+) -> tuple[str, SegmentDigests, Sequence[Sequence[int]]] | None:
+    """Returns under which name and entries the catalogue stores a share's count, if it does."""
+    digests = view.bags.digests_of(share.segment)
+    entries = None if digests is None else _entries_of(view, digests, share)
+    if digests is None or entries is None:
+        return None
+    return f"counted {JOINED_VERSION} {topic}", digests, entries
+
+
+def _entries_hash(view: View, share: Share, count: _Count) -> str:
+    """Returns a hash of the entries that decide what of a share counts; empty without them all."""
+    numbers: list[list[int]] = []
+    for each in _searched(view, share, count):
+        segment = each()
+        digests = None if segment is None else view.bags.digests_of(segment)
+        if digests is None or not digests.whole:
+            return ""
+        numbers.append([*digests.catalogue.row_ids([*digests.numbers.values()])])
+    return sha256(json.dumps(numbers).encode()).hexdigest()
 
 
 def _crossing(view: View, topic: str, segment: Segment) -> tuple[BagSpan, ...]:

@@ -108,7 +108,11 @@ class Sessions:
 
     def is_carried(self, bag: BagFile) -> bool:
         """Whether a bag holds carried messages, which are of several sessions."""
-        return self.folder(bag.recording) == self._carried
+        return self.holds_carried(bag.recording)
+
+    def holds_carried(self, recording: Path) -> bool:
+        """Whether a recording is of carried messages."""
+        return self.folder(recording) == self._carried
 
     def of(self, recording: Path) -> Session:
         """Returns the session of a recording."""

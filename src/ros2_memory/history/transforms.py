@@ -7,7 +7,7 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import islice
+from itertools import accumulate, islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -31,6 +31,7 @@ from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
+    MIN_NS,
     NS_PER_MS,
     NS_PER_S,
     Ns,
@@ -47,7 +48,7 @@ from ros2_memory.history.no_data import (
 from ros2_memory.history.sessions import Sessions, components
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile, Transform
@@ -82,6 +83,25 @@ _STATIC: Final[
     WeakKeyDictionary[Timeline, dict[tuple[Session, tuple[str, ...]], Sequence[StampedTransform]]]
 ] = WeakKeyDictionary()
 """Frames that are connected by what some topics recorded, static ones first, in a session."""
+
+
+class _StaticRead(NamedTuple):
+    """Static transforms as far as they were read: in so many bags, or in all."""
+
+    found: tuple[StampedTransform, ...] = ()
+    bags: int = 0
+    is_whole: bool = False
+
+
+_NOTHING_READ: Final = _StaticRead()
+_StaticKey: TypeAlias = "tuple[tuple[str, ...], frozenset[str], Session | None, tuple[Ns, Ns, str]]"
+_STATIC_READ: Final[WeakKeyDictionary[Segment | Timeline, dict[_StaticKey, _StaticRead]]] = (
+    WeakKeyDictionary()
+)
+_MOST_KEPT: Final = 64
+"""Sessions whose static transforms are kept of a segment: mostly they are one."""
+_BAGS_AT_ONCE: Final = 16
+"""Bags of which all static transforms are read before any are kept."""
 
 
 class FoundTransform(NamedTuple):
@@ -217,29 +237,128 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     """Returns the static transforms of a session, in log-time order.
 
     One that is equal to the one before of its child is left out: each split may have all again.
+
+    Raises:
+        QueryTimeoutError: the call's time is over; what was read is kept for the next call.
     """
-    topics = view.memory.limits.tf_static_topics
+    topics = _recorded(view, view.memory.limits.tf_static_topics)
     known = _STATIC.setdefault(view.snapshot.timeline, {})
     if (among, topics) in known:
         return known[among, topics]
     before = view.notes.keys()
-    decoded: dict[tuple[Schema, str, bytes], tuple[StampedTransform, ...]] = {}
+    chosen = {str(path): path for path in sessions_of(view).recordings_of(among, topics)}
+    found: list[StampedTransform] = []
+    for run in _runs_with(view, topics):
+        found += _static_in(view, topics, among, chosen, run)
+    found = _changes(found)
+    # What was noted must be noted in each answer.
+    if view.notes.keys() == before and not view.call.used_active:
+        known[among, topics] = found
+    return found
+
+
+def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
+    """Returns transforms in log-time order without those equal to the one before of their child."""
     latest: dict[str, StampedTransform] = {}
     found: list[StampedTransform] = []
-    for message in _messages(view, topics, TimeWindow.everything(), among):
+    for each in static:
+        child = each.child.lstrip("/")
+        last = latest.get(child)
+        if last is None or (last.parent, last.transform) != (each.parent, each.transform):
+            latest[child] = each
+            found.append(each)
+    return found
+
+
+def _runs_with(view: View, topics: Sequence[str]) -> Iterator[Sequence[Segment]]:
+    """Yields the segments that hold topics, in order; those together whose messages interleave."""
+    held = [
+        (segment, [segment.spans[topic] for topic in topics if topic in segment.spans])
+        for segment in view.snapshot.timeline.segments
+    ]
+    held = [(segment, spans) for segment, spans in held if spans]
+    reaches = [*accumulate((max(last for _, last in spans) for _, spans in held), max)]
+    firsts = [min(spans)[0] for _, spans in reversed(held)]
+    earliest_from = [*accumulate(firsts, min)][::-1]
+    run: list[Segment] = []
+    for nth, (segment, _) in enumerate(held):
+        if run and earliest_from[nth] > reaches[nth - 1]:
+            yield run
+            run = []
+        run.append(segment)
+    if run:
+        yield run
+
+
+def _static_in(
+    view: View,
+    topics: tuple[str, ...],
+    among: Session,
+    chosen: Mapping[str, Path],
+    run: Sequence[Segment],
+) -> Sequence[StampedTransform]:
+    """Returns the static transforms of a session in some segments, as `static_transforms` does.
+
+    Kept as far as they are read, while the segments stay: without a catalogue, those of a week take
+    longer to read than a call may. `chosen` are the session's recordings by folder.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    folders = chosen.keys() & frozenset[str]().union(*(each.folders for each in run))
+    if not folders:
+        return ()
+    carries = any(sessions_of(view).holds_carried(chosen[each]) for each in folders)
+    kept = _STATIC_READ.setdefault(run[0] if len(run) == 1 else view.snapshot.timeline, {})
+    key = (topics, frozenset(folders), among if carries else None, run[0].first)
+    read = kept.get(key, _NOTHING_READ)
+    if read.is_whole:
+        return read.found
+    spans = [each.spans[topic] for each in run for topic in topics if topic in each.spans]
+    window = TimeWindow(min(first for first, _ in spans), max(last for _, last in spans) + 1)
+    bags = _bags_of(view, topics, window, among)
+    is_sure = True
+    for stop in _cuts(bags, read.bags):
+        part = bags[read.bags : stop]
+        before = view.notes.keys()
+        with view.notes.isolated():
+            try:
+                found = _once_decoded(view, _merged(view, topics, part, window, among))
+            except QueryTimeoutError as error:
+                how_far = f"static transforms are read up to {unix_text(part[0].first)} so far"
+                raise QueryTimeoutError(
+                    f"{error}; {how_far}, and kept: ask again to go on from there"
+                ) from error
+            is_sure &= view.notes.complete and view.notes.keys() == before
+        read = _StaticRead((*read.found, *_changes(found)), stop, is_whole=stop == len(bags))
+        if is_sure and not view.call.used_active:
+            if key not in kept and len(kept) >= _MOST_KEPT:
+                kept.clear()
+            kept[key] = read
+    return read.found
+
+
+def _cuts(bags: Sequence[BagSpan], begin: int) -> Iterator[int]:
+    """Yields where bags are cut, from one on: after some each, where no message interleaves."""
+    reach, last = MIN_NS, begin
+    for nth in range(begin, len(bags)):
+        if nth - last >= _BAGS_AT_ONCE and bags[nth].first > reach:
+            yield nth
+            last = nth
+        reach = max(reach, bags[nth].last)
+    yield len(bags)
+
+
+def _once_decoded(view: View, messages: Iterable[StoredMessage]) -> list[StampedTransform]:
+    """Returns the transforms of messages; what has the same bytes is decoded once."""
+    decoded: dict[tuple[Schema, str, bytes], tuple[StampedTransform, ...]] = {}
+    found: list[StampedTransform] = []
+    for message in messages:
         channel = message.record.channel
         key = (channel.schema, channel.encoding, message.record.payload)
         if key not in decoded:
             decoded[key] = _decoded(view, message)
-        for each in decoded[key]:
-            child = each.child.lstrip("/")
-            last = latest.get(child)
-            if last is None or (last.parent, last.transform) != (each.parent, each.transform):
-                latest[child] = replace(each, log_time=message.time)
-                found.append(latest[child])
-    # What was noted must be noted in each answer.
-    if view.notes.keys() == before and not view.call.used_active:
-        known[among, topics] = found
+        found += [replace(each, log_time=message.time) for each in decoded[key]]
     return found
 
 
@@ -571,9 +690,19 @@ def _messages(
     if among is None:
         return view.stream.messages(recorded, window)
     # A message that was relatched belongs to the recording that received it, too.
-    bags = _bags_of(view, recorded, window, among)
+    return _merged(view, recorded, _bags_of(view, recorded, window, among), window, among)
+
+
+def _merged(
+    view: View,
+    topics: Sequence[str],
+    bags: Sequence[BagSpan],
+    window: TimeWindow,
+    among: Session,
+) -> Iterator[StoredMessage]:
+    """Yields the messages of topics in some bags that are of a session."""
     sessions = sessions_of(view)
-    merged = view.stream.merged(bags, recorded, window, newest_first=False)
+    merged = view.stream.merged(bags, topics, window, newest_first=False)
     several = any(sessions.is_carried(span.bag) for span in bags)
     tracked = view.bags.track_sources(merged)
     return (each for each in tracked if not several or sessions.has(among, each))

@@ -26,6 +26,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history.bag_access import BagAccess
+from ros2_memory.history.bag_fold import counted_once
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import bag_overlaps, deduplicate_forward
@@ -159,8 +160,7 @@ class View:
             if len(counted) != 1 or newest is None:
                 return _counted(self.stream.messages([topic], everything))
             [(type_name, known)] = counted.items()
-            count = sum(group.count() for group in groups_of(self.stream, topic, everything))
-            return {type_name: Census(known.first, newest.time, count)}
+            return {type_name: Census(known.first, newest.time, counted_once(self, topic))}
         for span in self.stream.duplicate_spans(topic, everything):
             for type_name, (stored, once) in self._overlap_census(topic, TimeWindow(*span)).items():
                 known = counted[type_name]

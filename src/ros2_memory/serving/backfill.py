@@ -303,7 +303,7 @@ def store_joined(memory: Memory) -> None:
 
     Nothing is looked at where all of it was stored, be it by another process.
     """
-    from ros2_memory.history.bag_fold import JOINED_VERSION
+    from ros2_memory.history.bag_fold import JOINED_VERSION, counted_once
     from ros2_memory.insights.changes_before import topics_with_changes
     from ros2_memory.insights.drive import drive_in
     from ros2_memory.insights.topic_events import events_in
@@ -316,7 +316,7 @@ def store_joined(memory: Memory) -> None:
         return
     catalogue, limits = memory.recall.catalogue, memory.limits
     depends_on = f"{limits.max_plausible_speed_mps:g} {limits.pose_topic}"
-    mark = f"joined {JOINED_VERSION} all to {MOST_JOINED} {depends_on}"
+    mark = f"joined {JOINED_VERSION} and counted to {MOST_JOINED} {depends_on}"
     if catalogue.joined(mark, [numbers]) is not None:
         return
     # Not only what is new: `forget` empties the catalogue of all that was joined.
@@ -326,6 +326,9 @@ def store_joined(memory: Memory) -> None:
     for topic in topics_with_changes(view):
         with suppress(EpisodicError):
             events_in(view, topic, window)
+    for topic in filter(lambda each: view.stream.may_be_relatched([each]), timeline.topics()):
+        with suppress(EpisodicError):
+            counted_once(view, topic)
     catalogue.store_joined(mark, [numbers], b"-")
 
 

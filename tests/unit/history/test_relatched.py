@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +16,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange, View
+from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
@@ -135,6 +137,39 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         last = View(memory, Call()).stream.newest(TOPIC, TimeWindow.everything())
         assert last is not None
         assert last.time == counted[-1][0]
+
+
+@settings(max_examples=examples(6), deadline=None)
+@given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 1.0]))
+def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part: float) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timeline, "SEGMENT_BAGS", 2)
+        root, aside = Path(folder) / "bags", Path(folder) / "aside"
+        write_recordings(root, draw)
+        aside.mkdir()
+        bags = sorted(root.glob("*/*.mcap"), key=lambda each: (each.parent, int(each.stem[5:])))
+        for bag in bags[-3:]:
+            bag.rename(aside / bag.name)
+        memory = recalling(memory_of(root, reader=McapReader()), root, part=part)
+
+        def check() -> None:
+            for stores in (False, True):
+                call = Call(stores_joined=stores)
+                census = View(memory, call).census(TOPIC)
+                found = texts(memory, TimeWindow.everything())
+                assert sum(each.count for each in census.values()) == len(found)
+                fresh = memory_of(root, reader=McapReader())
+                assert found == texts(fresh, TimeWindow.everything())
+                assert census == View(replace(fresh, recall=memory.recall), call).census(TOPIC)
+
+        check()
+        for bag in bags[-3:]:
+            (aside / bag.name).rename(bag)
+            check()
+        for bag in bags[:3]:
+            bag.unlink()
+            check()
 
 
 QUESTIONS: tuple[Callable[[Memory, Path], object], ...] = (
