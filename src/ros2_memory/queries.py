@@ -263,9 +263,9 @@ def find_last_match(
     With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
     of a score below `min_score` do not count.
     """
-    condition = condition_of(memory, topic, condition_type, value, field=field, min_score=min_score)
     now = memory.clock.now()
     view = View(memory, call, now)
+    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     until = _before(before_s)
     search = ReverseSearch(view, topic, condition)
     if before_s is not None:
@@ -302,12 +302,12 @@ def value_when(
     With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
     of a score below `min_score` do not count.
     """
-    condition = condition_of(
-        memory, condition_topic, condition_type, value, field=field, min_score=min_score
-    )
     now, until = memory.clock.now(), _before(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
+    condition = condition_of(
+        view, condition_topic, condition_type, value, field=field, min_score=min_score
+    )
     search = ReverseSearch(view, condition_topic, condition)
     if before_s is not None:
         require_recorded(view, TimeWindow(MIN_NS, until))

@@ -75,10 +75,10 @@ def count_matches(
         NoDataError: nothing is recorded in the window, or no such topic.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    condition = condition_of(memory, topic, condition_type, value, field=field, min_score=min_score)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
+    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest)))
     topics = matching_topics(view, topic)
     binned = BinnedWindow(view, asked, by, topics)

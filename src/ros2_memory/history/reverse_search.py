@@ -20,7 +20,7 @@ from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, abbreviate, listed, match_topics
+from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
@@ -28,7 +28,7 @@ from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.history.transforms import connects
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.messages.levels import level_number
+from ros2_memory.messages.levels import level_number, unknown_name_hint
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.context import Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import Segment
@@ -60,7 +59,7 @@ _MOST_TRUTHS: Final = 65_536
 
 
 def condition_of(
-    memory: Memory,
+    view: View,
     pattern: str,
     condition_type: str,
     value: JsonValue,
@@ -74,24 +73,23 @@ def condition_of(
     be a full path in its messages, and the level of a log or status may be named (WARN).
 
     Raises:
+        NoDataError: no such topic is recorded.
         InvalidArgumentsError: it is no condition.
     """
+    memory = view.memory
     limits = memory.limits
     least = limits.min_score if min_score is None else min_score
-    types = _types_of(memory, pattern) if field else frozenset()
+    timeline = view.snapshot.timeline
+    types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
     if field and len(types) == 1:
         (type_name,) = types
         field = memory.extractor.own_path(field.strip(), type_name)
         value = level_number(value, field, type_name)
-    return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
-
-
-def _types_of(memory: Memory, pattern: str) -> frozenset[str]:
-    """Returns the types of the topics that match; one without its leading slash, too."""
-    timeline = memory.index.snapshot().timeline
-    topics = match_topics(timeline.topics(), pattern)
-    topics = topics or match_topics(timeline.topics(), f"/{pattern}")
-    return frozenset(chain.from_iterable(map(timeline.types_of, topics)))
+    try:
+        return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
+    except InvalidArgumentsError as error:
+        hint = unknown_name_hint(value, field, types)
+        raise InvalidArgumentsError(f"{error}{hint}") from error
 
 
 def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:

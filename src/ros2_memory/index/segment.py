@@ -18,6 +18,7 @@ from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import bags_with_holes, between, pauses_between
 from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
+from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -308,7 +309,7 @@ class Segment:
 
 def is_log(type_name: str) -> bool:
     """Returns whether messages of a type are lines of a log."""
-    return type_name in {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
+    return type_name in {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"} | FOXGLOVE_LOGS
 
 
 def wider(known: Span | None, span: Span) -> Span:

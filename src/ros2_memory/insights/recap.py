@@ -38,6 +38,7 @@ from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
+from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import driven_way
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.scope import times_in_region
@@ -162,6 +163,7 @@ def recap(
         events = [each for each in events if there.has(each)]
     note_unread(view, window)
     note_edges(view, window)
+    _note_foxglove_logs(view)
     counts = Counter(each.kind for each in events)
     if things:
         counts["thing"] = things
@@ -199,6 +201,17 @@ def recap(
         if stood is not None:
             answer = replace(answer, stood=there.length_of(drive.standstills))
     return replace(answer, notes=view.notes.sentences())
+
+
+def _note_foxglove_logs(view: View) -> None:
+    """Notes the logs whose errors are no events: those that ROS writes alone are read for them."""
+    timeline = view.snapshot.timeline
+    for topic in timeline.topics():
+        if foxglove := FOXGLOVE_LOGS.intersection(timeline.types_of(topic)):
+            view.notes.add(
+                f"errors in {topic} are not among the events, since it is of {min(foxglove)}: "
+                'find_matches with condition_type "above", field "level", value "WARN" lists them'
+            )
 
 
 class _There:

@@ -121,10 +121,10 @@ def find_matches(
         NoDataError: nothing is recorded, or no such topic.
         QueryTimeoutError: the call's time is over before anything was found.
     """
-    condition = condition_of(memory, topic, condition_type, value, field=field, min_score=min_score)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
+    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
     asked = search_window(span, now)

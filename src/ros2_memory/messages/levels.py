@@ -1,25 +1,33 @@
-"""The names of levels in logs and diagnostics: WARN is 30 in the one, and 1 in the other."""
+"""The names of levels in logs and diagnostics: WARN is 30 in `/rosout`, and 1 in diagnostics."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.text import listed
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from ros2_memory.core.model import JsonValue
 
 FIELD: Final = "level"
 _LOG: Final = {"DEBUG": 10, "INFO": 20, "WARN": 30, "ERROR": 40, "FATAL": 50}
 _STATUS: Final = {"OK": 0, "WARN": 1, "ERROR": 2, "STALE": 3}
+_FOXGLOVE: Final = {"DEBUG": 1, "INFO": 2, "WARN": 3, "ERROR": 4, "FATAL": 5}
+FOXGLOVE_LOGS: Final = frozenset({"foxglove.Log", "foxglove_msgs/msg/Log"})
 _BY_TYPE: Final[Mapping[str, Mapping[str, int]]] = {
     "rcl_interfaces/msg/Log": _LOG,
+    **dict.fromkeys(FOXGLOVE_LOGS, _FOXGLOVE),
     "diagnostic_msgs/msg/DiagnosticArray": _STATUS,
     "diagnostic_msgs/msg/DiagnosticStatus": _STATUS,
 }
-_BESIDE: Final = ((frozenset({"msg"}), _LOG), (frozenset({"message", "hardware_id"}), _STATUS))
+_BESIDE: Final = (
+    (frozenset({"msg"}), _LOG),
+    (frozenset({"message", "hardware_id"}), _STATUS),
+    (frozenset({"message", "timestamp"}), _FOXGLOVE),
+)
 """Fields beside `level` by which an extracted value is one of a log, or a status."""
 
 
@@ -30,8 +38,7 @@ def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonVal
         InvalidArgumentsError: messages of the type have no level of that name.
     """
     names = _BY_TYPE.get(type_name)
-    is_name = isinstance(value, str) and value.strip().isalpha()
-    if names is None or not is_name or (field or "").rpartition(".")[2] != FIELD:
+    if names is None or not _is_name_of_level(value, field):
         return value
     word = str(value).strip().upper()
     number = names.get("WARN" if word == "WARNING" else word)
@@ -39,6 +46,23 @@ def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonVal
         known = ", ".join(f"{name} ({each})" for name, each in names.items())
         raise InvalidArgumentsError(f"{value!r} is no level of {type_name}: these are {known}")
     return number
+
+
+def unknown_name_hint(value: JsonValue, field: str | None, types: Collection[str]) -> str:
+    """Returns the end of the sentence on a condition that needs a number and got a level's name.
+
+    Empty where the value is no such name. `types` are those of the messages asked about.
+    """
+    if not _is_name_of_level(value, field):
+        return ""
+    if len(types) > 1:
+        return "; levels have names where the topics asked about are of one type: name one topic"
+    return f"; names of levels are not known of {listed(sorted(types))}: give the number"
+
+
+def _is_name_of_level(value: JsonValue, field: str | None) -> bool:
+    is_name = isinstance(value, str) and value.strip().isalpha()
+    return is_name and (field or "").strip().rpartition(".")[2] == FIELD
 
 
 def with_level_names(value: JsonValue, type_name: str | None = None) -> JsonValue:

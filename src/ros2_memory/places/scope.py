@@ -118,7 +118,7 @@ class _States:
     def __init__(self, view: View, during: WhileCondition) -> None:
         self._view = view
         self._condition = condition_of(
-            view.memory,
+            view,
             during.topic,
             during.condition_type,
             during.value,

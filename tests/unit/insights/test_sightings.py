@@ -46,11 +46,14 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.examples import examples
+from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
+    from mcap.writer import Writer
+
     from ros2_memory.history.context import Memory
 
 S = 10**9
@@ -547,6 +550,46 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
         memory, tmp_path, "find_last_match", topic="/rosout", **warned | {"value": "OK"}
     )
     assert refused["error"] == "invalid_arguments"
+
+
+def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_are_left_out(
+    tmp_path: Path,
+) -> None:
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema("foxglove.Log", "jsonschema", b"{}")
+        channel = writer.register_channel("/rosout", "json", schema)
+        for n, level in enumerate([2, 3, 4, 4]):
+            line = {"level": level, "message": f"line {n}", "timestamp": {"sec": 1, "nsec": n}}
+            writer.add_message(channel, BEGIN + n * S, json.dumps(line).encode(), BEGIN + n * S)
+
+    raw_mcap(tmp_path / "rec" / "rec_0.mcap", fill)
+    memory = memory_of(tmp_path)
+    asks = {"topic": "/rosout", "condition_type": "above", "field": "level"}
+    found = asked(memory, tmp_path, "find_matches", **asks, value="WARN", fields=["message"])
+    assert [each["value"]["message"] for each in found["sightings"]] == ["line 3", "line 2"]
+    recap = asked(memory, tmp_path, "recap", start=BEGIN // S, end=BEGIN // S + 4)
+    [note] = [each for each in recap["notes"] if "foxglove.Log" in each]
+    assert "errors in /rosout are not among the events" in note
+    assert "find_matches" in note
+
+
+@pytest.mark.parametrize("name", ["find_matches", "find_last_match", "get_value_when", "by"])
+def test_a_topic_that_is_not_recorded_is_named_before_a_level_that_is_no_number(
+    tmp_path: Path, name: str
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(BEGIN, 0.0, 0.0), boolean(BEGIN, True)])
+    memory = memory_of(tmp_path)
+    asks = {"condition_type": "above", "field": "level", "value": "WARN"}
+    topic = "condition_topic" if name == "get_value_when" else "topic"
+    if name == "get_value_when":
+        asks["value_topic"] = "/odom"
+    if name == "by":
+        name, asks["by"] = "find_matches", "day"
+    missing = asked(memory, tmp_path, name, **asks, **{topic: "/rosout"})
+    assert (missing["error"], missing["reason"]) == ("no_data", "topic_not_recorded")
+    refused = asked(memory, tmp_path, name, **asks, **{topic: "/bumper"})
+    assert refused["error"] == "invalid_arguments"
+    assert "names of levels are not known of std_msgs/msg/Bool" in refused["detail"]
 
 
 def test_a_condition_takes_the_path_of_a_field_in_the_message(tmp_path: Path) -> None:
