@@ -47,9 +47,9 @@ from ros2_memory.history.no_data import (
     describe_lack,
     no_data_at,
     no_data_between,
-    pose_topic_or_only,
     require_bags,
     require_recorded,
+    resolve_pose_topic,
     resolve_topic,
     seconds,
     with_notes,
@@ -174,7 +174,7 @@ def position(
     In the pose's own frame, or in `frame_id`. A topic of a satellite receiver gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
-    name = pose_topic_or_only(view, topic, degrees=True)
+    name = resolve_pose_topic(view, topic, degrees=True)
     _require_kind(view, name, "position", "geodetic")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
@@ -212,7 +212,7 @@ def velocity(
 ) -> results.Velocity:
     """Returns the robot's newest twist at or before a moment, within the tolerance (s)."""
     view, at, now = open_moment(memory, call, moment)
-    name = pose_topic_or_only(view, topic, "velocity")
+    name = resolve_pose_topic(view, topic, "velocity")
     _require_kind(view, name, "velocity")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
@@ -433,7 +433,7 @@ def trajectory_summary(
     Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
     """
     view, window = open_span(memory, call, span)
-    name = pose_topic_or_only(view, topic)
+    name = resolve_pose_topic(view, topic)
     path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
     if path is None:
         raise no_data_between(view, (name,), window)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.view import View
+from ros2_memory.places.map_digests import MapDigests
 from tests.support.bags import (
     Msg,
     boolean,
@@ -321,10 +324,48 @@ def test_where_no_topic_has_velocities_the_tool_that_computes_them_is_named(tmp_
     assert ask(tmp_path, False, "trajectory_summary", **way)["avg_speed"] == 1.0
 
 
-def test_recap_names_the_topic_with_poses(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [pose_stamped(T0, 1.0, 2.0, "/pose")])
-    reply = ask(tmp_path, False, "recap", start=T0_S, end=T0_S + 1)
-    assert any("set data.pose_topic=/pose" in note for note in reply["notes"])
+@each_way
+def test_the_only_topic_of_poses_serves_every_tool_that_places_the_robot(
+    tmp_path: Path, recalls: bool
+) -> None:
+    driven = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(6)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*driven, boolean(T0 + 4 * S, True)])
+    near = {"x": 2.0, "y": 0.0, "radius_m": 1.2}
+    span = {"start": T0_S, "end": T0_S + 5}
+    in_region = {"where": near, "topic": "/bumper", "condition_type": "equals", "value": True}
+    found = {
+        "visits": ask(tmp_path, recalls, "visits", **near),
+        "recap": ask(tmp_path, recalls, "recap", **span),
+        "trajectory_summary": ask(tmp_path, recalls, "trajectory_summary", **span, where=near),
+        "find_matches": ask(tmp_path, recalls, "find_matches", **in_region),
+    }
+    for tool, reply in found.items():
+        assert any(note.startswith("by /pose, the only topic") for note in reply["notes"]), tool
+    assert found["visits"]["total"] == 1
+    assert found["recap"]["distance_m"] == 5.0
+    assert found["trajectory_summary"]["distance_m"] == pytest.approx(2.4, abs=0.1)
+    assert found["find_matches"]["total"] == 0  # at 4 m
+    chosen = QuerySettings(pose_topic="/base")
+    refused = asked(replace(memory_of(tmp_path), limits=chosen), tmp_path, "visits", **near)
+    assert "set data.pose_topic=/pose" in refused["detail"]
+
+
+def test_digests_that_another_topic_of_poses_placed_are_made_again(tmp_path: Path) -> None:
+    """A bag without /odom is placed by /pose; with /odom in a later one it is no longer."""
+    driven = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(6)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", driven)
+    near = {"x": 2.0, "y": 0.0, "radius_m": 1.2, "start": T0_S, "end": T0_S + 60}
+    recalls = recalling(memory_of(tmp_path), tmp_path)
+    assert asked(recalls, tmp_path, "visits", **near)["total"] == 1
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + n * S, 2.0, 0.0) for n in range(20, 26)])
+    [known] = asked(recalls, tmp_path, "visits", **near)["visits"]
+    assert known["arrived"] == T0_S + 20
+    view = View(recalls, Call())
+    [segment] = view.snapshot.timeline.segments
+    digests = view.bags.digests_of(segment)
+    assert digests is not None
+    assert len(digests.numbers) == 1
+    assert not MapDigests(view).valid_in(digests, segment)
 
 
 def test_of_several_topics_with_poses_each_is_named(tmp_path: Path) -> None:

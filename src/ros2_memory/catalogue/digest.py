@@ -6,7 +6,7 @@ certain the bag is read. Pure: reads through the port, stores nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.payload_templates import Templates
@@ -82,7 +82,10 @@ class Digester:
         for each in summary.topics:
             latched[each.topic] = latched.get(each.topic, False) or each.latched
         sights = None if self._sights is None else self._sights()
-        in_map = MapCollector(self._map_settings, sights)
+        settings = self._map_settings
+        if statics.poses is not None:
+            settings = replace(settings, pose_topic=statics.poses)
+        in_map = MapCollector(settings, sights)
         collectors = {
             topic: TopicCollector(
                 topic,

@@ -52,14 +52,18 @@ class MapSettings:
 
 
 class Statics(NamedTuple):
-    """The static transforms in force for a bag, and a hash of them that entries are stored with."""
+    """The static transforms in force for a bag, and a hash of them that entries are stored with.
+
+    `poses`: the topic of the robot's poses where it is not the configured one, which the hash has.
+    """
 
     transforms: tuple[StampedTransform, ...]
     key: int
+    poses: str | None = None
 
 
-def statics_of(transforms: Iterable[StampedTransform]) -> Statics:
-    """Returns static transforms, one for each child, with their hash."""
+def statics_of(transforms: Iterable[StampedTransform], poses: str | None = None) -> Statics:
+    """Returns static transforms, one for each child, with their hash; see `Statics`."""
     ordered = tuple(sorted(transforms, key=lambda each: (each.child, each.parent)))
     described = json.dumps(
         [
@@ -67,8 +71,9 @@ def statics_of(transforms: Iterable[StampedTransform]) -> Statics:
             for each in ordered
         ]
     )
+    described += "" if poses is None else poses
     digest = hashlib.sha256(described.encode("utf-8", "surrogatepass")).digest()
-    return Statics(ordered, int.from_bytes(digest[:8], "big", signed=True))
+    return Statics(ordered, int.from_bytes(digest[:8], "big", signed=True), poses)
 
 
 NO_STATICS: Final = statics_of(())

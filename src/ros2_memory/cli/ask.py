@@ -101,7 +101,7 @@ def ask(
     of_settings = [each for each in words if _SETTING.fullmatch(each) or is_folder(each)]
     loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = build_fleet(loaded)
-    memory = open_memory(loaded, verbose=verbose, scans=fleet is None, finds_poses=fleet is None)
+    memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     tools = {each.name: each for each in dispatcher.tools}
     if tool is None:

@@ -321,14 +321,11 @@ def open_memory(
     verbose: bool = False,
     scans: bool = True,
     setting: str | None = None,
-    finds_poses: bool = False,
 ) -> "Memory":
     """Returns the memory of the configured bags, with an index of the directory as it is now.
 
     Without an index where it `scans` not, because the robots of a fleet are asked.
-    `setting` is the one that names the bags, where it is another than `recording.bag_dir`. With
-    `finds_poses` the only topic of poses takes the place of a `data.pose_topic` that the bags do
-    not have; stderr names it.
+    `setting` is the one that names the bags, where it is another than `recording.bag_dir`.
     `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
     prints the count when the command ends.
 
@@ -358,18 +355,6 @@ def open_memory(
         raise InvalidArgumentsError(
             f"{snapshot.problem}; {_recordings_like(settings.data.recording, memory.index.bag_dir)}"
         )
-    if finds_poses and isinstance(settings.recorder, NullRecorderNode):
-        from ros2_memory.history.context import Call  # noqa: PLC0415 - as above
-        from ros2_memory.history.no_data import only_pose_topic  # noqa: PLC0415
-        from ros2_memory.history.view import View  # noqa: PLC0415
-
-        only = only_pose_topic(View(memory, Call()))
-        if only is not None:
-            missing = f"these bags have no {settings.data.pose_topic} (data.pose_topic)"
-            typer.echo(f"note: {missing}; positions are those of {only}", err=True)
-            chosen = replace(settings, data=replace(settings.data, pose_topic=only))
-            memory = build_memory(chosen, setting=setting)
-            memory.index.refresh()
     return memory
 
 

@@ -73,10 +73,11 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
 
     With `degrees` that of the only satellite receiver, if there is none with poses. None where
     there is more than one, or somebody chose `data.pose_topic`; goals and clicked points do not
-    count.
+    count. None for a lake, which has the track of the configured topic alone.
     """
     configured = view.memory.limits.pose_topic
-    if configured != _DEFAULT_POSES or configured in view.snapshot.timeline.topics():
+    is_recorded = configured in view.snapshot.timeline.topics()
+    if configured != _DEFAULT_POSES or is_recorded or view.memory.stated is not None:
         return None
     found = _topics_of_robot(view, what)
     if not found and degrees:
@@ -87,24 +88,6 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
 def _topics_of_robot(view: View, what: str) -> list[str]:
     names = dict.fromkeys(each.partition(" ")[0] for each in topics_with(view, what))
     return [each for each in names if not _OF_OTHERS.search(each)]
-
-
-def pose_topic_or_only(
-    view: View, name: str | None, what: str = "position", *, degrees: bool = False
-) -> str:
-    """Returns what `resolve_pose_topic` does, or with a note the only other topic there is.
-
-    Raises:
-        NoDataError: as for `resolve_pose_topic`.
-    """
-    only = only_pose_topic(view, what, degrees=degrees) if name is None else None
-    if only is None:
-        return resolve_pose_topic(view, name, what, degrees=degrees)
-    view.notes.add(
-        f"by {only}, the only topic for it: data.pose_topic is {view.memory.limits.pose_topic}, "
-        "which these bags do not have"
-    )
-    return only
 
 
 def resolve_pose_topic(
@@ -118,7 +101,8 @@ def resolve_pose_topic(
 
     Args:
         view: what is recorded.
-        name: the topic that was asked for; None for `data.pose_topic`.
+        name: the topic that was asked for; None for `data.pose_topic`, or with a note for the only
+            other one that there is.
         what: "position" or "velocity".
         degrees: whether the latitude and longitude of a satellite receiver answer too.
 
@@ -129,47 +113,59 @@ def resolve_pose_topic(
     if name is not None:
         return resolve_topic(view, name)
     configured = view.memory.limits.pose_topic
+    only = only_pose_topic(view, what, degrees=degrees)
+    if only is not None:
+        view.notes.add(
+            f"by {only}, the only topic for it: data.pose_topic is {configured}, which these bags "
+            "do not have"
+        )
+        return only
     try:
         return resolve_topic(view, configured)
     except NoDataError as error:
-        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED:
+        where = _where_it_is(view, what, degrees=degrees)
+        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED or where is None:
             raise
-        detail = f"data.pose_topic is {configured}, which these bags do not have"
-        topics = topics_with(view, what)
-        if not topics and what == "position":
-            topics = topics_that_show_poses(view)
-        if topics:
-            those = {"position": "poses", "velocity": "velocities"}[what]
-            which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
-            detail += (
-                f"; {those} are on {listed(topics)}: set data.pose_topic"
-                f"{'=' if len(topics) == 1 else ' '}{which}, "
-                f"or {GIVE_TOPIC}"
-            )
-        elif what == "position" and (fixes := topics_with(view, "geodetic")):
-            advice = "give topic" if degrees else "get_position_at answers them by topic"
-            detail += (
-                ", nor another with poses in metres; latitude and longitude are on "
-                f"{listed(fixes)}: {advice}"
-            )
-        elif what == "velocity" and (
-            posed := topics_with(view, "position") or topics_that_show_poses(view)
-        ):
-            detail += (
-                f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
-                "returns speeds from them, by topic"
-            )
-        elif moving := _transform_topics(view):
-            those = {"position": "poses", "velocity": "velocities"}[what]
-            detail += (
-                f", nor another with {those}; transforms are on {listed(moving)}: get_transform_at "
-                "returns the pose of one frame in another, and list_frames lists the frames"
-            )
-        elif what == "velocity" and topics_with(view, "geodetic"):
-            detail += ", nor another with velocities"
-        else:
-            raise
+        detail = f"data.pose_topic is {configured}, which these bags do not have{where}"
         raise NoDataError(error.reason, detail, error.notes) from error
+
+
+def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
+    """Returns where positions or velocities are in bags without `data.pose_topic`, and the setting.
+
+    Else what the bags have in their place; None where they have nothing like it.
+    """
+    those = {"position": "poses", "velocity": "velocities"}[what]
+    topics = topics_with(view, what)
+    if not topics and what == "position":
+        topics = topics_that_show_poses(view)
+    if topics:
+        which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
+        return (
+            f"; {those} are on {listed(topics)}: set data.pose_topic"
+            f"{'=' if len(topics) == 1 else ' '}{which}, or {GIVE_TOPIC}"
+        )
+    if what == "position" and (fixes := topics_with(view, "geodetic")):
+        advice = "give topic" if degrees else "get_position_at answers them by topic"
+        return (
+            ", nor another with poses in metres; latitude and longitude are on "
+            f"{listed(fixes)}: {advice}"
+        )
+    if what == "velocity" and (
+        posed := topics_with(view, "position") or topics_that_show_poses(view)
+    ):
+        return (
+            f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
+            "returns speeds from them, by topic"
+        )
+    if moving := _transform_topics(view):
+        return (
+            f", nor another with {those}; transforms are on {listed(moving)}: get_transform_at "
+            "returns the pose of one frame in another, and list_frames lists the frames"
+        )
+    if what == "velocity" and topics_with(view, "geodetic"):
+        return ", nor another with velocities"
+    return None
 
 
 def topics_that_show_poses(view: View) -> list[str]:

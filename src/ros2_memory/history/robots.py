@@ -188,7 +188,7 @@ def _differing_topic(
     )
     shared = _topics_of(one) & _topics_of(other) - view.snapshot.timeline.transient_local
     limits = view.memory.limits
-    first = [each for each in (limits.pose_topic, *limits.tf_topics) if each in shared]
+    first = [each for each in (view.pose_topic, *limits.tf_topics) if each in shared]
     for topic in islice([*first, *sorted(shared.difference(first))], _MAX_TOPICS):
         if _differ_in(view, topic, (_spans(one, topic), _spans(other, topic)), both):
             return topic

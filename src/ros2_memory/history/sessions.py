@@ -47,14 +47,14 @@ class Sessions:
 
     Args:
         view: one call's view of the memory. Two sessions that hold the topic of the robot's own
-            poses (`data.pose_topic`) at once are two robots.
+            poses (`View.pose_topic`) at once are two robots.
         children: returns the child frames of all transforms of a session.
     """
 
     def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
         self._view = view
         limits = view.memory.limits
-        self._topics = (*limits.tf_topics, *limits.tf_static_topics, limits.pose_topic)
+        self._topics = (*limits.tf_topics, *limits.tf_static_topics, view.pose_topic)
         self._children = children
         self._names = HardLinks(view.memory.index.bag_dir)
         self._root = str(view.memory.index.bag_dir).rstrip("/")
@@ -64,7 +64,7 @@ class Sessions:
             "static": self._spans_of(limits.tf_static_topics),
         }
         self._joined = self._chains()
-        self._poses = [*self._spans_of((limits.pose_topic,)).items()]
+        self._poses = [*self._spans_of((view.pose_topic,)).items()]
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}

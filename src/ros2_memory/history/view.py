@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from bisect import bisect_left
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
@@ -31,7 +31,7 @@ from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import bag_overlaps, deduplicate_forward
 from ros2_memory.history.merged_stream import MergedStream
-from ros2_memory.history.no_data import require_bags
+from ros2_memory.history.no_data import only_pose_topic, require_bags
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
@@ -76,6 +76,14 @@ class View:
         self.snapshot = self.bags.snapshot
         self.notes = self.bags.notes
         self.sessions: Sessions | None = None
+
+    @cached_property
+    def pose_topic(self) -> str:
+        """The topic that the robot is placed by: `data.pose_topic`, or the only one of its poses.
+
+        See `only_pose_topic`; it need not be recorded.
+        """
+        return only_pose_topic(self) or self.memory.limits.pose_topic
 
     def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[StoredMessage]]:
         """Returns how many messages the window holds, and `at_most` of them, evenly spaced.

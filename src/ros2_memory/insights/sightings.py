@@ -477,7 +477,7 @@ def _robot(view: View, seen: StoredMessage, frame_id: str | None) -> Pose | None
     poses, it is one of these.
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
-    found = newest_in_session(view, view.memory.limits.pose_topic, window, seen.bag.recording)
+    found = newest_in_session(view, view.pose_topic, window, seen.bag.recording)
     message = None if found is None else view.bags.decode(found)
     if found is None or message is None:
         return None

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
 
-from ros2_memory.catalogue.map_digest import NO_STATICS, Statics, statics_of
+from ros2_memory.catalogue.map_digest import Statics, statics_of
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import StampedTransform
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.timeline import Timeline
 
 Topics: TypeAlias = "tuple[str, ...]"
+_Key: TypeAlias = "tuple[Topics, str | None]"
+"""The topics of static transforms, and that of poses where it is not the configured one."""
 
 
 @dataclass(slots=True)
@@ -46,6 +48,7 @@ class _SessionStatics:
 
     transforms: list[StampedTransform]
     changes: list[Ns]
+    poses: str | None
     periods: dict[int, Statics] = field(default_factory=dict)
 
     def at(self, time: Ns) -> Statics:
@@ -53,7 +56,7 @@ class _SessionStatics:
         number = bisect_right(self.changes, time + AT_OR_BEFORE_SLACK_NS)
         if number not in self.periods:
             since = self.changes[number - 1] if number else MIN_NS
-            self.periods[number] = statics_of(static_at(self.transforms, since))
+            self.periods[number] = statics_of(static_at(self.transforms, since), self.poses)
         return self.periods[number]
 
 
@@ -81,7 +84,7 @@ class _OfTimeline:
     sessions: dict[Session, _SessionStatics] = field(default_factory=dict)
 
 
-_OF_TIMELINES: Final[WeakKeyDictionary[Timeline, dict[Topics, _OfTimeline]]] = WeakKeyDictionary()
+_OF_TIMELINES: Final[WeakKeyDictionary[Timeline, dict[_Key, _OfTimeline]]] = WeakKeyDictionary()
 
 
 class BagStatics:
@@ -89,9 +92,11 @@ class BagStatics:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._topics = view.memory.limits.tf_static_topics
+        limits = view.memory.limits
+        self._topics = limits.tf_static_topics
+        self._poses = None if view.pose_topic == limits.pose_topic else view.pose_topic
         of_timeline = _OF_TIMELINES.setdefault(view.snapshot.timeline, {})
-        self._known = of_timeline.setdefault(self._topics, _OfTimeline())
+        self._known = of_timeline.setdefault((self._topics, self._poses), _OfTimeline())
         self._complete: dict[str, _SessionStatics] = {}
 
     def of(self, bag: BagFile) -> Statics:
@@ -106,7 +111,7 @@ class BagStatics:
             self._complete[folder] = known = self._statics(own)
             return known.at(bag.end)
         session = sessions.lending_to(bag.recording, bag.end)
-        return self._statics(session).at(bag.end) if session else NO_STATICS
+        return self._statics(session).at(bag.end) if session else statics_of((), self._poses)
 
     def remembered(
         self, digests: SegmentDigests, compute: Callable[[], dict[str, int]]
@@ -133,7 +138,7 @@ class BagStatics:
                         if sessions.has(session, found):
                             static += transforms
             static.sort(key=lambda each: each.log_time)
-            known = _SessionStatics(static, static_changes(static))
+            known = _SessionStatics(static, static_changes(static), self._poses)
             self._known.sessions[session] = known
         return known
 

@@ -8,6 +8,7 @@ answer is then computed from the bag, and is the same with the catalogue and wit
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
 from threading import Lock
 from typing import TYPE_CHECKING, Final
 
@@ -71,7 +72,7 @@ class MapDigests:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._settings = map_settings(view.memory.limits)
+        self._settings = replace(map_settings(view.memory.limits), pose_topic=view.pose_topic)
         self.statics = BagStatics(view)
 
     def valid_in(self, digests: SegmentDigests, segment: Segment) -> Mapping[str, int]:

@@ -64,7 +64,7 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._maps = MapDigests(view)
-        self._topic = view.memory.limits.pose_topic
+        self._topic = view.pose_topic
         self._reading: Deadline | None = None
         self._is_map = frame_id == view.memory.limits.map_frame
 

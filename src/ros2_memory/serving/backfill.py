@@ -315,7 +315,7 @@ def store_joined(memory: Memory) -> None:
     if memory.recall is None or not numbers:
         return
     catalogue, limits = memory.recall.catalogue, memory.limits
-    depends_on = f"{limits.max_plausible_speed_mps:g} {limits.pose_topic}"
+    depends_on = f"{limits.max_plausible_speed_mps:g} {view.pose_topic}"
     mark = f"joined {JOINED_VERSION} and counted to {MOST_JOINED} {depends_on}"
     if catalogue.joined(mark, [numbers]) is not None:
         return

@@ -74,7 +74,7 @@ def test_where_the_poses_are_on_one_other_topic_it_is_drawn_and_named(
     driven = [odom(T0 + n * S, float(n), 0.0, topic="/base/odometry") for n in range(3)]
     write_mcap(tmp_path / "bag.mcap", driven)
     assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 0
-    assert "positions are those of /base/odometry" in capsys.readouterr().err
+    assert "by /base/odometry, the only topic for it" in capsys.readouterr().err
 
 
 def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> None:

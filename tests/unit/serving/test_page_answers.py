@@ -479,11 +479,10 @@ def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: floa
 @pytest.mark.parametrize(
     ("message", "why"),
     [
-        (lambda at: odom(at, 0.0, 0.0, topic="/base"), "set data.pose_topic=/base"),
         (lambda at: fix(at, 0.0, 0.0), "latitude and longitude are on /fix"),
         (lambda at: tf(at, transform(at, "odom", "base", (0.0, 0.0, 0.0))), "get_transform_at"),
     ],
-    ids=["poses elsewhere", "a satellite receiver", "transforms"],
+    ids=["a satellite receiver", "transforms"],
 )
 def test_without_a_path_it_says_what_gives_one(
     tmp_path: Path, message: Callable[[int], Msg], why: str
@@ -492,3 +491,10 @@ def test_without_a_path_it_says_what_gives_one(
     found = shown(memory_of(tmp_path))
     assert found["path"] is None
     assert why in found["no_path"]
+
+
+def test_the_only_topic_of_poses_gives_the_path_with_a_note(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0, topic="/base")])
+    found = shown(memory_of(tmp_path))
+    assert (found["path"]["x"], found["path"]["y"]) == ([1.0], [2.0])
+    assert any(note.startswith("by /base, the only topic") for note in found["notes"])

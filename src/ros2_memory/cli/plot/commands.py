@@ -100,7 +100,7 @@ def plot_path(
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
     settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose, finds_poses=True)
+    memory = open_memory(settings, verbose=verbose)
     asked = opened(memory, parse_window(memory, start, end, last))
     with spinner("looking for the path"):
         path, subtitle, notes = path_in(asked, topic, frame)
@@ -168,7 +168,7 @@ def plot_timeline(
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
     settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose, finds_poses=True)
+    memory = open_memory(settings, verbose=verbose)
     asked = opened(memory, parse_window(memory, start, end, last))
     with spinner("looking what was recorded when"):
         found = recap_in(asked)
@@ -205,7 +205,7 @@ def plot_recap(
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
     settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose, finds_poses=True)
+    memory = open_memory(settings, verbose=verbose)
     if all(each is None for each in (start, end, last)):
         window = day_of(memory, day)
     elif day is None:
