@@ -88,6 +88,7 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
+from ros2_memory.things.find import unknown_label
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -486,7 +487,11 @@ def _notes_on_never(
     view: View, search: ReverseSearch, until: Ns, condition: Condition, min_score: float | None
 ) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null."""
-    notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+    notes = (
+        *_never(view, search, until),
+        *unasked_limit(condition, min_score),
+        *unknown_label(view, search.topics, condition),
+    )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 

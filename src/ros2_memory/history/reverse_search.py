@@ -18,7 +18,12 @@ from weakref import WeakKeyDictionary
 from ros2_memory.analysis.conditions import Equals, NearPosition, parse_condition, refusal_for
 from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
+from ros2_memory.core.errors import (
+    BagError,
+    InvalidArgumentsError,
+    QueryTimeoutError,
+    UndecodableError,
+)
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
@@ -49,6 +54,8 @@ _CONSTANT: Final = re.compile(
     r"^[ \t]*[a-z]+[0-9]*[ \t]+([A-Z][A-Z0-9_]*)[ \t]*=[ \t]*(-?[0-9]+)\b", re.MULTILINE
 )
 """A constant in the text of a message definition, as ROS 2 writes it."""
+_CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
+_NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_TEMPLATES: Final = 16
 """Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
@@ -70,7 +77,8 @@ def condition_of(
     """Returns the condition of a question; without a `min_score` of its own the configured one.
 
     `pattern` is the name or glob of the topics. Where all of these are of one type, the field may
-    be a full path in its messages, and the level of a log or status may be named (WARN).
+    be a full path in its messages, and the level of a log or status may be named (WARN), as may a
+    constant of the message definition where the field is a number.
 
     Raises:
         NoDataError: no such topic is recorded.
@@ -85,11 +93,35 @@ def condition_of(
         (type_name,) = types
         field = memory.extractor.own_path(field.strip(), type_name)
         value = level_number(value, field, type_name)
+        value = _constant_number(view, value, field, type_name)
     try:
         return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
     except InvalidArgumentsError as error:
         hint = unknown_name_hint(value, field, types)
         raise InvalidArgumentsError(f"{error}{hint}") from error
+
+
+def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
+    """Returns the number of a constant, where a condition on a number gives its whole name.
+
+    Else the value. A field is a number where the definition has one of its name.
+    """
+    word = value.strip() if isinstance(value, str) else ""
+    timeline = view.snapshot.timeline
+    topic = next((each for each in timeline.topics() if type_name in timeline.types_of(each)), None)
+    if not _CONSTANT_NAME.fullmatch(word) or topic is None:
+        return value
+    try:
+        channels = [*view.memory.reader.channels(timeline.first_with(topic, type_name).path)]
+    except BagError:
+        return value
+    is_number = re.compile(_NUMBER_FIELD.format(re.escape(field.rpartition(".")[2])), re.MULTILINE)
+    for each in channels:
+        text = each.schema.text.decode("utf-8", "replace")
+        if each.type == type_name and is_number.search(text):
+            found = {number for name, number in _CONSTANT.findall(text) if name == word}
+            return int(found.pop()) if len(found) == 1 else value
+    return value
 
 
 def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
@@ -108,7 +140,9 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     named = [f"{', '.join(each)} ({topic})" for topic, each in frames if each]
     if not named:
         return ()
-    compared = f"near_position compared x and y in the frame of each message: {listed(named)}"
+    within = f"within {condition.test.tolerance_m:g} m"
+    compared = f"near_position compared x and y ({within}) in the frame of each message: "
+    compared += listed(named)
     return (f"{compared}; {_ELSEWHERE}",)
 
 

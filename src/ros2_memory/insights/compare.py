@@ -13,7 +13,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, Undecoda
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import place_at
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.coverage import note_unread, note_unrecorded, recording_gaps
+from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
 from ros2_memory.history.driven_path import length_notes, pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.transforms import sessions_of
@@ -120,6 +120,9 @@ def _things(
     known = known_things(view, limits.min_score, limits.labels)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))
     frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
+    if any(gap_around(view, each) is not None for each in windows):
+        view.notes.add("things are not compared: there is nothing to compare them with")
+        return frame, ComparedThings((), (), (), (), 0)
     if first.start == second.start:
         view.notes.add("things are not compared: the two times begin together")
         return frame, ComparedThings((), (), (), (), 0)

@@ -148,7 +148,7 @@ def _compared(answer: results.Comparison, most: int) -> JsonObject:
         reply["way"] = {name: _pair(pair, 2) for name, pair in answer.way}
     reply |= way
     for key, places, found in (
-        ("minutes", 1, answer.places),
+        ("minutes", 2, answer.places),
         ("errors", 0, answer.errors),
         ("silent_s", 0, answer.silences),
     ):

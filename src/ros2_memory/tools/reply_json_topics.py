@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.core.text import listed, shortened
-from ros2_memory.core.timebase import Ns, unix_rounded_up
+from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
 from ros2_memory.tools.reply_json import (
     ROBOT_NAME,
     LocalTimes,
@@ -328,7 +328,7 @@ def _changes(changes: Sequence[results.PastChange]) -> list[JsonValue]:
 @render.register(results.Before)
 def _before(answer: results.Before) -> JsonObject:
     reply: JsonObject = {
-        "around": moment(answer.at),
+        "around": round(unix_from_ns(answer.at), 6),
         "seconds_before": seconds(answer.length),
         "before": _changes(answer.changes),
     }

@@ -188,6 +188,24 @@ class TestPaths:
         held = json.loads(shown)["held"]
         assert (code, held["recordings"], held["messages"]) == (0, recordings, messages)
 
+    def test_topics_without_messages_are_named_and_many_faults_of_clocks_are_one_row(
+        self, tmp_path: Path, capsys: Capture
+    ) -> None:
+        declared = [("/idle", "std_msgs/msg/Bool"), ("/lost", "std_msgs/msg/Bool")]
+        write_mcap(tmp_path / "a" / "a_0.mcap", seconds(0, 3), declared=declared)
+        for nth in range(7):
+            boot = [odom(nth * 100 * NS_PER_S, 0.0, 0.0)]  # before the clock was set
+            write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
+        _, shown = run(capsys, "info", tmp_path)
+        words = " ".join(shown.split())
+        assert "topics_without_messages /idle, /lost" in words
+        assert "silent_topics" not in words
+        assert words.count("the clock was not set") == 1
+        _, shown = run(capsys, "info", tmp_path, "--json")
+        reply = json.loads(shown)
+        assert reply["held"]["topics_without_messages"] == ["/idle", "/lost"]
+        assert len(reply["data_time_range"]["clock_faults"]) == 7
+
 
 class TestRecordings:
     def test_folders_are_recordings_and_so_are_files_that_lie_loose(

@@ -17,7 +17,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, battery, boolean, detections, odom, write_mcap
+from tests.support.bags import Msg, battery, boolean, detections, odom, text, write_mcap
 from tests.support.memories import memory_of, recalling
 from tests.support.noting_reader import NotingReader
 
@@ -65,6 +65,21 @@ def test_a_text_for_a_number_is_refused_with_the_constants_of_that_name(tmp_path
     with pytest.raises(InvalidArgumentsError, match=r"must be a number$"):
         queries.find_last_match(*asked, "asleep", field="power_supply_status")
     assert queries.find_last_match(*asked, 2, field="power_supply_status").found is not None
+
+
+def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.5), text(T0, "POWER_SUPPLY_STATUS_FULL")])
+    memory, call = memory_of(tmp_path), Call()
+
+    def newest(word: str, topic: str = "/battery_state", field: str = "power_supply_status") -> int:
+        found = queries.find_last_match(memory, call, topic, "equals", word, field=field).found
+        return 0 if found is None else found.sample.time
+
+    assert newest("POWER_SUPPLY_STATUS_DISCHARGING") == T0
+    assert newest("POWER_SUPPLY_STATUS_CHARGING") == 0
+    assert newest("POWER_SUPPLY_STATUS_FULL", "/chatter", "value") == T0  # a text stays one
+    with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
+        newest("POWER_SUPPLY_STATUS_EMPTY")
 
 
 def last(

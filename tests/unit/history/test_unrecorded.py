@@ -96,4 +96,7 @@ def test_recap_and_compare_say_first_that_nothing_was_recorded(
     note = f"nothing was recorded between {start}.000000 and {end}.000000"
     assert asked(memory, bag_dir, "recap", start=start, end=end)["notes"][0] == note
     other = {"with_start": T0_S, "with_end": T0_S + 30}
-    assert asked(memory, bag_dir, "compare", start=start, end=end, **other)["notes"][0] == note
+    reply = asked(memory, bag_dir, "compare", start=start, end=end, **other)
+    assert reply["notes"][0] == note
+    assert "things are not compared: there is nothing to compare them with" in reply["notes"]
+    assert (reply["things"], reply["things_unchanged"]) == ({}, 0)

@@ -143,6 +143,7 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
     assert reply["before"] == []
     assert reply["recorded"] == ["/bumper", "/diagnostics", "/rosout"]
     assert reply["notes"] == ["nothing changed on the recorded topics in the 10 s before"]
+    assert before(tmp_path, 7.123457, recalls=recalls)["around"] == at(7.123457) / 1e9
     later = before(tmp_path, 500.0, recalls=recalls)["notes"]
     assert "nothing was recorded in the 10 s before" in later
     assert not [each for each in later if "nothing changed" in each]

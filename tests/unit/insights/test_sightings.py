@@ -188,8 +188,8 @@ def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recall
     place: JsonValue = {"x": 9.0, "y": 9.0}
     asked = (memory, Call(), "/odom", "near_position", place)
     note = (
-        "near_position compared x and y in the frame of each message: odom (/odom); for a place in "
-        "another frame, such as the map, ask visits, or give where"
+        "near_position compared x and y (within 0.5 m) in the frame of each message: odom (/odom); "
+        "for a place in another frame, such as the map, ask visits, or give where"
     )
     assert note in find_matches(*asked).notes
     found = find_matches(*asked[:2], "/odom", "near_position", {"x": 1.0, "y": 2.0})

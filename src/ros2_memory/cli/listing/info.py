@@ -29,12 +29,14 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.config import Settings
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.text import counted
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
+from ros2_memory.history.view import View
 from ros2_memory.index.recordings import recordings_of
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.status import nothing_here
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
@@ -42,7 +44,12 @@ from ros2_memory.results import TopicRow
 
 _WHOLE_REPLY: Final = "server.max_reply_chars=1000000000"
 """A planner's context is short; a person's screen scrolls."""
-_TOLD_TWICE: Final = frozenset({"earliest_local", "latest_local", "now_local", "newest_age_s"})
+_TOLD_TWICE: Final = frozenset(
+    {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics"}
+)
+_MOST_ROWS: Final = 5
+"""Faults of clocks that are printed one by one; more are summed up."""
+_MOST_SILENT: Final = 30
 _OWN_LISTS: Final = re.compile(r"data_time_range (?:lists them|says why|has the details)")
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
@@ -182,6 +189,7 @@ class _Report(NamedTuple):
         held: how much is recorded.
         replies: those of the tools, by name.
         lists: what may confuse; each may be empty.
+        summed: what is printed in place of long lists of the replies.
     """
 
     empty: str | None
@@ -189,6 +197,7 @@ class _Report(NamedTuple):
     held: dict[str, JsonValue]
     replies: dict[str, JsonValue]
     lists: dict[str, list[JsonValue]]
+    summed: dict[str, JsonValue]
 
     def as_json(self) -> dict[str, JsonValue]:
         """Returns all of it."""
@@ -201,7 +210,11 @@ class _Report(NamedTuple):
             return
         console = stdout_console()
         parts = map(_for_people, self.replies.values())
-        print_reply(console, {**self.held, **dict(chain.from_iterable(map(dict.items, parts)))})
+        found = {**self.held, **dict(chain.from_iterable(map(dict.items, parts)))}
+        silent = found.get("topics_without_messages")
+        if isinstance(silent, list):
+            found["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
+        print_reply(console, found | self.summed)
         for name, rows in self.lists.items():
             if rows:
                 print_reply(console, {name: rows})
@@ -237,7 +250,38 @@ def _report(settings: Settings, *, verbose: bool, setting: str | None = None) ->
     if not _has_files(snapshot):
         empty = f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}"
     by_tool = dict(zip(tools, replies, strict=True))
-    return _Report(empty, bool(snapshot.bags), _held(snapshot), by_tool, lists)
+    summed = _summed_faults(memory, snapshot)
+    return _Report(empty, bool(snapshot.bags), _held(snapshot), by_tool, lists, summed)
+
+
+def _summed_faults(memory: Memory, snapshot: Snapshot) -> dict[str, JsonValue]:
+    """Returns one row for the steps of a clock, and one for the bags it misdated, if many."""
+    summed: dict[str, JsonValue] = {}
+    steps = clock_steps(View(memory, Call())) if snapshot.bags else ()
+    if len(steps) > _MOST_ROWS:
+        largest = max(steps, key=lambda each: abs(each.by))
+        summed["clock_steps"] = [
+            {
+                "steps": len(steps),
+                "first": unix_from_ns(steps[0].at),
+                "last": unix_from_ns(steps[-1].at),
+                "largest_s": round(unix_from_ns(largest.by), 3),
+                "largest_at": unix_from_ns(largest.at),
+            }
+        ]
+    faults = snapshot.dating.faults
+    if len(faults) > _MOST_ROWS:
+        ordered = sorted(faults, key=lambda each: each.bag.start)
+        worst = max(faults, key=lambda each: each.by)
+        summed["clock_faults"] = [
+            {
+                "bags": len(faults),
+                "first": ordered[0].bag.path.name,
+                "last": ordered[-1].bag.path.name,
+                "largest": f"{worst.bag.path.name}: {worst.reason}",
+            }
+        ]
+    return summed
 
 
 def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
@@ -257,6 +301,8 @@ def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
     }
     if snapshot.empty:
         held["empty_bags"] = len(snapshot.empty)
+    if snapshot.silent_topics:
+        held["topics_without_messages"] = [*sorted(snapshot.silent_topics)]
     return held
 
 
