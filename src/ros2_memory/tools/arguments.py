@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import partial
 from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
@@ -53,9 +54,12 @@ LONGEST_REASON_S: Final = 60.0
 """How far before a time `recap` looks for changes (`around`)."""
 
 
-_RELATIVE: Final = ("ago", "now")
-"""How texts end that are times before now."""
+_RELATIVE: Final = re.compile(r".*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
+"""Times before now, as people write them."""
+_WITHOUT_DATE: Final = re.compile(r"today|yesterday|\d{1,2}:\d\d")
 _AGO: Final = "for a time before now give seconds_ago, seconds or last_s, where a tool has it"
+_DATE: Final = "give the date, too: now_local of data_time_range has today's"
+# Not today's by this machine: of replayed bags (`data.now=latest`) now is another day.
 
 
 def _as_list(value: object) -> object:
@@ -75,9 +79,11 @@ def _read_time(value: object) -> object:
     try:
         seconds = unix_from_text(value)
     except ValueError as error:
-        if not value.strip().endswith(_RELATIVE):
-            raise
-        raise ValueError(f"{error}; {_AGO}") from None
+        if _RELATIVE.fullmatch(value.strip().lower()):
+            raise ValueError(f"{error}; {_AGO}") from None
+        if _WITHOUT_DATE.match(value.strip().lower()):
+            raise ValueError(f"{error}; {_DATE}") from None
+        raise
     if seconds > LATEST_UNIX_S:
         raise ValueError("is after the year 2262, up to which times are recorded")
     return seconds

@@ -356,10 +356,12 @@ def test_what_is_no_time_is_told() -> None:
     told = refusal("get_position_at", timestamp="yesterday")
     assert told == (
         'timestamp was "yesterday", which is not a valid time in ISO 8601, such as '
-        "2026-11-20T14:05:00; "
+        "2026-11-20T14:05:00; give the date, too: now_local of data_time_range has today's; "
         "expected Unix seconds or ISO 8601 text, e.g. 1784023200.5"
     )
-    for text in ("10 s ago", "now"):
+    for text in ("14:05", "yesterday 14:05", "9:30"):
+        assert "give the date, too" in refusal("get_position_at", timestamp=text)
+    for text in ("10 s ago", "now", "10m", "2 hours"):
         assert "give seconds_ago, seconds or last_s" in refusal("get_position_at", timestamp=text)
     assert "is a Fri, not a Wed" in refusal("recap", start="Wed 2026-11-20", end=2e9)
     assert "is after the year 2262" in refusal("recap", start=0, end="2300-01-01")
