@@ -575,7 +575,8 @@ def build_dispatcher(
     tools = build_tools(
         memory.limits,
         additions=server.tools == "all",
-        writing=server.write_tools,
+        # Where nothing records nothing is deleted, and nobody would save a moment.
+        writing=server.write_tools and not isinstance(settings.recorder, NullRecorderNode),
     )
     if fleet is not None:
         from ros2_memory.fleet.tools import fleet_tools

@@ -71,8 +71,14 @@ async def test_every_tool_has_a_title_which_marks_those_that_may_take_long(tmp_p
         assert title.endswith(" (blocking)") == (tool.description or "").startswith("Blocking")
 
 
-async def test_hints_say_what_a_call_changes(tmp_path: Path) -> None:
+async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path) -> None:
     async with Client(server(tmp_path, "server.write_tools=true")) as client:
+        assert "remember_moment" not in {each.name for each in (await client.list_tools()).tools}
+
+
+async def test_hints_say_what_a_call_changes(tmp_path: Path) -> None:
+    chosen = ("server.write_tools=true", "recorder=ros2bag")
+    async with Client(server(tmp_path, *chosen)) as client:
         hints = {tool.name: tool.annotations for tool in (await client.list_tools()).tools}
     assert all(hint and hint.open_world_hint is False for hint in hints.values())
     writing = {name for name, hint in hints.items() if hint and not hint.read_only_hint}
