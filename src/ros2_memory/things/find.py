@@ -345,18 +345,22 @@ def _notes(
 
 def _unknown(label: str, key: str, names: Sequence[str]) -> str:
     """Returns the sentence on a label that is none of these names, with the nearest ones."""
-    close = [each for each in names if key in each or each in key]
-    close += difflib.get_close_matches(key, names, 3)
+    close = _like(key, names)
     shown = [*dict.fromkeys(close)] or names
     meant = f"; did you mean {close[0]}?" if close else ""
     return f"no detector reported {abbreviate(label)}; there are: {listed(shown)}{meant}"
 
 
-def unknown_label(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
-    """Returns the sentence on a text that no detector has reported, for an answer of "never".
+def _like(key: str, names: Sequence[str]) -> list[str]:
+    close = [each for each in names if key in each or each in key]
+    return close + difflib.get_close_matches(key, names, 3)
 
-    Nothing where none of the topics is a detector's, where some label has the text, and while not
-    all bags are known.
+
+def unknown_label(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+    """Returns the sentence on labels like a text that no detector has reported, for a "never".
+
+    Nothing where no label is like it, where none of the topics is a detector's, where some label
+    has the text, and while not all bags are known.
     """
     text = plain_text(condition.test)
     if text is None or not text.strip():
@@ -371,6 +375,7 @@ def unknown_label(view: View, topics: Sequence[str], condition: Condition) -> tu
     if known.since is not None or not set(topics) & set(sights.topics):
         return ()
     names = sorted(set(map(plain, sights.labels)))
-    if not names or any(text.casefold() in each.casefold() for each in sights.labels):
+    is_known = any(text.casefold() in each.casefold() for each in sights.labels)
+    if is_known or not _like(plain(text), names):
         return ()
     return (_unknown(text, plain(text), names),)

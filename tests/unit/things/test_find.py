@@ -281,7 +281,7 @@ def test_never_names_the_labels_that_are_like_the_one_that_was_sought(
 
     for tool in ("find_matches", "find_last_match"):
         assert notes(tool, "scisors") == [near]
-        assert notes(tool, "scisors", "/chatter") == []
+        assert notes(tool, "scisors", "/chatter") == notes(tool, "chair") == []
     reply = asked(
         memory,
         tmp_path,
