@@ -451,6 +451,8 @@ class Status(AnswerWithNotes):
         now: what ages count from.
         earliest: the oldest recorded time; None if nothing is recorded.
         latest: the newest one.
+        heard: while a recorder runs, the newest time of a topic that it does not publish itself;
+            else `latest`.
         recorder: its state; None where no recorder has written here.
         live: whether it is running.
         restarts: how often it restarted `ros2 bag record`; 0 without a recorder.
@@ -471,6 +473,7 @@ class Status(AnswerWithNotes):
     now: Ns
     earliest: Ns | None
     latest: Ns | None
+    heard: Ns | None
     recorder: str | None
     live: bool
     restarts: int

@@ -121,7 +121,7 @@ class Observation:
             return "no data"
         if self.status.now == latest != self.now:
             return f"{format_time(unix_from_ns(latest))}, which is now (data.now=latest)"
-        age_s = unix_from_ns(self.status.now - latest)
+        age_s = unix_from_ns(self.status.now - (self.status.heard or latest))
         if age_s < 0:
             return f"dated {format_duration(-age_s)} ahead of the clock"
         return f"{format_duration(age_s)} old"

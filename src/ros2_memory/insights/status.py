@@ -12,6 +12,7 @@ from ros2_memory.history.coverage import (
     describe_excluded,
     describe_interrupted,
     describe_lost,
+    unix_text,
     was_forgotten,
 )
 from ros2_memory.history.robots import describe_mixed
@@ -21,6 +22,7 @@ from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.saved_moments import newest_moments, unlisted
 from ros2_memory.insights.silences import silences_of
+from ros2_memory.recorder.policies import OWN_TOPICS
 from ros2_memory.results import Budget, SilentTopic, Status, Undecodable
 
 if TYPE_CHECKING:
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
+_UNHEARD_NS: Final[Ns] = 30 * NS_PER_S
+"""As long as a silence lasts at least."""
 MAX_MOMENTS: Final = 5
 """Saved moments in a status; the resource has more."""
 _SILENT_PERIODS: Final = 10
@@ -55,6 +59,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     live = heartbeat is not None and heartbeat.is_live(wall)
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
+    heard = _heard(snapshot) if live else latest
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)
@@ -64,6 +69,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         now=now,
         earliest=snapshot.dating.earliest,
         latest=latest,
+        heard=heard,
         recorder=None if heartbeat is None else str(heartbeat.state),
         live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
@@ -80,6 +86,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         moments=moments,
         problems=(
             *problems_of(snapshot, heartbeat, wall),
+            *_describe_unheard(heard, latest),
             *missing_data(view),
             *describe_interrupted(snapshot, memory.index.bag_dir, TimeWindow.everything()),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
@@ -91,6 +98,31 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
         ),
     )
+
+
+def _heard(snapshot: Snapshot) -> Ns | None:
+    """Returns the newest time of a topic that no recorder publishes itself; else of any.
+
+    The recorder logs at each split, so its own topics go on when the robot is dead.
+    """
+    timeline = snapshot.timeline
+    times = [
+        stated.last
+        for topic in timeline.topics()
+        if topic not in OWN_TOPICS
+        for stated in timeline.totals(topic).values()
+    ]
+    latest = snapshot.dating.latest
+    return latest if latest is None or not times else min(max(times), latest)
+
+
+def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:
+    """Yields that only the recorder's own topics go on, if they do."""
+    if heard is not None and latest is not None and latest - heard > _UNHEARD_NS:
+        yield (
+            f"no message since {unix_text(heard)} but on topics that the recorder publishes "
+            "itself, such as /rosout"
+        )
 
 
 def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:

@@ -20,7 +20,9 @@ SILENT_SPLITS: Final = 3
 """Splits without growth after which a robot counts as silent."""
 WAITING_S: Final = 30.0
 """A recorder that has recorded nothing for so long, and for a split, waits for something."""
-OWN_TOPICS: Final = frozenset({"/rosout", "/parameter_events", MESSAGES_LOST})
+OWN_TOPICS: Final = frozenset(
+    {"/rosout", "/parameter_events", "/events/write_split", MESSAGES_LOST}
+)
 """Topics that each recorder publishes itself: they do not show that it hears the robot."""
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""

@@ -123,7 +123,7 @@ def _doubts(answer: results.Status) -> Iterator[str]:
 
 @render.register(results.Status)
 def _status(answer: results.Status) -> JsonObject:
-    latest = answer.latest
+    latest, heard = answer.latest, answer.heard
     local = LocalTimes(answer.earliest, answer.now)
     lists: dict[str, list[JsonValue]] = {
         "fell_silent": [
@@ -150,7 +150,7 @@ def _status(answer: results.Status) -> JsonObject:
         "earliest": moment(answer.earliest),
         "latest": moment(latest),
         **local.of(answer.earliest, latest),
-        "newest_age_s": None if latest is None else max(seconds(answer.now - latest), 0.0),
+        "newest_age_s": None if heard is None else max(seconds(answer.now - heard), 0.0),
         **{name: topics[:_MAX_TOPICS] for name, topics in lists.items()},
         "damaged": answer.damaged,
         "incomplete": answer.incomplete,

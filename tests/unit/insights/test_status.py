@@ -19,7 +19,7 @@ from ros2_memory.queries import topic_range
 from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
+from tests.support.bags import Msg, boolean, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
 
@@ -71,6 +71,18 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     assert told["never_heard"] == ["/b"]
     assert (told["restarts"], told["missing"]) == (0, [])
     assert told["fell_silent"] == []
+
+
+def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> None:
+    """The robot died at 10 s, and the recorder logs each split that it opens."""
+    driven = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(11)]
+    splits = [log_entry(BEGIN + t * S, 20, "rosbag2_recorder", "opened") for t in range(0, 60, 10)]
+    memory = remembering(tmp_path, [*driven, *splits])
+    assert shown(memory, tmp_path)["newest_age_s"] == 10.0  # of whoever recorded this
+    beating(tmp_path, RecorderState.RECORDING, 59)
+    told = shown(memory, tmp_path)
+    assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
+    assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["trust"]
 
 
 def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole(
