@@ -61,7 +61,7 @@ from ros2_memory.history.reverse_search import (
     may_be_elsewhere,
     unasked_limit,
 )
-from ros2_memory.history.robots import note_robots, note_robots_near
+from ros2_memory.history.robots import note_robots_near, require_one_robot
 from ros2_memory.history.view import (
     AtTime,
     TimeRange,
@@ -441,7 +441,7 @@ def trajectory_summary(
     note_unrecorded(view, window)
     if len(path.frames) > 1:
         view.notes.add(f"poses in several frames were joined: {', '.join(path.frames)}")
-    note_robots(view, name, window)
+    require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
     elapsed = elapsed_in(view, window)

@@ -54,6 +54,7 @@ class NoDataReason(StrEnum):
     UNDECODABLE = "undecodable"
     FRAME_UNKNOWN = "frame_unknown"
     FRAMES_NOT_CONNECTED = "frames_not_connected"
+    MIXED = "mixed"
     EMPTY_MEMORY = "empty_memory"
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
-from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
@@ -243,14 +243,40 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     return parents
 
 
-def note_robots(view: View, topic: str, window: TimeWindow) -> None:
-    """Notes the recordings that hold messages of their own on a topic at the same time.
+def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
+    """Checks that a path by this topic is that of one robot: else it jumps between several.
 
-    Adds no note about latched topics, which each recording receives again, or where the time for
-    the answer is over before it is known.
+    Raises:
+        NoDataError: recordings hold messages of their own on the topic at the same time.
+    """
+    names = _recordings_apart(view, topic, window)
+    if names:
+        raise NoDataError(
+            NoDataReason.MIXED,
+            f"{len(names)} recordings have different messages on {topic} at the same time, as "
+            f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
+            "a time with one of them, or set data.recording to one",
+        )
+
+
+def note_robots(view: View, topic: str, window: TimeWindow) -> None:
+    """Notes the recordings that hold messages of their own on a topic at the same time."""
+    names = _recordings_apart(view, topic, window)
+    if names:
+        view.notes.add(
+            f"{len(names)} recordings have different messages on {topic} at the same time, as "
+            f"from several robots, and the answer does not separate them: {listed(names)}"
+        )
+
+
+def _recordings_apart(view: View, topic: str, window: TimeWindow) -> list[str]:
+    """Returns the recordings that hold messages of their own on a topic at the same time.
+
+    None for latched topics, which each recording receives again, or where the time for the answer
+    is over before it is known.
     """
     if topic in view.snapshot.timeline.transient_local:
-        return
+        return []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
     try:
@@ -258,16 +284,11 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
             if not apart.issuperset(pair) and _differ(view, topic, pair, both):
                 apart.update(pair)
     except QueryTimeoutError:
-        return
+        return []
     finally:
         # The answer itself needed nothing of what was read here.
         view.notes.retract_before(MAX_NS, noted_before)
-    if apart:
-        names = sorted(each.name for each in apart)
-        view.notes.add(
-            f"{len(names)} recordings have different messages on {topic} at the same time, as "
-            f"from several robots, and the answer does not separate them: {listed(names)}"
-        )
+    return sorted(each.name for each in apart)
 
 
 def note_robots_near(view: View, found: StoredMessage) -> None:

@@ -34,7 +34,7 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.robots import note_robots
+from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.pose_frames import placed_waypoints
@@ -93,7 +93,7 @@ def driven_inside(
     elapsed = elapsed_in(view, window)
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
-    note_robots(view, name, window)
+    require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
     return DrivenInside(

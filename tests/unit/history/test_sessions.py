@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
+from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import (
     find_last_match,
@@ -30,6 +32,7 @@ from tests.support.memories import memory_of, recalling
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
 
 S = 10**9
@@ -320,8 +323,13 @@ def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> Non
     memory = remembered(tmp_path, recalls=recalls)
     begin, end = unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S)
     at = AtTime(unix_from_ns(BEGIN + 5 * S))
+    somewhere: JsonValue = {"x": 0.0, "y": 0.0, "radius_m": 9.0}
+    for path_of in (trajectory_summary, partial(driven_inside, where=somewhere)):
+        with pytest.raises(NoDataError, match="one path over them would be wrong") as refused:
+            path_of(memory, Call(), TimeRange(begin, end))
+        assert refused.value.reason is NoDataReason.MIXED
+        assert "as from several robots: r1, r2;" in refused.value.detail
     for answer in (
-        trajectory_summary(memory, Call(), TimeRange(begin, end)),
         recap(memory, Call(), TimeRange(begin, end)),
         position(memory, Call(), at),
         find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
