@@ -21,6 +21,7 @@ from ros2_memory.core.errors import (
     NoDataReason,
 )
 from ros2_memory.core.model import Pose, Sample, TimeWindow
+from ros2_memory.core.regions import place_at
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -52,6 +53,8 @@ from ros2_memory.history.no_data import (
     resolve_pose_topic,
     resolve_topic,
     seconds,
+    topics_that_show_poses,
+    topics_with,
     with_notes,
 )
 from ros2_memory.history.reverse_search import (
@@ -87,7 +90,7 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
-from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
+from ros2_memory.places.pose_frames import placed, placed_waypoints, robot_body, with_place
 from ros2_memory.things.find import unknown_label
 
 if TYPE_CHECKING:
@@ -175,7 +178,29 @@ def position(
     In the pose's own frame, or in `frame_id`. A topic of a satellite receiver gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
-    name = resolve_pose_topic(view, topic, degrees=True)
+    try:
+        name = resolve_pose_topic(view, topic, degrees=True)
+    except NoDataError as error:
+        by_transforms = None
+        if topic is None and error.reason is NoDataReason.TOPIC_NOT_RECORDED:
+            by_transforms = _position_of_body(view, at, now, frame_id)
+        if by_transforms is None:
+            raise
+        return by_transforms
+    return _position_by(view, name, at, now, tolerance_s=tolerance_s, frame_id=frame_id)
+
+
+def _position_by(
+    view: View,
+    name: str,
+    at: Ns,
+    now: Ns | None,
+    *,
+    tolerance_s: float | None,
+    frame_id: str | None,
+) -> results.Position:
+    """Returns the newest pose of a topic at or before a moment; see `position`."""
+    memory = view.memory
     _require_kind(view, name, "position", "geodetic")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
@@ -201,6 +226,30 @@ def position(
             pose = with_place(view, pose, found.time, recording)
     notes = view.notes.sentences()
     return results.Position(name, found.time, pose, _age(found, now), geodetic, notes=notes)
+
+
+def _position_of_body(
+    view: View, at: Ns, now: Ns | None, frame_id: str | None
+) -> results.Position | None:
+    """Returns where transforms have the robot's body; None where a topic has poses, or none moves.
+
+    Raises:
+        NoDataError: no transform brackets the moment.
+    """
+    if topics_with(view, "position") or topics_that_show_poses(view):
+        return None
+    body = robot_body(view)
+    if body is None:
+        return None
+    parent = frame_id or body.parent
+    found = frame_history.transform_at(view, parent, body.child, at).transform
+    place = place_at(view.memory.limits.places, parent, *found.translation[:2])
+    view.notes.add(f"by transforms, of {body.child} in {parent}: no topic has the robot's poses")
+    note_unread(view, TimeWindow.around(at, TF_CACHE_NS))
+    pose = Pose(found.translation, found.rotation, parent, place)
+    age = None if now is None else now - at
+    topic = next(iter(view.memory.limits.tf_topics))
+    return results.Position(topic, at, pose, age, notes=view.notes.sentences())
 
 
 def velocity(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.map_digests import MapDigests
@@ -298,7 +299,7 @@ def test_a_topic_of_an_unlisted_type_is_named_where_its_messages_have_poses(
 
 @each_way
 @pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
-def test_where_there_are_transforms_alone_the_tool_for_them_is_named(
+def test_transforms_alone_give_the_position_and_name_the_tools_for_them(
     tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
 ) -> None:
     moved = [
@@ -306,10 +307,31 @@ def test_where_there_are_transforms_alone_the_tool_for_them_is_named(
     ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", moved)
     reply = ask(tmp_path, recalls, tool, **given)
-    assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
-    assert "transforms are on /tf: get_transform_at returns" in reply["detail"]
+    if tool == "get_position_at":
+        assert (reply["x"], reply["frame_id"], reply["topic"]) == (1.0, "odom", "/tf")
+        assert reply["notes"][0].startswith("by transforms, of base_link in odom")
+    else:
+        assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
+        assert "transforms are on /tf: get_position_at answers by them" in reply["detail"]
     asked_for = {"parent": "odom", "child": "base_link", "timestamp": T0_S + 1}
     assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
+
+
+def test_the_body_is_placed_in_the_map_and_in_a_named_place(tmp_path: Path) -> None:
+    at = T0 + S
+    chain = (
+        transform(at, "map", "odom", (5.0, 0.0, 0.0)),
+        transform(at, "odom", "base_link", (1.0, 0.0, 0.0), YAW),
+        transform(at, "base_link", "arm", (0.0, 9.0, 0.0)),
+    )
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [tf(at, *chain)])
+    door = Place("door", "map", Circle(6.0, 0.0, 0.5))
+    found = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 1, limits={"places": (door,)})
+    assert (found["x"], found["frame_id"], found["in"]) == (6.0, "map", "door")
+    assert found["yaw_deg"] == pytest.approx(30)
+    asked_for = {"timestamp": T0_S + 1, "frame_id": "odom"}
+    assert ask(tmp_path, False, "get_position_at", **asked_for)["x"] == 1.0
+    assert "error" in ask(tmp_path, False, "get_position_at", timestamp=T0_S + 300)
 
 
 def test_where_no_topic_has_velocities_the_tool_that_computes_them_is_named(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from ros2_memory.cli.output import format_duration
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.no_data import topics_that_show_poses, topics_with
-from ros2_memory.history.transforms import edges, transform_at
+from ros2_memory.history.transforms import transform_at
+from ros2_memory.places.pose_frames import Body, robot_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 _MOST_MOMENTS: Final = 300
 """Transforms that are looked up: each takes some milliseconds."""
 _MOST_FIXES: Final = 4000
-_BODIES: Final = ("base_footprint", "base_link")
 _RADIUS_M: Final = 6_378_137.0
 _ECCENTRICITY_SQUARED: Final = 6.694_379_990_14e-3
 """Of the ellipsoid of WGS 84."""
@@ -64,29 +64,26 @@ def path_without_poses(
         NoDataError: there is nothing of it in this time, or it leads to no frame.
     """
     fixes = [each.partition(" ")[0] for each in topics_with(view, "geodetic")]
+    body = robot_body(view)
     if topic is not None:
         if topic in fixes:
             return _by_fixes(view, window, topic)
-        return (
-            _by_transforms(view, window, frame) if topic in view.memory.limits.tf_topics else None
-        )
+        if body is None or topic not in view.memory.limits.tf_topics:
+            return None
+        return _by_transforms(view, window, body, frame)
     if topics_with(view, "position") or topics_that_show_poses(view):
         return None
-    if any(not each.static for each in edges(view)):
-        return _by_transforms(view, window, frame)
+    if body is not None:
+        return _by_transforms(view, window, body, frame)
     return _by_fixes(view, window, fixes[0]) if fixes else None
 
 
-def _by_transforms(view: View, window: TimeWindow, frame: str | None) -> FoundPath:
+def _by_transforms(
+    view: View, window: TimeWindow, found_body: Body, frame: str | None
+) -> FoundPath:
     """Returns the path of the robot's body in the map, or in the root of its frames."""
-    parents = {each.child: each.parent for each in edges(view)}
-    moving = [each.child for each in edges(view) if not each.static]
-    above = {child: _above(child, parents) for child in moving}
-    # The robot's body, by its name; else what moves in the root itself.
-    body = min(moving, key=lambda each: (_rank(each), len(above[each]), each))
-    map_frame = view.memory.limits.map_frame
-    root = map_frame if map_frame in above[body] else above[body][-1]
-    parent = root if frame is None else frame
+    parent, body, others = found_body
+    parent = parent if frame is None else frame
     found: list[tuple[Ns, float, float]] = []
     failure: NoDataError | None = None
     for at in np.linspace(window.start, window.stop - 1, _MOST_MOMENTS).astype(np.int64).tolist():
@@ -100,26 +97,11 @@ def _by_transforms(view: View, window: TimeWindow, frame: str | None) -> FoundPa
     if not found:
         raise failure or NoDataError(NoDataReason.OUTSIDE_RANGE, "no transform in this time")
     path = _drawn(parent, found)
-    others = sorted({each for each in moving if each != body})
     notes = [*view.notes.sentences()]
     if others:
         notes.append(f"other frames that move: {', '.join(others[:5])}; get_transform_at has them")
     by = f"{body} in {parent} by transforms, at {len(found)} times"
     return path, f"{_line(path)}; {by}", notes
-
-
-def _above(frame: str, parents: dict[str, str]) -> list[str]:
-    """Returns the frames above a frame, the nearest first; a loop ends it."""
-    found: list[str] = []
-    while frame in parents and parents[frame] not in found:
-        frame = parents[frame]
-        found.append(frame)
-    return found
-
-
-def _rank(frame: str) -> int:
-    name = frame.rpartition("/")[2]
-    return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
 
 def _by_fixes(view: View, window: TimeWindow, topic: str) -> FoundPath:
