@@ -17,6 +17,8 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap import bag_file
+from ros2_memory.storage.mcap.index import chunk_data
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
 from tests.support.mcap_surgery import (
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
     from mcap.records import ChunkIndex
 
     from ros2_memory.storage.base import Record
+    from ros2_memory.storage.file_io import OpenFile
+    from ros2_memory.storage.mcap.summary import Chunk
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"
@@ -67,6 +71,23 @@ class TestReadingOnlyWhatIsWanted:
         assert list(reader.log_times(path, "/chatter", TimeWindow(5, 9))) == [5, 6, 7, 8]
         with pytest.raises(BagError, match="does not match its checksum"):
             read(reader, path)
+
+    def test_log_times_compare_the_indexes_with_the_chunks_once(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # No two of these chunks fit the cache.
+        path = write_mcap(tmp_path / "a.mcap", chatter(4, 300_000), SMALL)
+        read_chunks: list[int] = []
+
+        def noting(file: OpenFile, chunk: Chunk, at_most: int) -> bytes:
+            read_chunks.append(chunk.offset)
+            return chunk_data(file, chunk, at_most)
+
+        monkeypatch.setattr(bag_file, "chunk_data", noting)
+        reader = McapReader(cache_mb=1)
+        for _ in range(2):
+            assert list(reader.log_times(path, "/chatter", TimeWindow.everything())) == [0, 1, 2, 3]
+            assert len(read_chunks) == len(chunks_of(path)) == 4
 
     def test_a_damaged_chunk_disturbs_only_the_windows_that_it_overlaps(
         self, tmp_path: Path
