@@ -125,11 +125,11 @@ def find_matches(
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
     asked = search_window(span, now)
     require_recorded(view, asked)
+    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     window = clamped(view, asked)
     collected = _Sightings(limit, view.snapshot.timeline.is_log, oldest_first=oldest_first)
     scope = Scope(view, window, where, during)
