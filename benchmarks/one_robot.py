@@ -39,7 +39,7 @@ from benchmarks.footprint import resident_mb
 from benchmarks.motion import NOWHERE
 from benchmarks.report import machine
 from benchmarks.serving import Served
-from ros2_memory.bootstrap import build_backfill, build_memory, build_server
+from ros2_memory.bootstrap import build_backfill, build_memory, build_server, shared_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -166,7 +166,8 @@ def started(history: History, rounds: int = 3) -> Iterator[Figure]:
 
 def filled(settings: Settings) -> Iterator[Figure]:
     """Yields what making the bags known takes: memory in this process, and time for each bag."""
-    memory = build_memory(settings)
+    # As the server's helper does it.
+    memory = build_memory(settings, shared_parts(settings, cache_mb=8))
     memory.index.refresh()
     waiting = build_backfill(settings, memory).progress().waiting
     before, begun = resident_mb("VmRSS"), time.process_time()

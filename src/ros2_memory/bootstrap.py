@@ -359,8 +359,10 @@ class SharedParts(NamedTuple):
     extractor: SchemaExtractor
 
 
-def shared_parts(settings: Settings) -> SharedParts:
+def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedParts:
     """Returns what reads and decodes the bags of one memory, or of several.
+
+    With `cache_mb` for the reader if that is given.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
@@ -369,7 +371,7 @@ def shared_parts(settings: Settings) -> SharedParts:
 
     schemas = load_message_schemas(settings)
     extractor = SchemaExtractor(schemas, settings.data.max_array_length)
-    return SharedParts(build_reader(settings), schemas, extractor)
+    return SharedParts(build_reader(settings, cache_mb=cache_mb), schemas, extractor)
 
 
 def build_memory(

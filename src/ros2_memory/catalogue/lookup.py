@@ -32,8 +32,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_MAX_WITH_MESSAGES: Final = 64
-"""Segments whose stored messages stay in memory: two days of 10 s splits."""
+_MOST_MESSAGES: Final = 65_536
+"""24 MB: those of a week of 10 s splits that each repeat one, or of a log's nine hours."""
+_SEGMENT_COSTS: Final = 256
+"""A segment counts as so many messages besides its own."""
 _MAX_DERIVED: Final = 8192
 """What is computed of segments and stays in memory: a recap of a week of 10 s splits has 4,000."""
 _MAX_BOUNDS: Final = 8
@@ -98,6 +100,7 @@ class SegmentDigests:
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._relatched: dict[str, dict[int, bool]] = {}
         self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
+        self._held = 0
         self._derived: dict[str, object] = {}
 
     @property
@@ -180,10 +183,17 @@ class SegmentDigests:
 
         They are many, so they are cached for the segments that were asked for last.
         """
-        self._cache.touch(self)
-        return self._cached(
-            self._messages, topic, lambda: self.catalogue.messages(topic, self._entries_with(topic))
-        )
+        found = self._messages.get(topic)
+        if found is None:
+            found = self._cached(
+                self._messages,
+                topic,
+                lambda: self.catalogue.messages(topic, self._entries_with(topic)),
+            )
+            held = [*self._messages.values()]
+            self._held = sum(len(each) for by_entry in held for each in by_entry.values())
+        self._cache.touch(self, self._held)
+        return found
 
     def map_keys(self) -> Mapping[int, int]:
         """Returns, by entry, the hash of the static transforms its map digest was made with."""
@@ -220,6 +230,7 @@ class SegmentDigests:
     def release_messages(self) -> None:
         """Drops the cached messages."""
         self._messages = {}
+        self._held = 0
 
     def release_derived(self, name: str) -> None:
         """Drops what was computed under a name."""
@@ -235,16 +246,29 @@ class SegmentDigests:
 class DigestCache:
     """Caches the catalogue's entries, by segment. Thread-safe.
 
+    Args:
+        catalogue: what has the entries.
+        bag_dir: the folder of the bags.
+        most_messages: so many stored messages stay in memory, and those of one segment at least.
+
     Attributes:
         last_zone_maps: those that were asked for last, with their segment and topic.
     """
 
-    def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        bag_dir: Path,
+        *,
+        most_messages: int = _MOST_MESSAGES,
+    ) -> None:
         self.catalogue = catalogue
         self.bag_dir = bag_dir
+        self._most_messages = most_messages
+        self._messages = 0
         self.last_zone_maps: tuple[ref[SegmentDigests], str, Mapping[int, ZoneMap]] | None = None
         self._lock = threading.Lock()
-        self._with_messages: OrderedDict[SegmentDigests, None] = OrderedDict()
+        self._with_messages: OrderedDict[SegmentDigests, int] = OrderedDict()
         self._derived: OrderedDict[tuple[ref[SegmentDigests], str], None] = OrderedDict()
         self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
@@ -272,13 +296,16 @@ class DigestCache:
             known = self._segments.get(segment)
         return known if known is not None and known.is_complete else None
 
-    def touch(self, digests: SegmentDigests) -> None:
+    def touch(self, digests: SegmentDigests, messages: int) -> None:
         """Marks a segment's messages as used; the least recently used ones are dropped."""
+        cost = messages + _SEGMENT_COSTS
         with self._lock:
-            self._with_messages[digests] = None
-            self._with_messages.move_to_end(digests)
-            if len(self._with_messages) > _MAX_WITH_MESSAGES:
-                self._with_messages.popitem(last=False)[0].release_messages()
+            self._messages += cost - self._with_messages.pop(digests, 0)
+            self._with_messages[digests] = cost
+            while self._messages > self._most_messages and len(self._with_messages) > 1:
+                oldest, released = self._with_messages.popitem(last=False)
+                self._messages -= released
+                oldest.release_messages()
 
     def mark_derived(self, digests: SegmentDigests, name: str) -> None:
         """Marks what is computed from a segment as used; the least recently used is dropped."""

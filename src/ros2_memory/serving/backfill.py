@@ -13,7 +13,7 @@ import os
 import subprocess
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -22,7 +22,7 @@ import anyio.to_thread
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.catalogue.lookup import bags_without_entry
+from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import MOST_JOINED, BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
@@ -64,6 +64,8 @@ RETRY_NS: Final[Ns] = 600 * NS_PER_S
 _BESIDE_NS: Final[Ns] = 3600 * NS_PER_S
 """Bags that are older than a new one by more than this do not touch it."""
 _MAX_REFUSED: Final = 10_000
+_PASSED_AT_ONCE: Final = 16_384
+"""Stored messages that stay in memory while all are passed through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,17 +240,26 @@ class Backfill:
         if since == MAX_NS:
             return
         view = View(self._memory, Call())
-        window = TimeWindow(max(since - _BESIDE_NS, MIN_NS), MAX_NS)
-        with suppress(EpisodicError):
-            poses = resolve_pose_topic(view)
-            store_shared_paths(view, poses, window)
-            store_shared_standstills(view, poses, window)
-            store_shared_ranges(view, poses, window)
-        for topic in topics_with_changes(view):
+        windows = (
+            _not_joined(view)
+            if since == MIN_NS
+            else [TimeWindow(max(since - _BESIDE_NS, MIN_NS), MAX_NS)]
+        )
+        if TimeWindow.everything() in windows:
+            # What this looks at of a week is not what clients ask about, nor what stays in memory.
+            passing = DigestCache(self.catalogue, self._bag_dir, most_messages=_PASSED_AT_ONCE)
+            view = View(replace(self._memory, recall=passing), Call())
+        for window in windows:
             with suppress(EpisodicError):
-                store_shared_events(view, topic, window)
-        for topic in topics_with_texts(view):
-            store_shared_texts(view, topic, window)
+                poses = resolve_pose_topic(view)
+                store_shared_paths(view, poses, window)
+                store_shared_standstills(view, poses, window)
+                store_shared_ranges(view, poses, window)
+            for topic in topics_with_changes(view):
+                with suppress(EpisodicError):
+                    store_shared_events(view, topic, window)
+            for topic in topics_with_texts(view):
+                store_shared_texts(view, topic, window)
         store_joined(self._memory)
 
     def prune(self) -> None:
@@ -261,11 +272,12 @@ class Backfill:
         if snapshot.problem is not None or not snapshot.bags:
             return
         present = {self._key(bag).path for bag in snapshot.timeline.bags}
-        files = {path: self._bag_dir / path for path in self.catalogue.paths()}
+        reads = self._memory.reader.reads
+        absent = (path for path in self.catalogue.paths() if path not in present)
         gone = [
             path
-            for path, file in files.items()
-            if path not in present and (self._memory.reader.reads(file) or not file.exists())
+            for path in absent
+            if reads(self._bag_dir / path) or not (self._bag_dir / path).exists()
         ]
         self.catalogue.forget(gone)
         self.catalogue.forget_older_configurations()
@@ -303,20 +315,16 @@ def store_joined(memory: Memory) -> None:
 
     Nothing is looked at where all of it was stored, be it by another process.
     """
-    from ros2_memory.history.bag_fold import JOINED_VERSION, counted_once
+    from ros2_memory.history.bag_fold import counted_once
     from ros2_memory.insights.changes_before import topics_with_changes
     from ros2_memory.insights.drive import drive_in
     from ros2_memory.insights.topic_events import events_in
 
     view = View(memory, Call(stores_joined=True))
-    timeline = view.snapshot.timeline
-    known = [view.bags.digests_of(each) for each in timeline.segments if timeline.is_settled(each)]
-    numbers = [number for each in known if each is not None for number in each.numbers.values()]
+    mark, numbers = _settled(view)
     if memory.recall is None or not numbers:
         return
-    catalogue, limits = memory.recall.catalogue, memory.limits
-    depends_on = f"{limits.max_plausible_speed_mps:g} {view.pose_topic}"
-    mark = f"joined {JOINED_VERSION} and counted to {MOST_JOINED} {depends_on}"
+    catalogue = memory.recall.catalogue
     if catalogue.joined(mark, [numbers]) is not None:
         return
     # Not only what is new: `forget` empties the catalogue of all that was joined.
@@ -326,10 +334,42 @@ def store_joined(memory: Memory) -> None:
     for topic in topics_with_changes(view):
         with suppress(EpisodicError):
             events_in(view, topic, window)
-    for topic in filter(lambda each: view.stream.may_be_relatched([each]), timeline.topics()):
+    topics = view.snapshot.timeline.topics()
+    for topic in filter(lambda each: view.stream.may_be_relatched([each]), topics):
         with suppress(EpisodicError):
             counted_once(view, topic)
     catalogue.store_joined(mark, [numbers], b"-")
+
+
+def _settled(view: View) -> tuple[str, list[int]]:
+    """Returns the numbers of all digests in segments that stay as they are.
+
+    And the name of the mark that their bags' digests were joined, and those of overlapping
+    recordings stored.
+    """
+    from ros2_memory.history.bag_fold import JOINED_VERSION
+
+    timeline, limits = view.snapshot.timeline, view.memory.limits
+    known = [view.bags.digests_of(each) for each in timeline.segments if timeline.is_settled(each)]
+    numbers = [number for each in known if each is not None for number in each.numbers.values()]
+    depends_on = f"{limits.max_plausible_speed_mps:g} {view.pose_topic}"
+    return f"joined {JOINED_VERSION} and counted to {MOST_JOINED} {depends_on}", numbers
+
+
+def _not_joined(view: View) -> list[TimeWindow]:
+    """Returns the windows in which `precompute` of no process may have looked.
+
+    A server that starts beside a full catalogue would otherwise read what it has of a week.
+    """
+    recall, timeline = view.memory.recall, view.snapshot.timeline
+    mark, numbers = _settled(view)
+    if recall is None or not numbers or recall.catalogue.joined(mark, [numbers]) is None:
+        return [TimeWindow.everything()]
+    return [
+        TimeWindow(each.bags[0].start - _BESIDE_NS, each.latest + 1 + _BESIDE_NS)
+        for each in timeline.segments
+        if not timeline.is_settled(each)
+    ]
 
 
 async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: float) -> None:

@@ -29,8 +29,11 @@ from ros2_memory.cli import main
 from ros2_memory.cli.doctor import check_catalogue
 from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.counts import sighting_runs
 from ros2_memory.history.context import Call
+from ros2_memory.index import timeline
 from ros2_memory.serving.backfill import BACKLOG, Backfill, Progress, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
@@ -106,6 +109,31 @@ def test_what_recordings_that_touch_hold_together_is_stored_before_anybody_asks(
     fill_catalogue(backfill)
     for question in ("poses /odom", "standstills /odom", "story /said"):
         assert len(backfill.catalogue.cached_answers(question)) == 1, question
+
+
+def test_beside_a_full_catalogue_only_bags_that_may_come_and_go_are_looked_at_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timeline, "SEGMENT_BAGS", 2)
+    hour = 3600 * NS_PER_S
+    starts = [T0 + number * 3 * hour for number in range(7)]
+    for number, start in enumerate(starts):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [text(start, "word", "/said")])
+    looked: list[TimeWindow] = []
+    monkeypatch.setattr(
+        sighting_runs, "store_shared_texts", lambda _view, _topic, window: looked.append(window)
+    )
+
+    def windows() -> list[TimeWindow]:
+        looked.clear()
+        fill_catalogue(backfill_of(recalling(tmp_path), tmp_path))
+        return [*looked]
+
+    assert windows() == [TimeWindow.everything()]
+    # The last of the segments, which has one bag.
+    assert windows() == [TimeWindow(starts[6] - hour, starts[6] + 1 + hour)]
+    write_mcap(tmp_path / "rec" / "rec_2.mcap", [text(starts[2], "other", "/said")])
+    assert windows() == [TimeWindow.everything()]
 
 
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:

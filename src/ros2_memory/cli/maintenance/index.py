@@ -18,7 +18,7 @@ from typing import Annotated, Final, Protocol
 
 import typer
 
-from ros2_memory.bootstrap import build_backfill, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory, shared_parts
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
@@ -43,6 +43,7 @@ NICENESS: Final = 15
 
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _BATCH: Final = 64
+_CACHE_MB: Final = 8
 """Bags digested before the program looks which others closed meanwhile."""
 _SHARED: Final = 512
 """A second process takes half of more bags than these."""
@@ -145,7 +146,11 @@ def _low_priority_backfill(settings: Settings) -> Backfill:
     """Returns what fills the catalogue in a process that other programs go before."""
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
-    return build_backfill(settings, build_memory(settings))
+    # Each bag is read once. What is kept of its chunks would take more than all else.
+    cache_mb = min(_CACHE_MB, settings.reader.chunk_cache_mb)
+    return build_backfill(
+        settings, build_memory(settings, shared_parts(settings, cache_mb=cache_mb))
+    )
 
 
 @contextmanager
