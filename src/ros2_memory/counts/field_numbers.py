@@ -21,8 +21,10 @@ from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.counts.segment_fold import Digested, SegmentFold
 from ros2_memory.history.bag_groups import DigestKind, store_shared
+from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.insights.field_extremes import numbers_in
 
 if TYPE_CHECKING:
@@ -97,7 +99,13 @@ class FieldReader:
     def __init__(self, view: View, topic: str, fields: Sequence[str]) -> None:
         self._view = view
         self._topic = topic
-        self._fields = tuple(fields)
+        types = view.snapshot.timeline.types_of(topic)
+        own_path = view.memory.extractor.own_path
+        # Digests know a field by its extracted name alone.
+        self._fields = tuple(
+            own_path(each, types[0]) if len(types) == 1 else each for each in fields
+        )
+        self._kind = f"numbers {json.dumps(self._fields)}"
         self.failures: list[UndecodableError] = []
         self._shared: dict[tuple[int, ...], Digested[Numbers]] | None = None
         self._asked = 0
@@ -109,7 +117,7 @@ class FieldReader:
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
         """
-        kind = DigestKind(f"numbers {json.dumps(self._fields)}", self._look_up, _encoded, _decoded)
+        kind = DigestKind(self._kind, self._look_up, _encoded, _decoded)
         fold = SegmentFold(
             kind,
             self.numbers,
@@ -162,8 +170,24 @@ class FieldReader:
 
     def between(self, first: Ns, last: Ns) -> Numbers | None:
         """Returns the numbers between two log times (inclusive); None without a message."""
-        messages = self._view.stream.messages([self._topic], TimeWindow(first, last + 1))
-        return self.numbers(messages)[0]
+        window = TimeWindow(first, last + 1)
+        kept = self._kept_in(window)
+        if (first, last) in kept:
+            return kept[first, last]
+        with self._view.notes.isolated():
+            numbers, _ = self.numbers(self._view.stream.messages([self._topic], window))
+            if numbers is not None and self._view.notes.complete and not self.failures:
+                kept[first, last] = numbers
+        return numbers
+
+    def _kept_in(self, window: TimeWindow) -> dict[Span, Numbers]:
+        """Returns what was read between two times, where nothing but one segment decides that."""
+        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+        segments = self._view.snapshot.timeline.segments_in(wider)
+        digests = self._view.bags.digests_of(segments[0]) if len(segments) == 1 else None
+        if digests is None or not segments[0].is_closed:
+            return {}
+        return digests.derived(f"{self._kind} of {self._topic} between", dict)
 
     def numbers(self, messages: Iterable[StoredMessage]) -> tuple[Numbers | None, Span | None]:
         """Returns the numbers of messages in order, and the first and the last of their times."""

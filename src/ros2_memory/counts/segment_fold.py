@@ -135,27 +135,41 @@ class SegmentFold(Generic[T, R]):
         found: list[Digested[T]] = []
         since: Ns | None = None
         left_unread = False
-        groups = (
-            each
-            for group in reversed(share.groups(view, topic, window))
-            for each in (reversed(view.apart(topic, group)) if self._is_cut(group) else (group,))
-        )
-        for group in groups:
-            is_usable = group.is_whole and not self._is_cut(group)
-            known = stored.of(group) if is_usable else None
-            if known is not None and not self._lacks(known[0]):
-                found.append(Digested(known[0], *known[1]))
-                continue
-            other = self.unread(group) if self.unread is not None and is_usable else None
-            if other is not None:
-                found.append(other)
-                left_unread = True
+        for group, known in self._looked_up(view, topic, share.groups(view, topic, window), stored):
+            if known is not None:
+                found.append(known[0])
+                left_unread |= known[1]
                 continue
             if reading.is_over:
                 since = group.last + 1
                 break
             found.extend(reversed([*self._made(view, group, stored)]))
         return (self.reduce(found[::-1]) if found else None), since, left_unread
+
+    def _looked_up(
+        self, view: View, topic: str, groups: Sequence[Group], stored: StoredDigests[T]
+    ) -> Iterator[tuple[Group, tuple[Digested[T], bool] | None]]:
+        """Yields groups, the newest first, with what `_look_up` returns.
+
+        One that would have to be read is taken apart into its bags, where that can be done.
+        """
+        for group in reversed(groups):
+            known = self._look_up(group, stored)
+            parts = [group] if known is not None else view.apart(topic, group)
+            if len(parts) == 1:
+                yield group, known
+            else:
+                yield from ((part, self._look_up(part, stored)) for part in reversed(parts))
+
+    def _look_up(self, group: Group, stored: StoredDigests[T]) -> tuple[Digested[T], bool] | None:
+        """Returns what needs no reading, and whether it serves this one question alone."""
+        if not group.is_whole or self._is_cut(group):
+            return None
+        known = stored.of(group)
+        if known is not None and not self._lacks(known[0]):
+            return Digested(known[0], *known[1]), False
+        other = None if self.unread is None else self.unread(group)
+        return None if other is None else (other, True)
 
     def _made(self, view: View, group: Group, stored: StoredDigests[T]) -> Iterator[Digested[T]]:
         """Yields the digest of a group that is read; several where it is cut."""

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import Spans, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
@@ -89,11 +89,9 @@ class MergedStream:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         parts = self._parts(topics, window) if among is None else [window]
-        return self.bags.track_sources(
-            chain.from_iterable(
-                self._part(topics, part, among, newest_first=newest_first)
-                for part in (reversed(parts) if newest_first else parts)
-            )
+        return chain.from_iterable(
+            self._part(topics, part, among, newest_first=newest_first)
+            for part in (reversed(parts) if newest_first else parts)
         )
 
     def first(
@@ -169,8 +167,10 @@ class MergedStream:
         else:
             found = self.merged(bags, topics, window, newest_first=newest_first)
         if self.may_be_relatched(topics):
-            return (each for each in found if not self._is_relatched(each))
-        return found
+            found = (each for each in found if not self._is_relatched(each))
+        if all(each.bag.state is BagState.CLOSED for each in bags):
+            return found
+        return self.bags.track_sources(found)
 
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether two recordings may have received one latched message of these topics."""
@@ -268,10 +268,22 @@ class MergedStream:
             while waiting and (not heap or waiting[0][0] <= heap[0][0]):
                 _, rank, bag = waiting.popleft()
                 push(rank, read(bag))
-            if heap:
-                _, rank, found, source = heapq.heappop(heap)
+            if not heap:
+                continue
+            _, rank, found, source = heapq.heappop(heap)
+            yield found
+            # Whole stretches that no other bag interrupts do not go through the heap.
+            others = [each[0][0] for each in (heap, waiting) if each]
+            if not others:
+                yield from source
+                continue
+            until = min(others)
+            for found in source:
+                key = sign * found.record.log_time
+                if key >= until:
+                    heapq.heappush(heap, (key, rank, found, source))
+                    break
                 yield found
-                push(rank, source)
 
 
 def _since_published(found: StoredMessage) -> TimeWindow:

@@ -242,6 +242,7 @@ class ReverseSearch:
 
     Attributes:
         topics: the recorded topics that match.
+        condition: what is searched for.
 
     Raises:
         InvalidArgumentsError: the condition names a frame in which a topic has no positions.
@@ -250,7 +251,7 @@ class ReverseSearch:
 
     def __init__(self, view: View, pattern: str, condition: Condition) -> None:
         self._view = view
-        self._condition = condition
+        self.condition = condition
         self.topics = matching_topics(view, pattern)
         _require_frame(view, self.topics, condition)
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
@@ -262,7 +263,7 @@ class ReverseSearch:
 
     def candidates(self, until: Ns) -> CandidateBags:
         """Returns the bags that can contain a match before a moment."""
-        return CandidateBags(self._view, self.topics, self._condition, until)
+        return CandidateBags(self._view, self.topics, self.condition, until)
 
     def newest(self, until: Ns) -> StoredMessage | None:
         """Returns the newest match before a moment; notes report what could not be tested.
@@ -322,7 +323,7 @@ class ReverseSearch:
         Raises:
             InvalidArgumentsError: the newest value of none of the topics has what is tested.
         """
-        if not self._condition.can_be_refused:
+        if not self.condition.can_be_refused:
             return
         refusals = []
         for topic in self.topics:
@@ -339,12 +340,12 @@ class ReverseSearch:
             return None
         schema = found.record.channel.schema
         refusal = refusal_for(
-            self._condition, self._view.memory.extractor.exact(message, schema.name)
+            self.condition, self._view.memory.extractor.exact(message, schema.name)
         )
-        test = self._condition.test
+        test = self.condition.test
         if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
             return refusal
-        field = (self._condition.field or "").rpartition(".")[2]
+        field = (self.condition.field or "").rpartition(".")[2]
         constants = _constants_named(schema, field, str(test.value))
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
@@ -394,7 +395,7 @@ class ReverseSearch:
                 message = memory.reader.decode(found.record)
                 value = memory.extractor.exact(message, channel.type)
                 self._has_decoded = True
-                met = self._condition.matches(value)
+                met = self.condition.matches(value)
             except UndecodableError as error:
                 # A copy: the raised error keeps its traceback alive, and the message with it.
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
@@ -442,7 +443,7 @@ class CandidateBags:
     def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
         self._view = view
         self._topics = topics
-        self._condition = condition
+        self.condition = condition
         self._until = until
         self.ruled_out = False
 
@@ -488,7 +489,7 @@ class CandidateBags:
         known = {} if digests is None else digests.numbers
         possible: Collection[int] = ()
         if digests is not None and known:
-            possible = possible_entries(digests, topic, self._condition)
+            possible = possible_entries(digests, topic, self.condition)
             if digests.whole and not possible:
                 self.ruled_out = True
                 return

@@ -29,6 +29,7 @@ from ros2_memory.core.timebase import (
     Ns,
 )
 from ros2_memory.counts.sighting_runs import known_sightings
+from ros2_memory.counts.tested import tested
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
     from ros2_memory.counts.sighting_runs import KnownSightings
+    from ros2_memory.counts.tested import Tested
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
@@ -75,13 +77,17 @@ class _Matches:
     """Consecutive matches on one topic, collected from the newest on.
 
     Attributes:
-        newest: the last match.
+        topic: the topic.
+        last: log time of the last match.
+        newest: the last match; None where it is not in memory any more.
         first: log time of the earliest match so far.
         reach: log time of the earliest message so far, also of one that cannot be decoded.
         begun: whether what came before the earliest match is known.
     """
 
-    newest: StoredMessage
+    topic: str
+    last: Ns
+    newest: StoredMessage | None
     first: Ns
     reach: Ns
     messages: int = 1
@@ -151,13 +157,17 @@ def find_matches(
     view.notes.retract_before(searched.start)
     elapsed = elapsed_in(view, searched)
     # To say where the robot was takes longest.
-    wanted = [each for each in collected.selected if call.wants(each.newest.time)]
+    wanted = [
+        (matches, newest)
+        for matches in collected.selected
+        if call.wants(matches.last) and (newest := _newest(view, matches)) is not None
+    ]
     found = tuple(
         replace(
-            _sighting(view, condition, matches, frame_id),
-            skipped=elapsed.skipped_between(matches.first, matches.newest.time),
+            _sighting(view, condition, matches, newest, frame_id),
+            skipped=elapsed.skipped_between(matches.first, matches.last),
         )
-        for matches in wanted
+        for matches, newest in wanted
     )
     total = None if collected.cut else collected.count
     if goals is not None:
@@ -171,7 +181,7 @@ def find_matches(
             if call.wants(each.last)
         )
     elif fields:
-        found = _with_fields(view, found, wanted, fields)
+        found = _with_fields(view, found, [newest for _, newest in wanted], fields)
     is_nothing = not (collected.selected or goals)
     note_unread(view, searched, nothing=is_nothing, search=True)
     if is_nothing:
@@ -218,7 +228,7 @@ def read_sightings(
     _collect(view, ReverseSearch(view, pattern, condition), scope, found)
     if found.count > MAX_COUNTED:
         view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
-    spans = [(each.first, each.newest.time) for each in found.selected]
+    spans = [(each.first, each.last) for each in found.selected]
     return spans, spans[0][0] if found.cut and spans else None
 
 
@@ -240,17 +250,16 @@ def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings)
             _end_in_gap(view, found, TimeWindow(part.stop, max(before, part.stop)))
             # Only topics that can begin or end a sighting are read: there may be thousands.
             relevant = sorted({*topics, *found.open_topics()})
-            for each in view.stream.messages(relevant, part, newest_first=True):
+            for each in tested(view, search, relevant, part):
                 before = each.time
                 found.end_silent(each.time)
-                matches = search.matches(each)
                 # Where the scope does not hold, a match counts as no match.
-                if matches and scope.holds_at(each.time):
+                if each.met and scope.holds_at(each.time):
                     found.add(each)
-                elif matches is None:
+                elif each.met is None:
                     found.skip(each)
                 else:
-                    found.end(each.record.channel.topic)
+                    found.end(each.topic)
                 if found.enough:
                     _stop(search, found)
                     return
@@ -310,38 +319,46 @@ class _Sightings:
         self.count = 0
         self.cut = False
 
-    def add(self, found: StoredMessage) -> None:
+    def add(self, found: Tested) -> None:
         """Adds the next older match; call `end_silent` with its time before."""
-        topic = found.record.channel.topic
+        topic, time = found.topic, found.time
         matches = self._open.get(topic)
         if matches is None:
-            self._open[topic] = matches = _Matches(found, found.time, found.time)
+            matches = _Matches(topic, time, found.message, time, time)
+            self._open[topic] = matches
             self._kept.append(matches)
             self.count += 1
             if self._is_log(topic):
                 self.end(topic)
         else:
-            matches.first = matches.reach = found.time
+            matches.first = matches.reach = time
             matches.messages += 1
             self._open.move_to_end(topic)
 
     def take(self, known: KnownSightings) -> None:
         """Takes the sightings that were asked for, in order, in place of single matches."""
         found = [
-            _Matches(each.newest, each.first, each.first, each.messages, begun=True)
+            _Matches(
+                each.newest.record.channel.topic,
+                each.newest.time,
+                each.newest,
+                each.first,
+                each.first,
+                each.messages,
+                begun=True,
+            )
             for each in known.sightings
         ]
         self._kept.extend(reversed(found) if self._oldest_first else found)
         self.cut = known.total is None
         self.count = len(found) + 1 if known.total is None else known.total
 
-    def skip(self, found: StoredMessage) -> None:
+    def skip(self, found: Tested) -> None:
         """Adds a message that cannot be decoded: no match, but it ends no sighting either."""
-        topic = found.record.channel.topic
-        matches = self._open.get(topic)
+        matches = self._open.get(found.topic)
         if matches is not None:
             matches.reach = found.time
-            self._open.move_to_end(topic)
+            self._open.move_to_end(found.topic)
 
     def end_silent(self, until: Ns) -> None:
         """Ends the sightings to which no message before a moment can belong."""
@@ -349,7 +366,7 @@ class _Sightings:
             matches = next(iter(self._open.values()))
             if matches.reach - until <= SILENCE_NS:
                 return
-            self.end(matches.newest.record.channel.topic)
+            self.end(matches.topic)
 
     def end(self, topic: str) -> None:
         """Ends the sighting of a topic: its next match begins another one."""
@@ -405,23 +422,36 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     return bool(held) and view.stream.first([topic], gap) is not None
 
 
+def _newest(view: View, matches: _Matches) -> StoredMessage | None:
+    """Returns the last match, read again where need be; None where its bag was deleted since."""
+    if matches.newest is not None:
+        return matches.newest
+    at = TimeWindow(matches.last, matches.last + 1)
+    return view.stream.first([matches.topic], at, newest_first=True)
+
+
 def _sighting(
-    view: View, condition: Condition, matches: _Matches, frame_id: str | None
+    view: View,
+    condition: Condition,
+    matches: _Matches,
+    newest: StoredMessage,
+    frame_id: str | None,
 ) -> Sighting:
     """Returns the result, with where the robot and the thing were at the newest match."""
-    newest = matches.newest
     message = view.memory.reader.decode(newest.record)
     value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
     robot = _robot(view, newest, frame_id)
     thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
     return Sighting(
-        topic=newest.record.channel.topic,
+        topic=matches.topic,
         first=matches.first,
-        last=newest.time,
+        last=matches.last,
         messages=matches.messages,
         begun=matches.begun,
         robot=robot,
-        thing=_spot_of(view, condition, matches, robot, thing=thing, frame_id=frame_id),
+        thing=_spot_of(
+            view, condition, newest, matches.first, robot, thing=thing, frame_id=frame_id
+        ),
         matched=matched_texts(condition, value),
         score=None if thing is None else thing.score,
     )
@@ -445,7 +475,7 @@ def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
 def _with_fields(
     view: View,
     sightings: Sequence[Sighting],
-    found: Sequence[_Matches],
+    found: Sequence[StoredMessage],
     fields: Sequence[str],
 ) -> tuple[Sighting, ...]:
     """Returns the sightings with the fields of their last messages in place of matched texts.
@@ -455,8 +485,8 @@ def _with_fields(
     """
     extended: list[Sighting] = []
     refused: list[InvalidArgumentsError] = []
-    for sighting, matches in zip(sightings, found, strict=True):
-        record = matches.newest.record
+    for sighting, newest in zip(sightings, found, strict=True):
+        record = newest.record
         message = view.memory.reader.decode(record)
         try:
             shown = view.memory.extractor.shown(message, record.channel.type, fields)
@@ -493,7 +523,8 @@ def _robot(view: View, seen: StoredMessage, frame_id: str | None) -> Pose | None
 def _spot_of(
     view: View,
     condition: Condition,
-    matches: _Matches,
+    newest: StoredMessage,
+    first: Ns,
     robot: Pose | None,
     *,
     thing: Detection | None,
@@ -504,7 +535,6 @@ def _spot_of(
     The newest message of all may be newer than the last transform: then one of those just before it
     counts. A note says where none of them can be placed.
     """
-    newest = matches.newest
     spot = _spot(view, thing, newest, robot, frame_id)
     targets = _targets(view, robot, frame_id)
     if spot is None or spot.frame_id in targets:
@@ -516,7 +546,7 @@ def _spot_of(
     except QueryTimeoutError:
         return spot
     topic = newest.record.channel.topic
-    window = TimeWindow(matches.first, newest.time)
+    window = TimeWindow(first, newest.time)
     extractor = view.memory.extractor
     before = view.stream.messages([topic], window, newest_first=True)
     for found in islice(before, _MOST_TRIED):

@@ -316,10 +316,11 @@ def test_recordings_that_follow_each_other_at_a_full_hour_are_read_where_they_ho
     known = recalling(plain, tmp_path)
     list_recorded_topics(known, Call())
 
-    def ask(memory: Memory, *fields: str) -> Bins:
-        return count_range(memory, Call(), "/odom", everything(), "hour", fields=fields)
+    def ask(memory: Memory, *fields: str, by: str = "hour") -> Bins:
+        return count_range(memory, Call(), "/odom", everything(), by, fields=fields)  # type: ignore[arg-type]
 
     counts, numbers = ask(plain), ask(plain, "position.x")
+    of_day = ask(plain, "position.x", by="day")
     assert [each for each in column(counts, "count").values() if each] == [20, 20]
     assert whole(numbers, "position.x.mean") == -0.5
     with monkeypatch.context() as patch:
@@ -329,6 +330,8 @@ def test_recordings_that_follow_each_other_at_a_full_hour_are_read_where_they_ho
     if not copied:
         monkeypatch.setattr(segment_fold, "READING_S", -1.0)
     assert ask(known, "position.x") == numbers
+    assert ask(known, "position.x", by="day") == of_day
+    assert ask(known, "pose.pose.position.x").rows == numbers.rows
 
 
 def _counts_by_group(memory: Memory) -> Iterator[tuple[int, int]]:

@@ -145,6 +145,29 @@ def test_a_message_is_decoded_once_for_a_question(
     assert len(find_matches(memory, Call(), OBJECTS, "contains", "mug", limit=100).sightings) == 10
 
 
+def test_a_search_that_was_read_to_its_end_is_not_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mcap(
+        tmp_path / "rec_0" / "rec_0_0.mcap",
+        [odom(BEGIN + at * S, float(at // 10 % 2), 0.0) for at in range(60)],
+    )
+    memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
+
+    def ask(**given: object) -> list[tuple[int, int, int]]:
+        near: JsonValue = {"x": 1.0, "y": 0.0}
+        found = find_matches(memory, Call(), "/odom", "near_position", near, **given)  # type: ignore[arg-type]
+        return [(each.first, each.last, each.messages) for each in found.sightings]
+
+    expected = [(BEGIN + at * S, BEGIN + (at + 9) * S, 10) for at in (50, 30, 10)]
+    assert ask() == expected
+    monkeypatch.delattr(ReverseSearch, "matches")
+    assert ask() == expected
+    assert ask(limit=1, oldest_first=True) == expected[-1:]
+    with pytest.raises(AttributeError):
+        ask(start_s=BEGIN / S + 5)
+
+
 @each_way
 def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
     tmp_path: Path, recalls: bool
@@ -518,6 +541,7 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
             told = [(each.topic, each.first, each.last, each.messages) for each in answer.sightings]
             assert sorted(told, key=lambda each: (-each[2], each[0])) == expected, (topic, value)
             assert [each[2] for each in told] == sorted((each[2] for each in told), reverse=True)
+            assert find_matches(memory, Call(), topic, kind, value, limit=100) == answer
             oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
             assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
             assert oldest.total == len(answer.sightings)
