@@ -283,7 +283,20 @@ def test_a_clock_that_was_set_often_takes_one_row(page: Browser) -> None:
     )
     assert rows[0] == 4
     assert rows[1].startswith("a gap")
-    assert page.run("return [0.002, 0.53, 12.345].map(size)") == ["2 MB", "530 MB", "12.3 GB"]
+    sizes = page.run("return [0.000064, 0.002, 0.53, 12.345].map(size)")
+    assert sizes == ["64 kB", "2 MB", "530 MB", "12.3 GB"]
+
+
+def test_where_no_pose_is_recorded_the_reason_stands_in_place_of_a_map(page: Browser) -> None:
+    """No empty grid, and nothing is claimed of what was in view where nothing sees."""
+    page.run(
+        "state.view = { ...state.view, path: null, robot: null, places: [], things: [], events: [],"
+        " counts: {}, no_path: 'poses are on /pose: set data.pose_topic=/pose' };"
+        "map.show(state.view); showKey(); showLatest();"
+    )
+    assert page.text("#map-key") == "No path: poses are on /pose: set data.pose_topic=/pose."
+    assert page.run("return document.getElementById('map').checkVisibility()") is False
+    assert page.text("#moment") == "Where the robot is, is not known."
 
 
 def write_odd_history(bag_dir: Path) -> None:

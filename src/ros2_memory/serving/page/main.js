@@ -282,14 +282,21 @@ function showKey() {
   const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
   const left = view.paths_left_out;
+  // Without poses there is no map: the reason stands in its place.
+  const isEmpty = Boolean(view.no_path) && !(view.places || []).length;
+  at("map").hidden = at("map-tools").hidden = isEmpty;
+  if (isEmpty) {
+    at("map-key").replaceChildren(el("span", { class: "warn" }, `No path: ${view.no_path}.`));
+    return;
+  }
   at("map-key").replaceChildren(...(apart(view) ? [
     ...map.paths.map((each, n) => one(ofPath(n), each.name)),
     ...view.paths.filter((each) => each.error).map((each) => el("span", { class: "warn" },
       "no path of ", bdi(each.name), `: ${each.error}`)),
     ...(left ? [el("span", { class: "warn" }, `${counted(left, "more path")} left out`)] : [])]
     : pathKey(view, one)),
-  ...(view.isWhole ? [one("stood", `stops, ${map.stops.length}`)] : []),
-  one("seen", `things, ${map.things.length}${more}`),
+  ...(map.stops.length ? [one("stood", `stops, ${map.stops.length}`)] : []),
+  ...(map.things.length ? [one("seen", `things, ${map.things.length}${more}`)] : []),
   ...((view.places || []).length ? [one("place", "places")] : []),
   ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame || "without a name"))] : []),
   ...(map.paths.some((each) => !each.whole)

@@ -231,7 +231,7 @@ class RobotMap {
       this.drawRobot(c, robot, colour("now"), this.moment === null);
     }
     if (this.moment) this.drawRobot(c, this.moment, colour("robot"), true);
-    if (!this.paths.some((each) => each.t.length)) {
+    if (!this.paths.some((each) => each.t.length) && !this.view.no_path) {
       c.fillStyle = colour("soft");
       c.textAlign = "center";
       c.fillText("No poses in this time.", width / 2, height / 2);
@@ -317,8 +317,8 @@ class RobotMap {
       const w = c.measureText(text).width;
       const [left, top, right, bottom] = this.boundsOf(each);
       const [x, y] = [(left + right) / 2 - w / 2, (top + bottom) / 2 - 7];
-      const inside = [[x, top + 5], [x, bottom - 19], [x, y], [left + 6, top + 5], [right - w - 6, top + 5],
-        [left + 6, bottom - 19], [right - w - 6, bottom - 19], [left + 6, y], [right - w - 6, y]];
+      const rows = [top + 5, bottom - 19, y, (top + y) / 2, (bottom + y) / 2 - 7];
+      const inside = [x, left + 6, right - w - 6].flatMap((column) => rows.map((row) => [column, row]));
       const beside = [[x, top - 17], [x, bottom + 3], [right + 5, y], [left - w - 5, y]];
       named(text, "place-ink", w, right - left > w + 8 ? inside : beside);
     }

@@ -82,7 +82,8 @@ function showNow(host, view, choose, point) {
   const events = view.events.filter((each) => each.kind !== "thing").slice(-LATEST).reverse();
   host.replaceChildren(
     ...(robot ? [el("dl", {}, ...robotRows(robot, frame))] : [soft("Where the robot is, is not known.")]),
-    el("h3", {}, "In view"), ...(seen.length ? listing(seen, AT_ONCE) : [soft("Nothing.")]),
+    ...(seen.length || (view.counts || {}).sightings
+      ? [el("h3", {}, "In view"), ...(seen.length ? listing(seen, AT_ONCE) : [soft("Nothing.")])] : []),
     ...(events.length ? [el("h3", {}, "What happened last"), ...listing(eventRows(events, point))] : []));
 }
 

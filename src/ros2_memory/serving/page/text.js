@@ -64,7 +64,10 @@ const clock = (unix) => `${day(unix)}, ${timeOfDay(unix)}`;
 const date = (unix) => (new Date(unix * 1000).getFullYear() === new Date().getFullYear() ? DAY : DATE)
   .format(unix * 1000);
 const dated = (unix) => `${date(unix)}, ${timeOfDay(unix)}`;
-const size = (gb) => (gb >= 1 ? `${Number(gb.toPrecision(3))} GB` : `${Number((gb * 1000).toPrecision(3))} MB`);
+function size(gb) {
+  const [times, unit] = gb >= 1 ? [1, "GB"] : gb >= 0.001 ? [1e3, "MB"] : [1e6, "kB"];
+  return `${Number((gb * times).toPrecision(3))} ${unit}`;
+}
 const far = (m) => (m < 10000 ? `${m.toFixed(1)} m` : `${(m / 1000).toFixed(1)} km`);
 const centimetres = (metres) => (Math.round(metres * 100) / 100 || 0).toFixed(2);  // never -0.00
 const metres = (place) => `x\u00a0${centimetres(place.x)}, y\u00a0${centimetres(place.y)}\u00a0m`;
