@@ -8,6 +8,10 @@ look. So it is known what was not seen, too.
 Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores in thousandths:
 integers, so that sums do not depend on their order. Tables of several bags are joined by
 `joined`, which is associative.
+
+A bag of more than some seconds is several *slices*, each with tables as a short bag has them: in a
+look of an hour, what was seen before could not be told from what was missed after. So things are
+the same, whether a history is one file or many.
 """
 
 from __future__ import annotations
@@ -52,6 +56,8 @@ _MAX_AWAY_M: Final = 1e6
 _MAX_SCORE: Final = 1e6
 _NS_PER_US: Final = 1_000
 _TOGETHER_MESSAGES: Final = 3
+_SLICE_NS: Final = 10_000_000_000
+"""A slice is about this long: `recording.split_duration_s` as shipped, so that its bags are one."""
 
 
 class Spot(IntEnum):
@@ -144,9 +150,10 @@ class PlacedDetection(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Sights:
-    """What detectors saw in one bag, or in several: column 0 of most tables numbers the bags.
+    """What detectors saw in one bag, or in several: column 0 of most tables numbers their slices.
 
-    `frame_id` is the frame of all places and poses; empty where bags of several are joined.
+    `bags` is the number of slices, each of which counts as a bag. `frame_id` is the frame of all
+    places and poses; empty where bags of several are joined.
     """
 
     topics: tuple[str, ...]
@@ -478,6 +485,34 @@ class SightsBuilder:
         )
 
 
+class SlicedSights:
+    """Collects the sights of one bag, slice by slice.
+
+    Args:
+        span: log times of the first and the last message (ns).
+    """
+
+    def __init__(self, span: tuple[Ns, Ns]) -> None:
+        self._first, last = span
+        length = last - self._first
+        # Rounded: a bag of 10 s that ends with the first message after them is one slice.
+        self._width = length // max(1, (2 * length + _SLICE_NS) // (2 * _SLICE_NS)) + 1
+        self._slices: dict[int, SightsBuilder] = {}
+
+    def at(self, time: Ns) -> SightsBuilder:
+        """Returns what collects the messages of a log time."""
+        number = (time - self._first) // self._width
+        found = self._slices.get(number)
+        if found is None:
+            found = self._slices[number] = SightsBuilder()
+        return found
+
+    def sights(self, frame_id: str = "") -> Sights:
+        """Returns the sights of all slices, which are in this frame; the builder is used up."""
+        parts = [self._slices[number].sights() for number in sorted(self._slices)]
+        return replace(joined(parts), frame_id=frame_id)
+
+
 def _rounded(time: Ns) -> Ns:
     """Rounds up to 1 us: a message is at or before the time that is stored of it."""
     return -(-time // _NS_PER_US) * _NS_PER_US
@@ -568,7 +603,7 @@ def encode_sights(sights: Sights) -> bytes:
 def decode_joined(packed: Sequence[bytes]) -> tuple[Sights, list[int], list[str]]:
     """Decodes the sights of many bags, joined as by `joined`; bags without any are left out.
 
-    Returns with them which bags they are of, and the frame of each: much faster than one by one.
+    Returns with them the bag and the frame of each slice: much faster than one by one.
 
     Raises:
         ValueError: the bytes of some bag are invalid.
@@ -594,9 +629,21 @@ def _decoded(packed: Sequence[bytes], which: list[int]) -> tuple[Sights, list[in
             base = np.repeat(heads.base, rows)
             tables[-1][:, column] = tables[-1][:, column] * _NS_PER_US + base
     topics, labels = _Names(heads.topics), _Names(heads.labels)
-    _renumber(tables, counts, topics, labels)
-    whole = Sights((*topics.numbers,), (*labels.numbers,), tuple(tables), len(packed))
-    return whole, which, heads.frames
+    slices = _slices_of(tables, counts)
+    _renumber(tables, counts, slices, topics, labels)
+    whole = Sights((*topics.numbers,), (*labels.numbers,), tuple(tables), int(slices.sum()))
+    of = np.repeat(np.arange(len(packed)), slices).tolist()
+    return whole, [which[nth] for nth in of], [heads.frames[nth] for nth in of]
+
+
+def _slices_of(tables: Sequence[Ints], counts: Ints) -> Ints:
+    """Returns how many slices each bag has."""
+    last = np.zeros(len(counts), np.int64)
+    for at in (0, 1, 5):
+        if tables[at][:, 0].any():
+            of = np.repeat(np.arange(len(counts)), counts[:, at])
+            np.maximum.at(last, of, tables[at][:, 0])
+    return last + 1
 
 
 class _Names:
@@ -615,15 +662,17 @@ class _Names:
         self.first: Ints = np.cumsum(counts) - counts
 
 
-def _renumber(tables: Sequence[Ints], counts: Ints, topics: _Names, labels: _Names) -> None:
-    """Numbers bags, spots, looks, topics and labels of many bags throughout."""
+def _renumber(
+    tables: Sequence[Ints], counts: Ints, slices: Ints, topics: _Names, labels: _Names
+) -> None:
+    """Numbers slices, spots, looks, topics and labels of many bags throughout."""
     spot, look, hit, score, beside, unplaced = tables
 
     def each(at: int, values: Ints) -> Ints:
         return np.repeat(values, counts[:, at])
 
     for at, table in ((0, spot), (1, look), (5, unplaced)):
-        table[:, 0] += each(at, np.arange(len(counts)))
+        table[:, 0] += each(at, np.cumsum(slices) - slices)
         table[:, 1] = topics.of[table[:, 1] + each(at, topics.first)]
     for at, table in ((0, spot), (5, unplaced)):
         table[:, Spot.LABEL] = labels.of[table[:, Spot.LABEL] + each(at, labels.first)]
@@ -727,5 +776,5 @@ def decode_sights(packed: bytes) -> Sights:
     """
     if not packed:
         return no_sights()
-    found, _, [frame_id] = decode_joined([packed])
-    return replace(found, frame_id=frame_id)
+    found, _, frames = decode_joined([packed])
+    return replace(found, frame_id=frames[0])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import PlacedDetection, SightsBuilder, encode_sights
+from ros2_memory.analysis.sights import PlacedDetection, SlicedSights, encode_sights
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import Detection, detections_of
@@ -145,10 +145,16 @@ class DetectorSights:
 
     def digest(self, robot: PlacedPoses) -> bytes:
         """Returns the encoded sights."""
-        builder = SightsBuilder()
-        for topic, of_topic in self._topics.items():
-            if of_topic is None or not of_topic.is_detector:
-                continue
+        of_detectors = {
+            topic: found
+            for topic, found in self._topics.items()
+            if found is not None and found.is_detector
+        }
+        every = [time for found in of_detectors.values() for time in found.log_times]
+        if not every:
+            return b""
+        sliced = SlicedSights((min(every), max(every)))
+        for topic, of_topic in of_detectors.items():
             times = np.array(of_topic.times, np.int64)
             places = _places(of_topic, times, robot.frames)
             poses = robot.at(times)
@@ -161,8 +167,9 @@ class DetectorSights:
                     PlacedDetection(each.label, place, each.score)
                     for each, place in zip(found, placed, strict=True)
                 ]
-                builder.add(topic, log_time, (x, y, yaw) if valid else None, seen)
-        return encode_sights(builder.sights(robot.frames.target))
+                pose = (x, y, yaw) if valid else None
+                sliced.at(log_time).add(topic, log_time, pose, seen)
+        return encode_sights(sliced.sights(robot.frames.target))
 
 
 def _places(of_topic: _Topic, times: Times, frames: BagFrames) -> list[list[Vector3 | None]]:

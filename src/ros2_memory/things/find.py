@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -151,7 +152,7 @@ class _Finder:
             count=int(self.known.estimate.counts[every].sum()),
             best=best,
             median=median,
-            robot=self._robot(int(every[int(spots[:, Spot.LAST].argmax())])),
+            robot=self._robot(parts[-1][1]),
             still_there=self._still_there(instance, *parts[-1]),
             moved=tuple(stays) if len(stays) > 1 else (),
             at_once=self._side_by_side(parts[-1][1]),
@@ -205,7 +206,7 @@ class _Finder:
             count=int(result.counts[rows].sum()),
             best=best,
             median=median,
-            robot=self._robot(int(rows[newest])),
+            robot=self._robot(rows[[newest]]),
             still_there=None,
             at_once=most_at_once(spots),
             moves=True,
@@ -253,13 +254,13 @@ class _Finder:
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
         return best / 1000, (middle + 0.5) / SCORE_BINS
 
-    def _robot(self, spot: int) -> tuple[float, float, float] | None:
-        """Returns the pose from which a spot was seen most."""
-        look = int(self.known.estimate.robots[spot])
-        if look < 0:
+    def _robot(self, spots: Ints) -> tuple[float, float, float] | None:
+        """Returns the pose (m, rad) from which most messages saw some spots."""
+        pose = self.known.estimate.seen_from(spots)
+        if pose is None:
             return None
-        x, y, yaw = self.known.estimate.sights.looks[look, [Look.X, Look.Y, Look.YAW]].tolist()
-        return x / _MM, y / _MM, float(np.radians((yaw / 10 + 180) % 360 - 180))
+        x, y, yaw = pose
+        return x / _MM, y / _MM, math.radians((yaw + 180) % 360 - 180)
 
     def _names(self, instance: Instance, seen: Iterable[Mapping[str, int]]) -> tuple[str, ...]:
         """Returns the commonest of these names, other than the thing's own."""

@@ -139,13 +139,36 @@ class Estimate:
     movers: list[Mover]
     counts: Ints
     """How many detections of each spot count."""
-    robots: Ints
-    """The look from which each spot was seen most; -1 where that is not known."""
+    hits: Ints
+    """The hits of these, by spot; `hit_starts` is where each spot's begin."""
+    hit_starts: Ints
     names: dict[str, str]
     """The name to show of each key."""
     cells: Cells
     evidence: dict[tuple[str, int], dict[int, Evidence]]
     """By key and epoch: the evidence for each place."""
+
+    def seen_from(self, spots: Ints) -> tuple[float, float, float] | None:
+        """Returns the pose (mm, degrees) from which most messages saw some spots; None if unknown.
+
+        That is the mean pose in one cell; of two with equal numbers, in the one that saw it later.
+        """
+        starts = self.hit_starts[spots]
+        hits = self.hits[in_ranges(starts, self.hit_starts[spots + 1] - starts)]
+        hits = hits[hits[:, Hit.LOOK] >= 0]
+        if not len(hits):
+            return None
+        looks, n = hits[:, Hit.LOOK], hits[:, Hit.N]
+        cells, of = np.unique(self.cells.cell[looks], return_inverse=True)
+        seen, last = np.bincount(of, n), np.zeros(len(cells), np.int64)
+        np.maximum.at(last, of, self.cells.last[looks])
+        mine = of == np.lexsort((last, seen))[-1]
+        looks, n = looks[mine], n[mine]
+        x, y, yaw = (
+            float((column[looks] * n).sum() / n.sum())
+            for column in (self.cells.x, self.cells.y, self.cells.yaw)
+        )
+        return x, y, yaw
 
     def missing(self, instance: Instance, stay: PlacedStay) -> tuple[float, int, Ns | None]:
         """Returns `chance_of_missing` a thing after one of its stays."""
@@ -213,7 +236,8 @@ def estimate(
         instances,
         movers,
         seen.counts,
-        _robots(seen),
+        seen.hits,
+        seen.starts,
         _names(sights, labels),
         seen.cells,
         {(each.key, each.epoch): each.evidence for each in groups},
@@ -520,19 +544,6 @@ def _is_seen(group: _Group, seen: _Seen) -> bool:
     """Whether a mover has more detections than false ones would give."""
     n = seen.counts[group.rows]
     return int(n[n >= _FEWEST].sum()) >= _FEWEST_OF_MOVERS
-
-
-def _robots(seen: _Seen) -> Ints:
-    """Returns for each spot the look that saw it most."""
-    hits = seen.hits
-    found = np.full(len(seen.sights.spots), -1, np.int64)
-    if not len(hits):
-        return found
-    order = np.lexsort((-hits[:, Hit.N], hits[:, Hit.SPOT]))
-    best = hits[order]
-    spot, at = np.unique(best[:, Hit.SPOT], return_index=True)
-    found[spot] = best[at, Hit.LOOK]
-    return found
 
 
 def _names(sights: Sights, labels: Labels) -> dict[str, str]:

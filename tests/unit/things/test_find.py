@@ -400,3 +400,33 @@ def test_answers_are_the_same_with_the_catalogue_and_without(
 
 def answer(memory: Memory, bag_dir: Path, question: dict[str, object]) -> Any:
     return asked(memory, bag_dir, "find_things", **question)
+
+
+@settings(
+    max_examples=examples(6),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    moved=st.integers(30, 60),
+    split_s=st.sampled_from([4.0, 10.0, 17.0]),
+    back=st.booleans(),
+)
+@example(moved=30, split_s=10.0, back=True)
+@example(moved=44, split_s=10.0, back=False)
+def test_things_are_the_same_in_one_file_and_in_many(
+    tmp_path_factory: pytest.TempPathFactory, moved: int, split_s: float, back: bool
+) -> None:
+    """A cup is taken away while the robot looks elsewhere; then the robot looks again, or not."""
+    cup, book, mug = ("cup", 3.0, 0.5), ("book", 3.5, -1.0), ("mug", -1.5, 1.0)
+    messages = looked(0, moved, HERE, cup, book) + looked(moved, moved + 25, AWAY, mug)
+    if back:
+        messages += looked(moved + 25, moved + 50, HERE, book)
+    answers = []
+    for each in (split_s, 1e6):
+        bag_dir = tmp_path_factory.mktemp("bags")
+        write(bag_dir, messages, each)
+        answers.append(answer(memory_of(bag_dir, limits=NAMED), bag_dir, {}))
+    assert answers[0] == answers[1]
+    [lost] = [each for each in answers[0]["things"] if each["label"] == "cup"]
+    assert ("not_seen_where_expected" in lost["still_there"]) is back
