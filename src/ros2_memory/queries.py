@@ -76,13 +76,13 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
-from ros2_memory.insights.clock_steps import across_steps, clock_steps, elapsed_in
+from ros2_memory.insights.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.insights.field_extremes import (
     MAX_MESSAGES,
     TOO_MANY,
     extremes_of,
 )
-from ros2_memory.insights.silences import describe_silences, silences_of
+from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
 from ros2_memory.insights.status import (
     bags_with_remarks,
     clock_faults,
@@ -494,7 +494,9 @@ def trajectory_summary(
     note_unread(view, window)
     note_edges(view, window)
     elapsed = elapsed_in(view, window)
-    drawn = _with_few_waypoints(across_steps(path, elapsed), max_waypoints)
+    unrecorded = unrecorded_length(view, name, path, elapsed)
+    driven = while_recorded(across_steps(path, elapsed), elapsed, path, unrecorded)
+    drawn = _with_few_waypoints(driven, max_waypoints)
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
         drawn = replace(drawn, waypoints=moved)
@@ -505,6 +507,7 @@ def trajectory_summary(
         path.last,
         drawn,
         elapsed.skipped_between(path.first, path.last),
+        unrecorded,
         notes=view.notes.sentences(),
     )
 

@@ -224,7 +224,8 @@ class ValueWhen(AnswerWithNotes):
 class TrajectorySummary(AnswerWithNotes):
     """The driven path in a window, from one pose topic in log-time order.
 
-    `skipped`: how much of the time from its first to its last pose the clock skipped.
+    `skipped`: how much of the time from its first to its last pose the clock skipped. `unrecorded`:
+    for how much of the rest no poses were recorded.
     """
 
     topic: str
@@ -233,6 +234,7 @@ class TrajectorySummary(AnswerWithNotes):
     end: Ns
     trajectory: Trajectory
     skipped: Ns = 0
+    unrecorded: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,13 +284,15 @@ class Sighting:
         last: of the last.
         messages: how many there are; 0 for a goal of an action.
         begun: whether the message before the first is known not to belong.
-        robot: where the robot was at the last.
+        robot: where the robot was at the first; at the last where that is the sighting of a thing,
+            a goal, or began before what was read.
         thing: where the thing itself was then, if the message has that.
         matched: the texts of the last message that met the condition, where that is on texts.
         value: the requested fields of the last message; None where none were, or it has none. Of a
             goal its id and its status.
         score: of the detection, if the message has that; the best of several.
         skipped: how much of the time from the first to the last the clock skipped.
+        robot_at_first: whether `robot` is of the first message.
     """
 
     topic: str
@@ -302,6 +306,7 @@ class Sighting:
     value: JsonValue = None
     score: float | None = None
     skipped: Ns = 0
+    robot_at_first: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,6 +101,22 @@ def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
     )
 
 
+def while_recorded(
+    found: Trajectory, elapsed: Elapsed, path: DrivenPath, unrecorded: Ns
+) -> Trajectory:
+    """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
+
+    What was driven in the rest, `unrecorded`, is not part of its length either.
+    """
+    recorded = elapsed.between(path.first, path.last) - unrecorded
+    if not unrecorded or recorded <= 0:
+        return found
+    avg_speed = found.totals.distance_m / unix_from_ns(recorded)
+    is_stated = found.max_speed_from == "twist"
+    fastest = found.max_speed if is_stated else max(found.max_speed, avg_speed)
+    return replace(found, avg_speed=avg_speed, max_speed=fastest)
+
+
 def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
     """Returns the steps in a window, and others near it."""
     steps = [

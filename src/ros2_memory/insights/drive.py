@@ -40,6 +40,7 @@ from ros2_memory.history.driven_path import add_poses, driven_path
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
+from ros2_memory.insights.silences import unrecorded_length
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -67,13 +68,14 @@ class Drive:
     """How the robot moved: its path, and its standstills with whether each goes on afterwards.
 
     `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
-    between moments of the window.
+    between moments of the window, `unrecorded` for how much of it no poses were recorded.
     """
 
     path: DrivenPath | None = None
     standstills: tuple[tuple[Standstill, bool], ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
     elapsed: Elapsed = field(default_factory=Elapsed)
+    unrecorded: Ns = 0
 
     @property
     def known(self) -> Trajectory | None:
@@ -91,16 +93,12 @@ class Drive:
         known = self.known
         if known is None:
             return stood or None
+        recorded_s = known.totals.duration_s - unix_from_ns(self.unrecorded)
         if not stood:
-            is_hidden = (
-                length >= SHORTEST_NS
-                and known.totals.distance_m <= CREEP_MPS * known.totals.duration_s
-            )
+            is_hidden = length >= SHORTEST_NS and known.totals.distance_m <= CREEP_MPS * recorded_s
             return None if is_hidden else 0
-        else_s = known.totals.duration_s - unix_from_ns(stood)
-        is_hidden = (
-            else_s > known.totals.duration_s / 2 and known.totals.distance_m < CREEP_MPS * else_s
-        )
+        else_s = recorded_s - unix_from_ns(stood)
+        is_hidden = else_s > recorded_s / 2 and known.totals.distance_m < CREEP_MPS * else_s
         if is_hidden and not known.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
             return None
         return stood
@@ -121,7 +119,8 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
     else:
         path = replace(path, trajectory=across_steps(path, elapsed))
-    return Drive(path, standstills, drops, elapsed)
+    unrecorded = 0 if path is None else unrecorded_length(view, topic, path, elapsed)
+    return Drive(path, standstills, drops, elapsed, unrecorded)
 
 
 _STANDSTILLS: Final = DigestKind(

@@ -7,6 +7,7 @@ are left out, and counted.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -36,7 +37,7 @@ from ros2_memory.insights.changes_before import (
 from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
-from ros2_memory.insights.silences import grouped, silences_in
+from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import driven_way
@@ -327,7 +328,8 @@ def _topic_events(
             continue
         seen = found.visible.scoring(min_score) if min_score else found.visible
         below += found.visible.size - seen.size
-        events += [*_flips(topic, found), *map(_error, _errors(view, topic, found, there))]
+        ends = [begin for begin, _ in unrecorded_times(view, topic, TimeWindow(start, end))]
+        events += [*_flips(topic, found, ends), *map(_error, _errors(view, topic, found, there))]
         visible.append(seen)
         throughout.update(seen.throughout(start, end))
         last_seen |= dict.fromkeys(seen.at_end(found.last, known_to), found.last)
@@ -402,12 +404,18 @@ def _goal(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     return Event(kind, goal.accepted, goal.ended, f"{goal.action} goal {goal.outcome} {after}")
 
 
-def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:
-    """Yields each toggle with how long its value held: until the next, or beyond the window."""
+def _flips(topic: str, events: TopicEvents, ends: Sequence[Ns]) -> Iterator[Event]:
+    """Yields each toggle with how long its value held: until the next, or beyond the window.
+
+    Or as long as it was recorded: `ends` are the times at which the topic ceased to be, in order.
+    """
     until: dict[str, Ns] = {}
     for toggle in reversed(events.toggles):
         text = toggled(topic, toggle)
         end = until.get(toggle.path)
+        ceased = bisect_left(ends, toggle.time)
+        if ceased < len(ends) and (end is None or ends[ceased] < end):
+            end = ends[ceased]
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
         until[toggle.path] = toggle.time
 

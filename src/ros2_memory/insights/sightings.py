@@ -51,6 +51,7 @@ from ros2_memory.things.find import unknown_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
@@ -437,11 +438,16 @@ def _sighting(
     newest: StoredMessage,
     frame_id: str | None,
 ) -> Sighting:
-    """Returns the result, with where the robot and the thing were at the newest match."""
+    """Returns the result, with where the robot was and, at the newest match, the thing.
+
+    What happens is where the robot was when it began; a thing is where it was last seen from.
+    """
     message = view.memory.reader.decode(newest.record)
     value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
-    robot = _robot(view, newest, frame_id)
     thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
+    robot_at_first = thing is None and matches.begun
+    at = matches.first if robot_at_first else newest.time
+    robot = _robot(view, at, newest.bag.recording, frame_id)
     return Sighting(
         topic=matches.topic,
         first=matches.first,
@@ -454,6 +460,7 @@ def _sighting(
         ),
         matched=matched_texts(condition, value),
         score=None if thing is None else thing.score,
+        robot_at_first=robot_at_first,
     )
 
 
@@ -466,7 +473,7 @@ def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
         last=goal.last,
         messages=0,
         begun=goal.accepted is not None,
-        robot=None if newest is None else _robot(view, newest, frame_id),
+        robot=None if newest is None else _robot(view, newest.time, newest.bag.recording, frame_id),
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
     )
@@ -502,14 +509,14 @@ def _with_fields(
     return tuple(extended)
 
 
-def _robot(view: View, seen: StoredMessage, frame_id: str | None) -> Pose | None:
+def _robot(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
     """Returns the robot's newest pose at or before a match; None where it is not known.
 
-    In the map where transforms lead there, or in `frame_id`. Where the session of the match has
-    poses, it is one of these.
+    In the map where transforms lead there, or in `frame_id`. Where the session of the match, which
+    is in this recording, has poses, it is one of these.
     """
-    window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
-    found = newest_in_session(view, view.pose_topic, window, seen.bag.recording)
+    window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
+    found = newest_in_session(view, view.pose_topic, window, recording)
     message = None if found is None else view.bags.decode(found)
     if found is None or message is None:
         return None

@@ -8,14 +8,16 @@ from ros2_memory.analysis.silences import Silence
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
-from ros2_memory.history.coverage import forgotten_spans, unix_text
+from ros2_memory.history.coverage import forgotten_spans, recording_gaps, unix_text
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
+    from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
 
@@ -62,6 +64,30 @@ def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
         part = each.within(start, end)
         if part is not None:
             yield part
+
+
+def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
+    """Returns the times of a window in which a topic was not recorded, in order, none overlapping.
+
+    Nothing was recorded, or the topic has a usual rate and was silent.
+    """
+    silent = [(each.start, each.end) for each in silences_in(view, window) if each.topic == topic]
+    found: list[tuple[Ns, Ns]] = []
+    for start, end in sorted([*recording_gaps(view, window), *silent]):
+        if found and start <= found[-1][1]:
+            found[-1] = (found[-1][0], max(found[-1][1], end))
+        else:
+            found.append((start, end))
+    return found
+
+
+def unrecorded_length(view: View, topic: str, path: DrivenPath, elapsed: Elapsed) -> Ns:
+    """Returns for how long no poses were recorded between the first and the last of a path."""
+    return sum(
+        elapsed.between(max(start, path.first), min(end, path.last))
+        for start, end in unrecorded_times(view, topic, TimeWindow(path.first, path.last + 1))
+        if start < path.last and path.first < end
+    )
 
 
 def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:

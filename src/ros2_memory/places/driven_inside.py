@@ -91,6 +91,8 @@ def driven_inside(
     inside = times_in_region(view, region, window)
     totals, waypoints = way.totals(inside), way.waypoints(inside, max_waypoints)
     elapsed = elapsed_in(view, window)
+    duration = sum(elapsed.between(each.start, each.stop) for each in inside)
+    average = totals.distance_m / unix_from_ns(duration) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
     require_one_robot(view, name, window)
@@ -101,11 +103,12 @@ def driven_inside(
         frame_id or way.frames[0],
         region.shown,
         len(inside),
-        sum(elapsed.between(each.start, each.stop) for each in inside),
+        duration,
         inside[0].start if inside else None,
         inside[-1].stop if inside else None,
         totals.distance_m,
-        totals.max_speed,
+        # Measured over a second, it is below the mean of a visit that hardly lasts as long.
+        max(totals.max_speed, average),
         waypoints,
         notes=view.notes.sentences(),
     )

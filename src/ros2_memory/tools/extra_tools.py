@@ -104,7 +104,7 @@ _SIGHTINGS = ToolDeclaration(
     '"equals", "value": false}} counts only while another topic meets a condition. '
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
-    "position then, place: of the thing, score}}], total}}.",
+    "position (at when), place: of the thing, score}}], total}}.",
     MatchesArguments,
     _find_matches,
     blocking=True,

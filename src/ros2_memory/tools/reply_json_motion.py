@@ -97,11 +97,13 @@ def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
     path = answer.trajectory
     known = path.is_known
     duration_s = path.totals.duration_s - unix_from_ns(answer.skipped)
+    recorded_s = duration_s - unix_from_ns(answer.unrecorded)
     reply: JsonObject = {
         "distance_m": rounded(path.totals.distance_m, 4) if known else None,
         "avg_speed": rounded(path.avg_speed, 4) if known else None,
         "max_speed": rounded(path.max_speed, 4) if known else None,
         "duration_s": rounded(duration_s, 3) if known else None,
+        **({"recorded_s": rounded(recorded_s, 3)} if known and answer.unrecorded else {}),
         "waypoints": _waypoints(path.waypoints, "jump"),
         "topic": answer.topic,
         "frame_id": answer.frame_id or None,

@@ -253,7 +253,11 @@ def _sighting(sighting: results.Sighting, now: Ns, local: LocalTimes) -> JsonObj
         **({"count": sighting.messages} if sighting.messages else {}),
         "robot": None
         if robot is None
-        else {**planar_pose(robot), "frame_id": robot.frame_id or None},
+        else {
+            "at": "first_seen" if sighting.robot_at_first else "last_seen",
+            **planar_pose(robot),
+            "frame_id": robot.frame_id or None,
+        },
     }
     if sighting.matched:
         reply["matched"] = [

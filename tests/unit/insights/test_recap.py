@@ -794,3 +794,27 @@ def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
     assert drop.before[0].text == "/blocked became true"
     assert [each.kind for each in answer.events if each.kind == "stop"] == ["stop"]
     assert ("speed drops", 1) in answer.counts
+
+
+def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: Path) -> None:
+    """A robot that drives at 0.5 m/s, recorded for 20 s, an hour later, and another hour later."""
+    for run in range(3):
+        begin = BEGIN + run * 3600 * S
+        body = [odom(begin + n * S // 10, n * 0.05, 0.0, 0.0) for n in range(200)]
+        body += [boolean(begin + n * S, n < 5, "/bumper") for n in range(20)]
+        write_mcap(tmp_path / f"run{run}" / f"run{run}_0.mcap", body)
+    memory, window = memory_of(tmp_path), {"start": BEGIN / S, "end": BEGIN / S + 7220}
+    answer = asked(memory, tmp_path, "recap", **window)
+    flips = [each for each in answer["events"] if each["text"].startswith("/bumper")]
+    assert [each["text"] for each in flips] == [
+        f"/bumper became {now}" for now in ("false", "true", "false", "true", "false")
+    ]
+    assert [each.get("duration_s") for each in flips] == [
+        pytest.approx(length, abs=1.0) if length else None for length in (15, 5, 15, 5, None)
+    ]
+    assert answer["stood_s"] == 0
+    path = asked(memory, tmp_path, "trajectory_summary", **window)
+    assert path["avg_speed"] == pytest.approx(0.5, abs=0.01)
+    assert path["avg_speed"] <= path["max_speed"]
+    assert path["duration_s"] == pytest.approx(7219.9)
+    assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)

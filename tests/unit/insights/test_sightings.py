@@ -638,3 +638,14 @@ def test_a_condition_takes_the_path_of_a_field_in_the_message(tmp_path: Path) ->
         )
         assert raw == mapped
         assert len(raw) == 1
+
+
+def test_the_robot_is_where_it_was_when_something_began(tmp_path: Path) -> None:
+    messages = [odom(BEGIN + n * S, float(n), 0.0, 0.0) for n in range(20)]
+    messages += [text(BEGIN + n * S, "hot" if 5 <= n < 9 else "cold") for n in range(20)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    [topic] = {each.topic for each in messages} - {"/odom"}
+    given = {"topic": topic, "condition_type": "contains", "value": "hot"}
+    [found] = asked(memory_of(tmp_path), tmp_path, "find_matches", **given)["sightings"]
+    assert found["first_seen"] == BEGIN / S + 5
+    assert (found["robot"]["at"], found["robot"]["x"]) == ("first_seen", 5.0)
