@@ -41,6 +41,8 @@ _OF_OTHERS: Final = re.compile(r"(?i)goal|target|click|initial_?pose|waypoint|pl
 """Names of topics whose poses are not those of the robot."""
 MOST_TRIED: Final = 20
 """Topics of unknown content that are looked into for poses."""
+_NEAR_NS: Final[Ns] = 60 * NS_PER_S
+"""An older message may stand in for a missing one; farther back it says nothing about the time."""
 _CLOCKS_DIFFER_NS: Final[Ns] = 60 * NS_PER_S
 """A time that is later than now by no more may be now by the clock of who asks."""
 ON_DISK_S: Final = 3
@@ -317,7 +319,7 @@ def no_data_at(
     detail += _advice(view, reason)
     if _is_to_come(view, at):
         detail.append(_to_come(view, at))
-    elif older and tolerance is not None:
+    elif older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance):
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))

@@ -19,6 +19,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
+from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
@@ -88,7 +89,13 @@ def find_things(
     for each in found:
         totals[each.label] = totals.get(each.label, 0) + (each.at_once or 1)
     held = describe_held(being_written(view.snapshot, asked_for))
-    notes = [*view.notes.sentences(), *held, *_notes(known, label, asked, found=bool(found))]
+    notes = [*view.notes.sentences(), *held]
+    if not found:
+        notes += [*_unseen(view, known, window)]
+    is_bounded = start_s is not None or end_s is not None
+    bounds = [*["window"] * is_bounded, *([] if region is None else ["region"])]
+    inside = f" in this {' and '.join(bounds)}" if bounds else ""
+    notes += _notes(known, label, asked, window, inside, found=bool(found))
     return Things(
         frame_id=_frame_of(known, found),
         things=tuple(found[:limit]),
@@ -100,7 +107,30 @@ def find_things(
 
 
 def _frame_of(known: KnownThings, found: Sequence[Thing]) -> str:
-    return found[0].frame_id if found else known.frames[0]
+    if found:
+        return found[0].frame_id
+    # Without a map, the frame of the newest odometry; nothing where no detector published.
+    return known.frames[0] if known.has_map else "".join(known.frames[1:][-1:])
+
+
+def _unseen(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
+    """Yields why no thing may be known of a window: its detectors published nothing in it."""
+    sights = known.estimate.sights
+    times = (
+        (sights.looks, Look.FIRST, Look.LAST),
+        (sights.spots, Spot.FIRST, Spot.LAST),
+        (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
+    )
+    published = any(
+        bool(((table[:, first] < window.stop) & (table[:, last] >= window.start)).any())
+        for table, first, last in times
+    )
+    if sights.topics and not published:
+        yield (
+            f"{listed(sights.topics)} published nothing in this window: whether things were there "
+            "is not known"
+        )
+    yield from describe_silences(view, sights.topics, window)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +272,10 @@ class _Finder:
         )
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
-        """Returns the best score of some spots, and the middle of the bin of their median."""
+        """Returns the best score of some spots, and their median to 0.05, the width of a bin.
+
+        That is the best score in its bin, where that is known: of spots with none in a higher one.
+        """
         sights = self.known.estimate.sights
         best = int(sights.spots[rows, Spot.BEST].max())
         if best < 0:
@@ -252,7 +285,11 @@ class _Finder:
         of = mine[sights.scores[:, Score.SPOT]]
         counts = np.bincount(sights.scores[of, Score.BIN], sights.scores[of, Score.N], SCORE_BINS)
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
-        return best / 1000, (middle + 0.5) / SCORE_BINS
+        highest = np.full(len(sights.spots), -1, np.int64)
+        np.maximum.at(highest, sights.scores[of, Score.SPOT], sights.scores[of, Score.BIN])
+        known = sights.spots[highest == middle, Spot.BEST]
+        median = int(known.max()) / 1000 if len(known) else (middle + 0.5) / SCORE_BINS
+        return best / 1000, min(median, best / 1000)
 
     def _robot(self, spots: Ints) -> tuple[float, float, float] | None:
         """Returns the pose (m, rad) from which most messages saw some spots."""
@@ -311,9 +348,15 @@ def _by_place(
 
 
 def _notes(
-    known: KnownThings, label: str | None, asked: str | None, *, found: bool
+    known: KnownThings,
+    label: str | None,
+    asked: str | None,
+    window: TimeWindow,
+    inside: str,
+    *,
+    found: bool,
 ) -> Iterator[str]:
-    """Yields notes on a label, and on resets of odometry."""
+    """Yields notes on a label, and on resets of odometry; `inside` says how it was asked about."""
     sights = known.estimate.sights
     if len(known.frames) > 1 + bool(known.frames[0]):
         yield (
@@ -333,13 +376,17 @@ def _notes(
         yield f"{counted(int(unplaced), 'detection')} of it could not be placed, and are left out"
     if found:
         return
-    seen = int(sights.spots[mine[sights.spots[:, Spot.LABEL]], Spot.N].sum())
+    spots = sights.spots[mine[sights.spots[:, Spot.LABEL]]]
+    during = (spots[:, Spot.FIRST] < window.stop) & (spots[:, Spot.LAST] >= window.start)
+    every, seen = int(spots[:, Spot.N].sum()), int(spots[during, Spot.N].sum())
     names = sorted(set(known.estimate.names.values()))
     if seen:
         yield (
-            f"it was detected {counted(seen, 'time')} in all, but in this window and region it "
-            "does not count as a thing: find_matches lists single detections"
+            f"it was detected {counted(seen, 'time')} in this time, but does not count as a thing"
+            f"{inside}: find_matches lists single detections"
         )
+    elif every:
+        yield f"it was detected {counted(every, 'time')} in all, and not once in this window"
     elif names:
         yield _unknown(label, asked, names)
 

@@ -50,6 +50,7 @@ class KnownThings:
     Attributes:
         labels: maps labels to keys.
         frames: by epoch, the frame of its places; epoch 0 is the map.
+        has_map: whether any sights are in the map.
         since: how far back it reaches, where not all bags could be read in time; else None.
     """
 
@@ -57,6 +58,7 @@ class KnownThings:
     labels: Labels
     frames: tuple[str, ...]
     since: Ns | None = None
+    has_map: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +159,7 @@ class _Loader:
                 f"things are known since {unix_text(self._since)} only: reading older bags takes "
                 f"too long; {self._view.bags.backfill_progress()}ask again"
             )
-        return KnownThings(found, labels, names, self._since)
+        return KnownThings(found, labels, names, self._since, 0 in epochs)
 
     def _part(self, segment: Segment) -> _Part:
         digests = self._view.bags.digests_of(segment)

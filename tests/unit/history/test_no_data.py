@@ -112,7 +112,15 @@ def test_a_duration_is_reported_without_powers_of_ten(length_s: float, reply: st
     assert seconds(round(length_s * NS_PER_S)) == reply
 
 
-@pytest.mark.parametrize("older_s", [12_345.631, 1_234_567.891])
+def test_no_tolerance_is_advised_for_a_message_of_another_day(tmp_path: Path) -> None:
+    messages = [boolean(T0, True), text(T0 + 80_000 * NS_PER_S, "late")]
+    write_mcap(tmp_path / "run" / "run_0.mcap", messages)
+    with pytest.raises(NoDataError) as caught:
+        queries.topic_value(memory_of(tmp_path), Call(), "/bumper", after(80_000))
+    assert "tolerance_s" not in caught.value.detail
+
+
+@pytest.mark.parametrize("older_s", [12.631, 59.891])
 def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s: float) -> None:
     messages = [boolean(T0, True), text(T0 + round(older_s * NS_PER_S), "late")]
     write_mcap(tmp_path / "run" / "run_0.mcap", messages)
