@@ -143,15 +143,16 @@ def only(judge: judges.Judge) -> Judge:
     return lambda replies, asked: judge(replies[-1], asked)
 
 
-def _sighting(found: JsonValue, row: Sequence[Message]) -> None:
-    """A row of messages as a sighting."""
+def _sighting(found: JsonValue, row: Sequence[Message], *, of_thing: bool) -> None:
+    """A row of messages as a sighting; of a thing from where it was seen last."""
     first, last = row[0], row[-1]
     one_of("first seen", number(found, "first_seen"), [first.log_time])
     one_of("last seen", number(found, "last_seen"), [last.log_time])
     near("how long", number(found, "duration_s"), (last.log_time - first.log_time) / 1e9, SAME_S)
     near("how long ago", number(found, "ago_s"), _ago(last.log_time), SAME_S)
     same("count", number(found, "count"), len(row))
-    here = robot.pose_in_map(last.t)
+    same("robot at", text(found, "robot", "at"), "last_seen" if of_thing else "first_seen")
+    here = robot.pose_in_map(last.t if of_thing else first.t)
     near("x", number(found, "robot", "x"), here.x, PLACE_M)
     near("y", number(found, "robot", "y"), here.y, PLACE_M)
     same("frame", text(found, "robot", "frame_id"), "map")
@@ -169,7 +170,7 @@ def sighting_of(
     def judge(replies: Replies, asked: CallContext) -> None:
         found = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
         same("topic", text(found, "topic"), stream.topic)
-        _sighting(found, _rows(asked, stream, holds)[nth])
+        _sighting(found, _rows(asked, stream, holds)[nth], of_thing=stream is SEEN)
         if place is not None:
             for axis, expected in zip("xyz", THINGS[place], strict=True):
                 near(f"{axis} of the {place}", number(found, "place", axis), expected, PLACE_M)
@@ -358,7 +359,7 @@ def later(first: str, second: str) -> Judge:
 
     def judge(replies: Replies, asked: CallContext) -> None:
         for label, reply in zip((first, second), replies, strict=True):
-            _sighting(at(reply, "sightings", 0), _rows(asked, SEEN, sees(label))[-1])
+            _sighting(at(reply, "sightings", 0), _rows(asked, SEEN, sees(label))[-1], of_thing=True)
 
     return judge
 
