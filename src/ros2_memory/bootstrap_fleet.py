@@ -14,15 +14,19 @@ from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.timebase import WallClock
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+
     from ros2_memory.bootstrap import SharedParts
     from ros2_memory.config import Settings
-    from ros2_memory.fleet.robots import Fleet
+    from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.robot import LakeRobot
 
 ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
+_JOINED_AGAIN_S: Final = 5.0
+"""Whoever asks for a robot that there is not has the lake looked at, but no more often."""
 LAKE_REFRESH_S: Final = 60.0
 """How old what is known of a lake may be: at most one commit of a table is made in this time."""
 
@@ -59,15 +63,24 @@ def build_fleet(settings: Settings) -> Fleet | None:
         source = None if lake is None else _source_of(lake, name, settings, own, shared)
         is_mounted = lake is None or bag_dir.is_dir()
         robots.append(Robot(name, bag_dir, build, lake=source, is_mounted=is_mounted))
-    if lake is not None:
-        for name in lake.robots():
-            if name in fleet.robots or not is_robot_name(name):
-                continue
-            source = _source_of(lake, name, settings, robot_settings(settings, name), shared)
-            robots.append(
-                Robot(name, Path(name), partial(_lake_of, source), lake=source, is_mounted=False)
-            )
-    return Fleet(robots, WallClock(), shared_map=fleet.shared_map)
+    join = None if lake is None else partial(_only_in, lake, settings, shared)
+    found = Fleet(robots, WallClock(), shared_map=fleet.shared_map, join=join)
+    found.joined()
+    return found
+
+
+def _only_in(
+    lake: Lake, settings: Settings, shared: SharedParts, known: Collection[str]
+) -> Iterator[Robot]:
+    """Yields the robots of a lake besides the known ones."""
+    from ros2_memory.fleet.robots import Robot
+
+    lake.refresh(_JOINED_AGAIN_S)
+    for name in lake.robots():
+        if name in known or not is_robot_name(name):
+            continue
+        source = _source_of(lake, name, settings, robot_settings(settings, name), shared)
+        yield Robot(name, Path(name), partial(_lake_of, source), lake=source, is_mounted=False)
 
 
 def _has_places(settings: Settings, own: Settings) -> bool:

@@ -314,9 +314,9 @@ def find_last_match(
     of a score below `min_score` do not count.
     """
     now = memory.clock.now()
-    view = View(memory, call, now)
-    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     until = _before(before_s)
+    view = View(memory, call, min(now, until))
+    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     search = ReverseSearch(view, topic, condition)
     if before_s is not None:
         require_recorded(view, TimeWindow(MIN_NS, until))

@@ -44,6 +44,8 @@ PROGRAM: Final = "ros2-memory-server"
 CANNOT_LISTEN: Final = 1
 
 _THREADS_END_S: Final = 0.2
+_LAKE_LOOKED_AT_S: Final = 30.0
+"""Twice as often as a question would look itself."""
 
 log = get_logger("ros2_memory.server")
 
@@ -286,29 +288,51 @@ async def _fleet_in_background(
         for each, backfill in robots.items()
     ]
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(keep_fleet_fresh, [*fleet.robots.values()], every_s)
+        tasks.start_soon(keep_fleet_fresh, fleet, every_s)
         tasks.start_soon(keep_all_backfilled, fillers, every_s)
 
 
-async def keep_fleet_fresh(robots: Sequence[Robot], every_s: float) -> None:
+async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_LOOKED_AT_S) -> None:
     """Looks for new bags of each robot, and for what was shipped of it, until it is cancelled.
 
-    A disk that hangs keeps the scans of its own robot waiting alone.
+    Where there is a lake, also for robots that were shipped for the first time, every `lake_s`
+    seconds. A disk that hangs keeps the scans of its own robot waiting alone.
     """
     import anyio
 
-    from ros2_memory.bootstrap_fleet import LAKE_REFRESH_S
     from ros2_memory.serving.health import keep_fresh
 
-    limiter = anyio.CapacityLimiter(2 * len(robots))
+    limiter = anyio.CapacityLimiter(1)
     async with anyio.create_task_group() as tasks:
-        for each in robots:
-            shipped = each.lake_memory
-            if each.memory() is not shipped:
-                tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
-            if shipped is not None:
-                # Sooner than a question would have to look itself.
-                tasks.start_soon(keep_fresh, shipped, LAKE_REFRESH_S / 2, limiter)
+        robots: Sequence[Robot] = [*fleet.robots.values()]
+        while True:
+            limiter.total_tokens += 2 * len(robots)
+            for each in robots:
+                shipped = each.lake_memory
+                if each.memory() is not shipped:
+                    tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
+                if shipped is not None:
+                    tasks.start_soon(keep_fresh, shipped, lake_s, limiter)
+            if not fleet.grows:
+                return
+            await anyio.sleep(lake_s)
+            robots = await anyio.to_thread.run_sync(
+                partial(_joined_logged, fleet), abandon_on_cancel=True, limiter=limiter
+            )
+
+
+def _joined_logged(fleet: Fleet) -> Sequence[Robot]:
+    """Returns the robots that have joined, and logs what keeps the lake from being looked at."""
+    from ros2_memory.core.errors import EpisodicError
+
+    try:
+        robots = fleet.joined()
+    except EpisodicError as error:
+        log.warning("lake_not_looked_at", reason=str(error))
+        return ()
+    if robots:
+        log.info("robots_joined", robots=[each.name for each in robots])
+    return robots
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:

@@ -53,8 +53,9 @@ def count_visits(
     if by == "place" and place is not None:
         raise InvalidArgumentsError("by place counts all named places: give no other one")
     wall = memory.clock.now()
-    view = open_view(memory, call, wall)
-    asked = clamped(view, search_window(TimeRange(start_s, end_s), wall))
+    window = search_window(TimeRange(start_s, end_s), wall)
+    view = open_view(memory, call, min(window.stop, wall))
+    asked = clamped(view, window)
     topic = resolve_pose_topic(view)
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame

@@ -11,7 +11,7 @@ from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS, Clock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.timebase import Ns
@@ -141,12 +141,44 @@ class Fleet:
         robots: all of them; no two have one name.
         clock: the wall clock, read once for a question to several.
         shared_map: whether coordinates mean the same place for all of them.
+        join: returns the robots that a lake has besides those of some names, where there is one.
+            It looks there, unless it did so a moment ago.
+
+    Attributes:
+        robots: by their names.
+        clock: see above.
+        shared_map: see above.
+        grows: whether robots may join.
     """
 
-    def __init__(self, robots: Iterable[Robot], clock: Clock, *, shared_map: bool = False) -> None:
-        self.robots = {each.name: each for each in robots}
+    def __init__(
+        self,
+        robots: Iterable[Robot],
+        clock: Clock,
+        *,
+        shared_map: bool = False,
+        join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
+    ) -> None:
+        self.robots: Mapping[str, Robot] = {each.name: each for each in robots}
         self.clock = clock
         self.shared_map = shared_map
+        self.grows = join is not None
+        self._join = join
+        self._lock = threading.Lock()
+
+    def joined(self) -> Sequence[Robot]:
+        """Returns the robots that were shipped to the lake for the first time since; adds them.
+
+        Raises:
+            EpisodicError: the lake cannot be read.
+        """
+        if self._join is None:
+            return ()
+        with self._lock:
+            found = [*self._join(self.robots)]
+            # Another one: whoever goes through them sees no change.
+            self.robots = {**self.robots, **{each.name: each for each in found}}
+        return found
 
     def allowed(self, call: Call) -> list[Robot]:
         """Returns the robots that a call may ask about, in the order of the configuration."""
@@ -159,7 +191,10 @@ class Fleet:
         Raises:
             InvalidArgumentsError: there is none, or the call may not ask about it, which the
                 sentence does not tell apart.
+            EpisodicError: the lake, which may have it, cannot be read.
         """
+        if name not in self.robots and call.robots is None:
+            self.joined()
         allowed = self.allowed(call)
         for each in allowed:
             if each.name == name:

@@ -127,6 +127,10 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
     suspects = [
         each for each in view.snapshot.suspected_holes if window.overlaps(each.first, each.last)
     ]
+    if view.memory.stated is not None and any(each.bag is not None for each in suspects):
+        # A lake has no times of messages to look at.
+        suspects = [each for each in suspects if each.bag is None]
+        view.notes.add("steps of the clock inside of a bag are not seen in the lake")
     if suspects:
         try:
             topic = resolve_pose_topic(view)

@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Final, cast
+from datetime import date
+from typing import TYPE_CHECKING, Final
 
 from pyiceberg.exceptions import NoSuchTableError
-from pyiceberg.expressions import AlwaysTrue, And, GreaterThanOrEqual, In, LessThanOrEqual
 
-from ros2_memory.core.errors import RefusedError
 from ros2_memory.lake.engines.base import DataFiles
+from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions, locations
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable
+    from collections.abc import Callable, Collection, Iterable, Mapping
     from contextlib import AbstractContextManager
-    from datetime import date
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
-    from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
 
-# Their constructors are not those that Pydantic's plugin for mypy takes them to have.
-_one_of: Final = cast("Callable[[str, object], BooleanExpression]", In)
-_at_least: Final = cast("Callable[[str, object], BooleanExpression]", GreaterThanOrEqual)
-_at_most: Final = cast("Callable[[str, object], BooleanExpression]", LessThanOrEqual)
-_MOST_PLANS: Final = 256
-"""Plans that stay in memory."""
+_EVER: Final = (date.min, date.max)
 
 
 def _as_they_are(_: str) -> AbstractContextManager[None]:
@@ -59,19 +54,25 @@ class Lake:
         self._engine = engine
         self._namespace = namespace
         self._lock = threading.Lock()
+        self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}
-        self._plans: dict[tuple[object, ...], DataFiles] = {}
+        self._partitions = {name: Partitions(name) for name in TABLES}
 
-    def refresh(self) -> int:
-        """Looks for what was committed since, and returns the version of `bags`; 0 without one.
+    def refresh(self, within_s: float = 0.0) -> None:
+        """Looks for what was committed since, unless that was done within so many seconds.
 
         `bags` is committed last, so nothing else changes for those who ask about its rows.
+
+        Raises:
+            RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
+            if time.monotonic() - self._looked_at < within_s:
+                return
+            # Other tables are looked up later, and have the rows of these bags by then.
             self._tables = {}
-            table = self._table("bags")
-            snapshot = None if table is None else table.current_snapshot()
-            return 0 if snapshot is None else snapshot.snapshot_id
+            self._table("bags")
+            self._looked_at = time.monotonic()
 
     def robots(self) -> list[str]:
         """Returns the names of all robots that have bags, in order; no file of rows is read.
@@ -80,10 +81,16 @@ class Lake:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            table = self._table("bags")
-            tasks = () if table is None else table.scan().plan_files()
-            # Partitioned by robot and day.
-            return sorted({str(task.file.partition[0]) for task in tasks})
+            return [*self._days("bags")]
+
+    def days(self, name: str, robot: str) -> Days:
+        """Returns the files of a robot in a table.
+
+        Raises:
+            RefusedError: the lake cannot be read.
+        """
+        with self._lock, self._translated("looking into the lake"):
+            return self._days(name).get(robot, NO_DAYS)
 
     def select(
         self,
@@ -103,7 +110,7 @@ class Lake:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            files = {name: self._files(name, robots, days) for name in tables}
+            files = {name: self._files(name, robots, days or _EVER) for name in tables}
         return self._engine.select(sql, files, parameters or {})
 
     def _table(self, name: str) -> IcebergTable | None:
@@ -114,42 +121,15 @@ class Lake:
                 return None
         return self._tables[name]
 
-    def _files(
-        self, name: str, robots: Collection[str] | None, days: tuple[date, date] | None
-    ) -> DataFiles:
+    def _days(self, name: str) -> Mapping[str, Days]:
         table = self._table(name)
-        snapshot = None if table is None else table.current_snapshot()
-        if table is None or snapshot is None:
-            return DataFiles(TABLES[name].arrow_schema(), (), {})
-        among = None if robots is None else tuple(sorted(robots))
-        key = (name, snapshot.snapshot_id, among, days)
-        if key not in self._plans:
-            if len(self._plans) >= _MOST_PLANS:
-                self._plans.clear()
-            self._plans[key] = _planned(table, name, _filter(among, days))
-        return self._plans[key]
+        return {} if table is None else self._partitions[name].look(table)
 
-
-def _filter(robots: Collection[str] | None, days: tuple[date, date] | None) -> BooleanExpression:
-    found: BooleanExpression = AlwaysTrue()
-    if robots is not None:
-        found = And(found, _one_of("robot", robots))
-    if days is not None:
-        first, last = days
-        found = And(
-            found,
-            _at_least("day", first.isoformat()),
-            _at_most("day", last.isoformat()),
-        )
-    return found
-
-
-def _planned(table: IcebergTable, name: str, row_filter: BooleanExpression) -> DataFiles:
-    tasks = [*table.scan(row_filter=row_filter).plan_files()]
-    if any(task.delete_files for task in tasks):
-        raise RefusedError(
-            f"the lake's table {name} has delete files, which another program wrote: rewrite them "
-            "into its data files first (copy-on-write)"
-        )
-    locations = tuple(task.file.file_path for task in tasks)
-    return DataFiles(TABLES[name].arrow_schema(), locations, dict(table.io.properties))
+    def _files(
+        self, name: str, robots: Collection[str] | None, days: tuple[date, date]
+    ) -> DataFiles:
+        of_robot, table = self._days(name), self._table(name)
+        among = of_robot if robots is None else sorted(robots)
+        files = [each for robot in among for each in of_robot.get(robot, NO_DAYS).files(*days)]
+        store = {} if table is None else dict(table.io.properties)
+        return DataFiles(TABLES[name].arrow_schema(), locations(files), store)

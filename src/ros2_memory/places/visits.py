@@ -94,8 +94,8 @@ def visits(
     """
     place = asked_place(memory.limits, (x, y), radius_m, where)
     wall = memory.clock.now()
-    view = open_view(memory, call, wall)
     window = search_window(TimeRange(start_s, end_s), wall)
+    view = open_view(memory, call, min(window.stop, wall))
     require_recorded(view, window)
     topic = resolve_pose_topic(view)
     named_frame = None if place is None else place.frame_id

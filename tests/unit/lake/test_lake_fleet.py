@@ -13,6 +13,7 @@ from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.bootstrap_lake import engine_of
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Call
 from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
@@ -79,13 +80,54 @@ async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: P
     assert [each.published for each in indexes] == [None, None]
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_fleet_fresh, robots, 1.0)
+            tasks.start_soon(keep_fleet_fresh, fleet, 1.0)
             while any(each.published is None for each in indexes):
                 await anyio.sleep(0.01)
             tasks.cancel_scope.cancel()
     assert [each.published.latest for each in indexes if each.published] == [
         each.memory().index.snapshot().latest for each in robots
     ]
+
+
+def test_a_robot_that_is_first_shipped_later_is_known_when_it_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
+    fleet = _with_a_later_robot(tmp_path)
+    assert [*fleet.robots] == ["hall", "attic"]
+    limited = Call(robots=frozenset({"hall"}))
+    with pytest.raises(InvalidArgumentsError, match=r"cellar.*there is hall"):
+        fleet.named("cellar", limited)
+    assert "cellar" not in fleet.robots
+    found = reply(fleet, "find_last_match", {**CUP, "robot": "cellar"})
+    assert found["robot_name"] == "cellar"
+    assert found["topic"] == SEEN
+    with pytest.raises(InvalidArgumentsError, match="there are attic, cellar, hall"):
+        fleet.named("garden", Call())
+
+
+async def test_a_server_looks_for_robots_that_are_first_shipped_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
+    fleet = _with_a_later_robot(tmp_path)
+    with anyio.fail_after(60):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_fleet_fresh, fleet, 1.0, 0.01)
+            while not (cellar := fleet.robots.get("cellar")) or not cellar.memory().index.published:
+                await anyio.sleep(0.01)
+            tasks.cancel_scope.cancel()
+
+
+def _with_a_later_robot(folder: Path) -> Fleet:
+    """The fleet of a server that was started before a robot was shipped for the first time."""
+    for name in ("hall", "attic", "cellar"):
+        write_bag(folder / name, 0)
+    ship(folder / "lake", [robot_bags(name, folder / name) for name in ("hall", "attic")])
+    fleet = build_fleet(load_settings(overrides(folder, "duckdb"), {}))
+    ship(folder / "lake", [robot_bags("cellar", folder / "cellar")])
+    assert fleet is not None
+    return fleet
 
 
 def test_an_engine_has_the_settings_of_its_group(tmp_path: Path) -> None:

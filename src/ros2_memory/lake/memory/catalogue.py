@@ -13,10 +13,11 @@ from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.map_digest import NO_STATICS, decode_map_tracks
 from ros2_memory.catalogue.store import BagKey, Catalogue
+from ros2_memory.lake.partitions import locations
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import date
 
     from ros2_memory.analysis.motion.odometry import PoseDigest
@@ -25,12 +26,15 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeIndex
+    from ros2_memory.lake.partitions import Days
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
 
-_MOST_DAYS: Final = 64
-"""Days of digests of one kind that stay in memory."""
+_PART_BYTES: Final = 1 << 20
+"""Days are read together, of so many bytes in all: a home robot's day, or weeks of a rare one."""
+_MOST_PARTS: Final = 64
+"""Parts of one kind of digest that stay in memory."""
 _PACKED: Final = (
     "SELECT bag_id, packed FROM digests WHERE kind = $kind AND topic = $topic"
     " AND version = $version AND packed IS NOT NULL"
@@ -39,7 +43,7 @@ _LABELS: Final = "SELECT DISTINCT bag_id, label FROM sightings WHERE topic = $to
 
 
 class LakeCatalogue(Catalogue):
-    """Looks digests up in a lake, a day at a time; what a lake has no digests of is not known.
+    """Looks digests up in a lake, days at a time; what a lake has no digests of is not known.
 
     Positions are placed in the map already, so there are no static transforms here.
 
@@ -58,8 +62,8 @@ class LakeCatalogue(Catalogue):
         self._robot = robot
         self._index = index
         self._static_topics = static_topics
-        self._days_lock = threading.Lock()
-        self._days: OrderedDict[tuple[object, ...], Mapping[str, object]] = OrderedDict()
+        self._parts_lock = threading.Lock()
+        self._parts: OrderedDict[tuple[object, ...], Mapping[str, object]] = OrderedDict()
 
     def read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
         """Returns `unknown`: there is no database."""
@@ -123,9 +127,7 @@ class LakeCatalogue(Catalogue):
         found: dict[int, ZoneMap] = {}
         if not self._index.is_detector(topic):
             return dict.fromkeys(numbers, UNBOUNDED)
-        for number in numbers:
-            bag = self._index.bag(number)
-            labels = self._of_day("labels", topic, bag.day).get(bag.bag_id)
+        for number, labels in self._digests("labels", topic, numbers):
             found[number] = labels if isinstance(labels, ZoneMap) else ZoneMap()
         return found
 
@@ -144,33 +146,43 @@ class LakeCatalogue(Catalogue):
         return dict.fromkeys(numbers, ()) if topic in self._static_topics else {}
 
     def _packed(self, kind: str, topic: str, numbers: Sequence[int]) -> dict[int, bytes]:
-        found: dict[int, bytes] = {}
+        found = self._digests(kind, topic, numbers)
+        return {number: packed for number, packed in found if isinstance(packed, bytes)}
+
+    def _digests(
+        self, kind: str, topic: str, numbers: Sequence[int]
+    ) -> Iterator[tuple[int, object]]:
+        """Yields bags by their numbers, with their digest of a kind, or None."""
+        days = self._lake.days("sightings" if kind == "labels" else "digests", self._robot)
+        of_day: dict[date, Mapping[str, object]] = {}
         for number in numbers:
             bag = self._index.bag(number)
-            packed = self._of_day(kind, topic, bag.day).get(bag.bag_id)
-            if isinstance(packed, bytes):
-                found[number] = packed
-        return found
+            if bag.day not in of_day:
+                of_day[bag.day] = self._of_part(kind, topic, days, days.part(bag.day, _PART_BYTES))
+            yield number, of_day[bag.day].get(bag.bag_id)
 
-    def _of_day(self, kind: str, topic: str, day: date) -> Mapping[str, object]:
+    def _of_part(
+        self, kind: str, topic: str, days: Days, part: tuple[date, date]
+    ) -> Mapping[str, object]:
         """Returns digests of a kind by the ids of their bags."""
-        key = (self._index.version, kind, topic, day)
-        with self._days_lock:
-            known = self._days.get(key)
+        # Files never change, so what was read of the same ones is still true.
+        key = (kind, topic, locations(days.files(*part)))
+        with self._parts_lock:
+            known = self._parts.get(key)
             if known is not None:
-                self._days.move_to_end(key)
+                self._parts.move_to_end(key)
                 return known
-        known = self._read_day(kind, topic, day)
-        with self._days_lock:
-            self._days[key] = known
-            if len(self._days) > _MOST_DAYS:
-                self._days.popitem(last=False)
+        known = self._read(kind, topic, part)
+        with self._parts_lock:
+            self._parts[key] = known
+            if len(self._parts) > _MOST_PARTS:
+                self._parts.popitem(last=False)
         return known
 
-    def _read_day(self, kind: str, topic: str, day: date) -> Mapping[str, object]:
+    def _read(self, kind: str, topic: str, days: tuple[date, date]) -> Mapping[str, object]:
         if kind == "labels":
             rows = self._lake.select(
-                _LABELS, ["sightings"], {"topic": topic}, robots=[self._robot], days=(day, day)
+                _LABELS, ["sightings"], {"topic": topic}, robots=[self._robot], days=days
             )
             words: dict[str, set[str]] = {}
             pairs = zip(rows["bag_id"].to_pylist(), rows["label"].to_pylist(), strict=True)
@@ -180,7 +192,7 @@ class LakeCatalogue(Catalogue):
                 bag_id: ZoneMap(joined_words(each), texts=True) for bag_id, each in words.items()
             }
         asked = {"kind": kind, "topic": topic, "version": str(DIGEST_VERSION)}
-        rows = self._lake.select(_PACKED, ["digests"], asked, robots=[self._robot], days=(day, day))
+        rows = self._lake.select(_PACKED, ["digests"], asked, robots=[self._robot], days=days)
         return dict(zip(rows["bag_id"].to_pylist(), rows["packed"].to_pylist(), strict=True))
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
-from datetime import timedelta
+from dataclasses import dataclass, field, replace
+from datetime import date, timedelta
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+import pyarrow.compute as pc
 
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
@@ -16,17 +19,20 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from ros2_memory.lake.partitions import locations
+from ros2_memory.lake.tables import day_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from datetime import date
 
     import pyarrow as pa
+    from numpy.typing import NDArray
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.lake.files import Lake
+    from ros2_memory.lake.partitions import Days
     from ros2_memory.retention.foreign import Foreign
 
 FOLDER: Final = "lake"
@@ -39,7 +45,16 @@ _TOPICS: Final = (
     "SELECT bag_id, topic, type, messages, first_ns, last_ns, version FROM digests"
     " WHERE kind = 'topic' AND messages > 0 AND bag_id IN (SELECT bag_id FROM bags)"
 )
-_DAYS: Final = "SELECT min(day) AS first, max(day) AS last FROM bags"
+_TABLES: Final = ("bags", "digests", "sightings", "messages")
+"""Those whose rows the index is made of."""
+MOST_BAGS: Final = 45_000
+"""Bags that are looked at together: a month of minutes, or some years of ten a day."""
+_FEWEST_DAYS: Final = 2
+"""Days that are looked at together where a time before the newest ones is asked about."""
+_MOST_WINDOWS: Final = 3
+"""Times before the newest days that stay in memory."""
+_LOOKS: Final = 4
+"""What is known of the lake serves for all robots for this part of the time that it may be old."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +72,33 @@ class LakeBag:
     is_current: bool
 
 
+@dataclass(frozen=True)
+class _Window:
+    """Consecutive days of a robot, and what the lake has of them.
+
+    Attributes:
+        made_of: the files of its rows.
+        since: its first day, where there are older ones; None otherwise.
+        timeline: its bags.
+        files: these by their paths.
+        detectors: topics of which all detections are rows.
+        whole_topics: topics of which some bags have all messages as rows.
+    """
+
+    made_of: tuple[str, ...] = ()
+    since: date | None = None
+    timeline: Timeline = field(default_factory=Timeline)
+    files: Mapping[str, BagFile] = field(default_factory=dict)
+    detectors: frozenset[str] = frozenset()
+    whole_topics: frozenset[str] = frozenset()
+
+
 class LakeIndex:
     """What a lake has of one robot, as of some seconds ago. Thread-safe.
 
-    All bags are of one recording here: which messages count where recordings overlap was decided
-    when they were shipped.
+    It is of the newest days, and of other days where a question is about a time before these. All
+    bags are of one recording here: which messages count where recordings overlap was decided when
+    they were shipped.
 
     Args:
         lake: the lake.
@@ -69,13 +106,12 @@ class LakeIndex:
         clock: the wall clock.
         pose_topic: the topic of the robot's track.
         refresh_s: how old (s) the index may be.
-        days: how many days with data answer: the newest.
+        days: how many days are looked at together, at least: the newest; more of few bags.
+        most_bags: so many bags at most, where that is more days.
 
     Attributes:
         bag_dir: names no directory.
         pose_topic: the topic of the robot's track.
-        version: of what was committed last, as far as it was seen.
-        since: the first day that answers, where older days have data; None where all days do.
     """
 
     def __init__(
@@ -87,23 +123,23 @@ class LakeIndex:
         pose_topic: str,
         refresh_s: float,
         days: int,
+        most_bags: int,
     ) -> None:
         self.bag_dir = Path("/") / robot
         self.pose_topic = pose_topic
-        self.version = -1
-        self.since: date | None = None
         self._lake = lake
         self._robot = robot
         self._clock = clock
-        self._refresh_ns = round(refresh_s * 1e9)
-        self._days = days
+        self._refresh_s = refresh_s
+        self._fewest_days = days
+        self._most_bags = most_bags
         self._lock = threading.Lock()
         self._numbers: dict[tuple[str, ...], int] = {}
         self._bags: list[LakeBag] = []
-        self._files_by_name: dict[str, BagFile] = {}
-        self._detectors: frozenset[str] = frozenset()
-        self._whole_topics: frozenset[str] = frozenset()
+        self._newest = _Window()
+        self._older: dict[date, _Window] = {}
         self._snapshot: Snapshot | None = None
+        self._asked = threading.local()
 
     @property
     def published(self) -> Snapshot | None:
@@ -113,26 +149,39 @@ class LakeIndex:
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
         """Returns an index that is not older than it may be; what is not shipped yet is not in it.
 
+        Where `reach` is before the newest days, it is of the days up to that time.
+
         Raises:
             RefusedError: the lake cannot be read.
         """
-        del reach
         known = self._snapshot
-        if known is None or self._clock.now() - known.scanned_at > self._refresh_ns:
-            return self.refresh()
+        if known is None or self._clock.now() - known.scanned_at > self._refresh_s * 1e9:
+            known = self.refresh()
+        window = self._newest
+        if reach is not None and window.since is not None and day_of(reach) < window.since:
+            window = self._window_before(day_of(reach))
+            known = replace(known, timeline=window.timeline)
+        self._note(window)
         return known
 
     def refresh(self) -> Snapshot:
-        """Looks into the lake now."""
+        """Looks into the lake now; what was just seen there for another robot is not old."""
         with self._lock:
-            version = self._lake.refresh()
-            known = self._snapshot
-            timeline = (
-                self._timeline() if known is None or version != self.version else known.timeline
-            )
-            self.version = version
-            self._snapshot = Snapshot(timeline=timeline, scanned_at=self._clock.now())
+            self._lake.refresh(self._refresh_s / _LOOKS)
+            days = self._lake.days("bags", self._robot)
+            span = days.newest(date.max, self._most_bags, self._fewest_days)
+            self._newest = self._window(days, span, self._newest, FOLDER)
+            self._snapshot = Snapshot(self._newest.timeline, scanned_at=self._clock.now())
             return self._snapshot
+
+    def unseen_before(self) -> date | None:
+        """Returns before which day the lake has days that this thread was not shown since it asked.
+
+        None where it was shown all.
+        """
+        found: date | None = getattr(self._asked, "since", None)
+        self._asked.since = None
+        return found
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
@@ -152,66 +201,81 @@ class LakeIndex:
         return bag.sidecar_ns
 
     def file(self, path: Path) -> BagFile:
-        """Returns the bag of the current snapshot that has a path there.
+        """Returns the bag of a snapshot that has a path there.
 
         Raises:
             BagVanishedError: it is not in the lake any more.
         """
-        found = self._files_by_name.get(str(path))
-        if found is None:
-            raise BagVanishedError(str(path), "it is not in the lake any more")
-        return found
+        for window in (self._newest, *self._older.values()):
+            found = window.files.get(str(path))
+            if found is not None:
+                return found
+        raise BagVanishedError(str(path), "it is not in the lake any more")
 
     def is_detector(self, topic: str) -> bool:
         """Returns whether all detections of a topic are rows."""
-        return topic in self._detectors
+        return any(topic in each.detectors for each in (self._newest, *self._older.values()))
 
     def has_messages(self, topic: str) -> bool:
         """Returns whether some bags have all messages of a topic as rows."""
-        return topic in self._whole_topics
+        return any(topic in each.whole_topics for each in (self._newest, *self._older.values()))
 
-    def _timeline(self) -> Timeline:
-        [span] = self._lake.select(_DAYS, ["bags"], robots=[self._robot]).to_pylist()
-        if span["last"] is None:
-            return Timeline()
-        first = max(span["first"], span["last"] - timedelta(days=self._days - 1))
-        self.since = None if first == span["first"] else first
-        days = (first, span["last"])
-        bags = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=days)
-        topics = self._lake.select(_TOPICS, ["digests", "bags"], robots=[self._robot], days=days)
-        summaries = _summaries(bags["bag_id"].to_pylist(), topics)
-        versions = dict(
-            zip(topics["bag_id"].to_pylist(), topics["version"].to_pylist(), strict=True)
+    def _note(self, window: _Window) -> None:
+        since: date | None = getattr(self._asked, "since", None)
+        if window.since is not None and (since is None or window.since < since):
+            self._asked.since = window.since
+
+    def _window_before(self, day: date) -> _Window:
+        """Returns the days up to one, with the next, in which what lies across midnight goes on."""
+        with self._lock:
+            days = self._lake.days("bags", self._robot)
+            span = days.newest(day + timedelta(days=1), self._most_bags, _FEWEST_DAYS)
+            last = day if span is None else span[1]
+            known = self._older.pop(last, _Window())
+            window = self._window(days, span, known, f"{FOLDER}-{last}")
+            self._older[last] = window
+            # Another one: whoever goes through them sees no change.
+            kept = [*self._older.items()][-_MOST_WINDOWS:]
+            self._older = dict(kept)
+            return window
+
+    def _window(
+        self, known_days: Days, days: tuple[date, date] | None, known: _Window, folder: str
+    ) -> _Window:
+        """Returns what the lake has of some days; the known one where no file is another."""
+        if days is None:
+            return _Window()
+        since = None if days[0] == known_days.known[0] else days[0]
+        of_robot = [self._lake.days(table, self._robot) for table in _TABLES]
+        made_of = tuple(locations(chain.from_iterable(each.files(*days) for each in of_robot)))
+        if made_of == known.made_of:
+            return replace(known, since=since)
+        select = partial(self._lake.select, robots=[self._robot], days=days)
+        bags, topics = select(_BAGS, ["bags"]), select(_TOPICS, ["digests", "bags"])
+        files = [*self._files(bags, topics, folder)]
+        detectors, whole_topics = (
+            # Of a table name of this module.
+            frozenset(select(f"SELECT DISTINCT topic FROM {each}", [each])["topic"].to_pylist())  # noqa: S608
+            for each in ("sightings", "messages")
         )
-        files = [*self._files(bags.to_pylist(), summaries, versions)]
-        self._files_by_name = {bag.file: bag for bag in files}
-        self._detectors = self._topics_in("sightings", days)
-        self._whole_topics = self._topics_in("messages", days)
-        return Timeline.of(files)
+        by_path = {bag.file: bag for bag in files}
+        return _Window(made_of, since, Timeline.of(files), by_path, detectors, whole_topics)
 
-    def _topics_in(self, table: str, days: tuple[date, date]) -> frozenset[str]:
-        sql = f"SELECT DISTINCT topic FROM {table}"  # noqa: S608 - of a constant
-        rows = self._lake.select(sql, [table], robots=[self._robot], days=days)
-        return frozenset(rows["topic"].to_pylist())
-
-    def _files(
-        self,
-        rows: Sequence[Mapping[str, object]],
-        summaries: Mapping[int, BagSummary],
-        versions: Mapping[str, str],
-    ) -> Iterator[BagFile]:
-        for nth, row in enumerate(rows):
+    def _files(self, bags: pa.Table, topics: pa.Table, folder: str) -> Iterator[BagFile]:
+        summaries = _summaries(bags, topics)
+        is_old = pc.not_equal(topics["version"], str(DIGEST_VERSION))
+        old = frozenset(topics["bag_id"].filter(is_old).to_pylist())
+        for nth, row in enumerate(bags.to_pylist()):
             if nth not in summaries:
                 continue
             key = str(row["bag_id"]), str(row["sha256"]), str(row["made_of"])
             number = self._numbers.get(key)
             if number is None:
-                is_current = versions[key[0]] == str(DIGEST_VERSION)
-                self._bags.append(LakeBag(key[0], _day(row["day"]), is_current))
+                self._bags.append(LakeBag(key[0], _day(row["day"]), key[0] not in old))
                 number = self._numbers[key] = len(self._bags)
             # Numbered in the order of time, as the splits of one recording are.
             yield BagFile(
-                f"{self.bag_dir}/{FOLDER}/{FOLDER}_{nth}.mcap",
+                f"{self.bag_dir}/{folder}/{folder}_{nth}.mcap",
                 _whole(row["size"]),
                 _whole(row["mtime_ns"]),
                 BagState.CLOSED,
@@ -222,28 +286,40 @@ class LakeIndex:
             )
 
 
-def _summaries(bag_ids: Sequence[str], topics: pa.Table) -> dict[int, BagSummary]:
+def _summaries(bags: pa.Table, topics: pa.Table) -> dict[int, BagSummary]:
     """Returns the summaries of bags, by their position; rows of topics are in any order."""
-    position = {bag_id: nth for nth, bag_id in enumerate(bag_ids)}
-    names = [*zip(topics["topic"].to_pylist(), topics["type"].to_pylist(), strict=True)]
-    codes = {name: code for code, name in enumerate(sorted(set(names)))}
-    headers = [TopicHeader(topic, kind, _ENCODING, latched=False) for topic, kind in codes]
-    of_bag = np.array([position[each] for each in topics["bag_id"].to_pylist()], np.int64)
-    of_topic = np.array([codes[name] for name in names], np.int64)
+    ids = bags["bag_id"].combine_chunks()
+    of_bag = pc.index_in(topics["bag_id"], value_set=ids).to_numpy().astype(np.int64)
+    names, of_topic = _ranked(topics)
+    headers = [TopicHeader(topic, kind, _ENCODING, latched=False) for topic, kind in names]
     order = np.lexsort((of_topic, of_bag))
     columns = [topics[name].to_numpy() for name in ("messages", "first_ns", "last_ns")]
     numbers = np.stack(columns, axis=1).astype("<i8")[order] if len(order) else np.zeros((0, 3))
-    bags, begins = np.unique(of_bag[order], return_index=True)
+    found_bags, begins = np.unique(of_bag[order], return_index=True)
     ends = [*begins[1:].tolist(), len(order)]
     held, schemas = of_topic[order], dict[bytes, "SummarySchema"]()
     found: dict[int, BagSummary] = {}
-    for bag, begin, end in zip(bags.tolist(), begins.tolist(), ends, strict=True):
+    for bag, begin, end in zip(found_bags.tolist(), begins.tolist(), ends, strict=True):
         key = held[begin:end].tobytes()
         if key not in schemas:
             own = tuple(headers[code] for code in held[begin:end].tolist())
             schemas[key] = shared_schema(own, (), complete=True, notes=())
         found[bag] = BagSummary.decoded(schemas[key], numbers[begin:end].tobytes())
     return found
+
+
+def _ranked(topics: pa.Table) -> tuple[Sequence[tuple[str, str]], NDArray[np.int64]]:
+    """Returns all pairs of topic and type in order, and for each row the position of its pair."""
+    columns = [topics[name].combine_chunks().dictionary_encode() for name in ("topic", "type")]
+    texts = [each.dictionary.to_pylist() for each in columns]
+    indices = [each.indices.to_numpy().astype(np.int64) for each in columns]
+    many = max(len(texts[1]), 1)
+    codes, rows = np.unique(indices[0] * many + indices[1], return_inverse=True)
+    names = [(texts[0][code // many], texts[1][code % many]) for code in codes.tolist()]
+    order = sorted(range(len(names)), key=names.__getitem__)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return [names[each] for each in order], rank[rows]
 
 
 def _day(value: object) -> date:

@@ -20,6 +20,7 @@ from ros2_memory.lake.memory.rows_as_messages import (
     message,
     states,
 )
+from ros2_memory.lake.partitions import locations
 from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, StateRun, unpacked, unpacked_empty
 from ros2_memory.lake.tables import topic_key
 from ros2_memory.lake.typed_values import MAPS
@@ -38,26 +39,29 @@ if TYPE_CHECKING:
     from ros2_memory.lake.memory.index import LakeBag, LakeIndex
     from ros2_memory.storage.base import Channel, Record
 
-    DayOfSightings = tuple[pa.Table, Mapping[str, int], Mapping[str, int], Mapping[str, bytes]]
+    RowsOfDay = tuple[pa.Table, Mapping[str, int], Mapping[str, int]]
 
-_MOST_DAYS: Final = 8
-"""Days of detections of a topic that stay in memory: a search goes through most of their bags."""
+_MOST_DAYS: Final = 16
+"""Days of a table of which the rows of a topic stay in memory."""
+_MOST_ALONE: Final = 3
+"""Bags of a day that are read alone."""
 _MOST_READ: Final = 256
 """Topics of a bag that stay in memory."""
 _SIGHTINGS: Final = (
     "SELECT bag_id, time_ns, message, label, score, frame_id, x, y, z FROM sightings"
-    " WHERE topic_key = $key AND topic = $topic ORDER BY bag_id, time_ns, message"
+    " WHERE topic_key = $key AND topic = $topic"
 )
 _EMPTY: Final = (
-    "SELECT bag_id, packed FROM digests WHERE topic_key = $key AND topic = $topic AND kind = $kind"
+    "SELECT bag_id, kind, packed FROM digests"
+    f" WHERE topic_key = $key AND topic = $topic AND kind = '{EMPTY_KIND}'"  # noqa: S608
 )
 _MESSAGES: Final = (
     f"SELECT type, time_ns, publish_ns, value, {', '.join(MAPS)} FROM messages"  # noqa: S608
     " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns, message"
 )
 _POSES: Final = (
-    "SELECT time_ns, frame_id, x, y, heading, begins FROM poses"
-    " WHERE topic_key = $key AND topic = $topic AND bag_id = $bag ORDER BY time_ns"
+    "SELECT bag_id, time_ns, frame_id, x, y, heading, begins FROM poses"
+    " WHERE topic_key = $key AND topic = $topic"
 )
 _STATES: Final = (
     "SELECT kind, packed FROM digests"
@@ -100,7 +104,8 @@ class LakeReader(BagReader):
         self._served = threading.local()
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[str, str], Sequence[Record]] = OrderedDict()
-        self._days: OrderedDict[tuple[object, ...], DayOfSightings] = OrderedDict()
+        self._days: OrderedDict[tuple[object, ...], RowsOfDay] = OrderedDict()
+        self._read_alone = Counter[tuple[object, ...]]()
 
     def reads(self, path: Path) -> bool:
         """Returns True: all files of the index are of the lake."""
@@ -251,29 +256,50 @@ class LakeReader(BagReader):
         self, bag: LakeBag, topic: str
     ) -> tuple[Sequence[Mapping[str, JsonValue]], bytes | None]:
         """Returns the detections of a bag, and where there was none, which is packed."""
-        key = self._index.version, topic, bag.day
+        rows = self._rows_of_day("sightings", _SIGHTINGS, "time_ns, message", bag, topic)
+        empty = self._rows_of_day("digests", _EMPTY, "kind", bag, topic)
+        packed: object = empty[0]["packed"] if empty else None
+        return rows, packed if isinstance(packed, bytes) else None
+
+    def _rows_of_day(
+        self, table: str, sql: str, order: str, bag: LakeBag, topic: str
+    ) -> Sequence[Mapping[str, JsonValue]]:
+        """Returns the rows of a topic in a bag, in order.
+
+        The first bags of a day that are asked for are read alone: the newest match is in one of
+        these. Who goes on reads most of the day.
+        """
+        select = partial(self._lake.select, robots=[self._robot], days=(bag.day, bag.day))
+        asked = {"key": topic_key(topic), "topic": topic}
+        # Files never change, so what was read of the same ones is still true.
+        key = table, topic, locations(self._lake.days(table, self._robot).files(bag.day, bag.day))
         with self._lock:
             known = self._days.get(key)
+            self._read_alone[key] += known is None
+            is_alone = self._read_alone[key] <= _MOST_ALONE
+        rows: Sequence[Mapping[str, JsonValue]]
+        if known is None and is_alone:
+            of_bag = f"{sql} AND bag_id = $bag ORDER BY {order}"
+            rows = select(of_bag, [table], {**asked, "bag": bag.bag_id}).to_pylist()
+            return rows
         if known is None:
-            asked = {"key": topic_key(topic), "topic": topic}
-            of_day = partial(self._lake.select, robots=[self._robot], days=(bag.day, bag.day))
-            table = of_day(_SIGHTINGS, ["sightings"], asked)
-            empty = of_day(_EMPTY, ["digests"], {**asked, "kind": EMPTY_KIND})
-            packed = zip(empty["bag_id"].to_pylist(), empty["packed"].to_pylist(), strict=True)
-            names = table["bag_id"].to_pylist()
-            begins: Mapping[str, int] = {name: at for at, name in reversed([*enumerate(names)])}
-            known = table, begins, Counter(names), dict(packed)
+            found = select(f"{sql} ORDER BY bag_id, {order}", [table], asked)
+            names = found["bag_id"].to_pylist()
+            known = found, {name: at for at, name in reversed([*enumerate(names)])}, Counter(names)
             with self._lock:
                 self._days[key] = known
+                del self._read_alone[key]
                 if len(self._days) > _MOST_DAYS:
                     self._days.popitem(last=False)
-        begin, count = known[1].get(bag.bag_id, 0), known[2].get(bag.bag_id, 0)
-        rows: Sequence[Mapping[str, JsonValue]] = known[0].slice(begin, count).to_pylist()
-        return rows, known[3].get(bag.bag_id)
+        found, begins, counts = known
+        rows = found.slice(begins.get(bag.bag_id, 0), counts.get(bag.bag_id, 0)).to_pylist()
+        return rows
 
     def _tracks(self, bag: BagFile, here: LakeBag) -> Tracks:
         topic = self._index.pose_topic
-        return Tracks(bag, topic, self._rows(_POSES, "poses", here, topic), self._map_frame)
+        return Tracks(
+            bag, topic, self._rows_of_day("poses", _POSES, "time_ns", here, topic), self._map_frame
+        )
 
     def _rows(
         self, sql: str, table: str, bag: LakeBag, topic: str

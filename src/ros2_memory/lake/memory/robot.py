@@ -9,7 +9,7 @@ from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.memory.catalogue import LakeCatalogue
-from ros2_memory.lake.memory.index import LakeIndex
+from ros2_memory.lake.memory.index import MOST_BAGS, LakeIndex
 from ros2_memory.lake.memory.reader import LakeReader
 from ros2_memory.lake.memory.rows_as_messages import stated_in
 
@@ -52,7 +52,8 @@ class LakeRobot:
         limits: the settings of queries.
         extractor: knows the types of messages.
         refresh_s: how old (s) the index may be.
-        days: how many days with data answer: the newest.
+        days: how many days are looked at together, at least; see `LakeIndex`.
+        most_bags: likewise, and of how many bags.
 
     Attributes:
         memory: what queries are asked of.
@@ -68,9 +69,16 @@ class LakeRobot:
         *,
         refresh_s: float = 60.0,
         days: int = 31,
+        most_bags: int = MOST_BAGS,
     ) -> None:
         self._index = LakeIndex(
-            lake, name, clock, pose_topic=limits.pose_topic, refresh_s=refresh_s, days=days
+            lake,
+            name,
+            clock,
+            pose_topic=limits.pose_topic,
+            refresh_s=refresh_s,
+            days=days,
+            most_bags=most_bags,
         )
         self._reader = LakeReader(
             lake,
@@ -95,6 +103,10 @@ class LakeRobot:
 
     def notes(self) -> Iterator[str]:
         """Yields the notes for the answer that this thread has just computed."""
-        if self._index.since is not None:
-            yield f"the lake has days before {self._index.since}, which were not looked at"
+        since = self._index.unseen_before()
+        if since is not None:
+            yield (
+                f"the lake has days before {since}, which were not looked at: an end (or a time) "
+                "there has them looked at"
+            )
         yield from self._reader.take_notes()
