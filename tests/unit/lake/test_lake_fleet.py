@@ -102,7 +102,7 @@ def test_a_robot_that_is_first_shipped_later_is_known_when_it_is_asked_for(
     found = reply(fleet, "find_last_match", {**CUP, "robot": "cellar"})
     assert found["robot_name"] == "cellar"
     assert found["topic"] == SEEN
-    with pytest.raises(InvalidArgumentsError, match="there are attic, cellar, hall"):
+    with pytest.raises(InvalidArgumentsError, match="there are hall, attic, cellar"):
         fleet.named("garden", Call())
 
 

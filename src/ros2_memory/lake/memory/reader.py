@@ -52,8 +52,8 @@ _SIGHTINGS: Final = (
     " WHERE topic_key = $key AND topic = $topic"
 )
 _EMPTY: Final = (
-    "SELECT bag_id, kind, packed FROM digests"
-    f" WHERE topic_key = $key AND topic = $topic AND kind = '{EMPTY_KIND}'"  # noqa: S608
+    "SELECT bag_id, kind, packed FROM digests"  # noqa: S608
+    f" WHERE topic_key = $key AND topic = $topic AND kind = '{EMPTY_KIND}'"
 )
 _MESSAGES: Final = (
     f"SELECT type, time_ns, publish_ns, value, {', '.join(MAPS)} FROM messages"  # noqa: S608
