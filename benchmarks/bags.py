@@ -182,7 +182,7 @@ def _record(history: History, splits: list[Split]) -> None:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for split in splits:
-        _write(split, splits[: split.nth + 1], history.topics)
+        write_split(split, splits[: split.nth + 1], history.topics)
         # A bag that was closed long ago, as most bags of a history were.
         closed = split.start + SPLIT_NS
         os.utime(split.path, ns=(closed, closed))
@@ -215,7 +215,8 @@ def _name(recording: int) -> str:
     return f"rec_{recording:04}"
 
 
-def _write(split: Split, so_far: Sequence[Split], topics: Sequence[Topic]) -> None:
+def write_split(split: Split, so_far: Sequence[Split], topics: Sequence[Topic]) -> None:
+    """Writes a bag of 10 s; `so_far` are the splits of its recording up to it."""
     noise = np.random.default_rng(split.number)
     with split.path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
