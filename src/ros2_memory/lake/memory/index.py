@@ -256,6 +256,8 @@ class LakeIndex:
         detectors, whole_topics = (
             # Of a table name of this module.
             frozenset(select(f"SELECT DISTINCT topic FROM {each}", [each])["topic"].to_pylist())  # noqa: S608
+            if self._lake.days(each, self._robot).files(*days)
+            else frozenset[str]()
             for each in ("sightings", "messages")
         )
         by_path = {bag.file: bag for bag in files}
