@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
+import shutil
 import sys
 import time
 from functools import partial
@@ -91,15 +92,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _make(folder: Path, names: Sequence[str], days: int) -> None:
-    bags, recording = folder / "bags" / "rec_0000", []
+    bags = folder / "bags" / "rec_0000"
     bags.mkdir(parents=True, exist_ok=True)
+    # What was begun and not finished would be in the lake twice.
+    shutil.rmtree(folder / "files", ignore_errors=True)
+    (folder / "lake.sqlite").unlink(missing_ok=True)
     (folder / "places.yaml").write_text("places: {}\n")
     (folder / "labels.yaml").write_text("labels: {}\n")
     for number in range(days * len(_HOURS)):
         day, nth = divmod(number, len(_HOURS))
         at = (_FIRST_S + day * _DAY_S + _HOURS[nth] * 3600) * NS_PER_S
         split = Split(number, bags / f"rec_0000_{number}.mcap", at, number)
-        recording.append(split)
         write_split(split, [split], (ODOM, SCENE))
     settings = settings_of(folder, bags.parent)
     memory = build_memory(settings)

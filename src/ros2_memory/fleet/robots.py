@@ -193,7 +193,7 @@ class Fleet:
                 sentence does not tell apart.
             EpisodicError: the lake, which may have it, cannot be read.
         """
-        if name not in self.robots and call.robots is None:
+        if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)
         for each in allowed:
