@@ -44,11 +44,13 @@ class _Requests(BaseHTTPRequestHandler):
         with self._lock:
             match self._parts():
                 case ["namespaces"]:
-                    self._catalog.create_namespace(tuple(json.loads(body)["namespace"]))
-                    self._reply(200, {"namespace": json.loads(body)["namespace"]})
+                    asked = json.loads(body)["namespace"]
+                    is_new = tuple(asked) not in self._catalog.list_namespaces()
+                    self._catalog.create_namespace_if_not_exists(tuple(asked))
+                    self._reply(200 if is_new else 409, {"namespace": asked})
                 case ["namespaces", name, "tables"]:
-                    asked = {"location": None, **json.loads(body)}
-                    self._create(name, CreateTableRequest.model_validate(asked))
+                    request = {"location": None, **json.loads(body)}
+                    self._create(name, CreateTableRequest.model_validate(request))
                 case ["namespaces", name, "tables", table]:
                     self._commit(name, table, CommitTableRequest.model_validate_json(body))
                 case _:
