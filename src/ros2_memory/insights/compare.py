@@ -126,6 +126,12 @@ def _things(
     if first.start == second.start:
         view.notes.add("things are not compared: the two times begin together")
         return frame, ComparedThings((), (), (), (), 0)
+    runs = {each.epoch for each in known.estimate.instances}
+    if len(runs) > 1 and not known.has_map and not _is_one_session(view, windows):
+        view.notes.add(
+            "things are not recognised from one run of odometry to another, which has its own "
+            "coordinates: one that stayed where it was is in not_looked_at for each run"
+        )
     return frame, ThingsBetween(known, (first, second), where, limits.places).compared()
 
 

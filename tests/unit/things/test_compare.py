@@ -221,17 +221,19 @@ def test_standstills_are_compared_by_place_and_length(tmp_path: Path) -> None:
 
 
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
-    stood = [scene(at, HERE, [], in_map=False) for at in range(30)]
-    later = [scene(at, (3.0, 0.0, 0.0), [], in_map=False) for at in range(60, 90)]
+    stood = [scene(at, HERE, [BOOK], in_map=False) for at in range(30)]
+    later = [scene(at, (3.0, 0.0, 0.0), [BOOK], in_map=False) for at in range(60, 90)]
     write(tmp_path / "two", [each for one in stood for each in one], name="first")
     write(tmp_path / "two", [each for one in later for each in one], name="second")
     reply = ask(tmp_path / "two", **EARLIER, **LATER)
     assert not reply.keys() & {"stood_at", "farthest_apart"}
     assert any("changes with every start" in note for note in reply["notes"])
+    assert any("from one run of odometry to another" in note for note in reply["notes"])
     write(tmp_path / "one", [each for one in (*stood, *later) for each in one])
     reply = ask(tmp_path / "one", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2
     assert reply["frame_id"] == "odom"
+    assert not any("from one run" in note for note in reply.get("notes", ()))
 
 
 def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
