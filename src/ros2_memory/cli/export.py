@@ -37,7 +37,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.coverage import lost_in, note_unread
+from ros2_memory.history.coverage import lost_in, note_unread, unix_text
 from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, Record
@@ -106,8 +106,15 @@ def export(
         earlier = _latched_before(view, topics, window.start) if with_latched else []
         within = view.stream.messages(topics, window)
         first = list(islice(within, 1))
-        if earlier and not first:
-            view.notes.add("no message is in the window: only earlier latched messages are copied")
+        if latched is None and not first and not view.snapshot.timeline.overlapping(window):
+            earlier = []  # alone they would look like an answer
+        if earlier:
+            copied = counted(len(earlier), "latched message is", "latched messages are")
+            view.notes.add(
+                f"{copied} copied from before the window, with the original time: the file begins "
+                f"at {unix_text(earlier[0].time)}"
+                + ("" if first else "; no message is in the window")
+            )
         messages = _reported(chain(earlier, first, within), report)
         if mcap is not None:
             done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
@@ -219,6 +226,8 @@ def write_mcap(
     """
     if path.exists():
         raise InvalidArgumentsError(f"{path} exists; name another file, or delete it first")
+    if not path.parent.is_dir():
+        raise InvalidArgumentsError(f"{path}: there is no folder {path.parent}; make it first")
     first = next(messages, None)
     if first is None:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message is in the window")

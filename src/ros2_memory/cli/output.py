@@ -36,6 +36,9 @@ _COLUMN_GAP: Final = 2
 _TIME_OF_DAY_WIDTH: Final = 12
 _MIN_TEXT_WIDTH: Final = 16
 """Columns that a text keeps where a table is wider than the terminal."""
+_ALL: Final = "all"
+"""The key of a table's last row, and what stands in its first column."""
+_KEYS_OF_TIMES: Final = frozenset({"start", "end", "earliest", "latest", "first_ts", "last_ts"})
 _VECTOR_KEYS: Final = frozenset({"x", "y", "z", "w", "yaw_deg", "frame_id"})
 _TIME_IN_NOTE: Final = re.compile(r"\b\d{10}\.\d{3,9}\b")
 _COMMANDS: Final = {
@@ -99,13 +102,25 @@ def with_commands(sentence: str) -> str:
 
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
     """Returns a reply with an object for each row of its table, if it has one."""
-    fields, rows = value.get("fields"), value.get("rows")
+    names = "columns" if "columns" in value else "fields"
+    fields, rows = value.get(names), value.get("rows")
     if not isinstance(fields, list) or not isinstance(rows, list):
         return value
+    every = value.get(_ALL)
+    if isinstance(every, list):  # a row of its own, without its name
+        rows = [*rows, [_ALL, *every]]
     named: list[JsonValue] = [
-        dict(zip(map(str, fields), row, strict=False)) for row in rows if isinstance(row, list)
+        {name: cell for name, cell in zip(map(str, fields), row, strict=False) if _is_shown(name)}
+        for row in rows
+        if isinstance(row, list)
     ]
-    return {key: each for key, each in value.items() if key != "fields"} | {"rows": named}
+    told = {names, "rows", _ALL} if isinstance(every, list) else {names, "rows"}
+    return {key: each for key, each in value.items() if key not in told} | {"rows": named}
+
+
+def _is_shown(column: str) -> bool:
+    """Returns whether people get a column: the same time as text stands beside a Unix time."""
+    return not column.endswith("_unix")
 
 
 def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
@@ -133,7 +148,12 @@ def _format_line(key: str, value: JsonValue, now: float | None) -> str:
 
 
 def _format_for_key(key: str, value: JsonValue) -> str:
-    """Formats a value; under a key that ends in `_s`, long durations in minutes, hours or days."""
+    """Formats a value; under a key that ends in `_s`, long durations in minutes, hours or days.
+
+    A time of a clock that was never set gets its unit.
+    """
+    if key in _KEYS_OF_TIMES and isinstance(value, int | float) and not _is_time(value):
+        return f"{format_value(value)} s after 1970"
     if (
         isinstance(value, int | float)
         and key.endswith("_s")

@@ -291,6 +291,12 @@ def _recordings_apart(view: View, topic: str, window: TimeWindow) -> list[str]:
     return sorted(each.name for each in apart)
 
 
+def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> None:
+    """Does as `note_robots` for the first few of some topics."""
+    for topic in topics[:_MAX_TOPICS]:
+        note_robots(view, topic, window)
+
+
 def note_robots_near(view: View, found: StoredMessage) -> None:
     """Does as `note_robots`, around the time of a message; a single recording is of one robot."""
     topic = found.record.channel.topic

@@ -38,6 +38,7 @@ from ros2_memory.history.reverse_search import (
     condition_of,
     unasked_limit,
 )
+from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects, newest_in_session, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
@@ -184,6 +185,7 @@ def find_matches(
     elif fields:
         found = _with_fields(view, found, [newest for _, newest in wanted], fields)
     is_nothing = not (collected.selected or goals)
+    note_robots_on(view, matching_topics(view, topic), searched)
     note_unread(view, searched, nothing=is_nothing, search=True)
     if is_nothing:
         topics = matching_topics(view, topic)

@@ -255,7 +255,7 @@ def nothing_here(snapshot: Snapshot) -> str:
         bags = counted(len(snapshot.empty), "bag holds", "bags hold")
         return f"no message is recorded here: {bags} none"
     if snapshot.damaged or snapshot.unread:
-        return "no bag answers"
+        return "no bag here can be read"
     return "no bag is here: nothing is recorded yet, or it is recorded elsewhere"
 
 

@@ -39,6 +39,7 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import require_recorded, resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
+from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
@@ -98,6 +99,7 @@ def visits(
     view = open_view(memory, call, min(window.stop, wall))
     require_recorded(view, window)
     topic = resolve_pose_topic(view)
+    note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
     own_frame = pose_frame(view, topic)

@@ -18,6 +18,7 @@ from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
+from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.where import parse_where
@@ -81,6 +82,7 @@ def find_things(
         raise InvalidArgumentsError(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
         )
+    note_robots(view, limits.pose_topic, window)
     known = known_things(view, lowest, limits.labels)
     asked = None if label is None else known.labels.key(label)
     finder = _Finder(known, window, region, limits.places)

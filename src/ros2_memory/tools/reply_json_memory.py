@@ -112,13 +112,13 @@ def _doubts(answer: results.Status) -> Iterator[str]:
         yield f"{one.topic} was silent for {seconds(one.length):.0f} s{still}"
     elif topics:
         named = next(iter(topics)) if len(topics) == 1 else counted(len(topics), "topic")
-        yield f"{named} fell silent {len(answer.silences)} times, as silences lists"
+        yield f"{named} fell silent {len(answer.silences)} times (see fell_silent)"
     if len(answer.clock_steps) == 1:
         [(_, by)] = answer.clock_steps
         how = f"{seconds(by):.3g} s ahead" if by > 0 else f"back by {seconds(-by):.3g} s or more"
         yield f"the clock was set {how}"
     elif answer.clock_steps:
-        yield f"the clock was set {len(answer.clock_steps)} times, as clock_steps lists"
+        yield f"the clock was set {len(answer.clock_steps)} times (see clock_steps)"
 
 
 @render.register(results.Status)

@@ -164,7 +164,7 @@ class TestMcap:
         assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
 
     def test_what_latched_messages_held_at_the_start_comes_along_unless_it_is_refused(
-        self, bag_dir: Path, tmp_path: Path
+        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         mounts = [
             tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
@@ -178,6 +178,8 @@ class TestMcap:
         words = ["export", "--start", str(T0 / NS_PER_S + 5), "--end", str(T0 / NS_PER_S + 6)]
         assert cli.main([*words, "--mcap", str(tmp_path / "without.mcap"), "--no-latched"]) == 0
         assert cli.main([*words, "--mcap", str(tmp_path / "with.mcap")]) == 0
+        err = capsys.readouterr().err
+        assert "2 latched messages are copied from before the window" in err
         held = [row for row in read(tmp_path / "with.mcap") if row[0] == "/tf_static"]
         assert [at for _, at, _ in held] == [T0 + 1, T0 + 2]
         rest = [row for row in read(tmp_path / "with.mcap") if row[0] != "/tf_static"]
@@ -189,10 +191,20 @@ class TestMcap:
         mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
         write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
         after = str(T0 / NS_PER_S + 5000)
+        nothing = ["export", "--mcap", str(tmp_path / "nothing.mcap"), "--start", after]
+        assert cli.main([*nothing, "--end", str(T0 / NS_PER_S + 6000)]) == 2
+        assert "no message is in the window" in capsys.readouterr().err
+        assert not (tmp_path / "nothing.mcap").exists()
         words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--start", after, "--latched"]
         assert cli.main([*words, "--end", str(T0 / NS_PER_S + 6000)]) == 0
         assert {row[0] for row in read(tmp_path / "out.mcap")} == {"/tf_static"}
         assert "no message is in the window" in capsys.readouterr().err
+
+    def test_a_folder_that_is_missing_is_named(
+        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert cli.main(["export", "--mcap", str(tmp_path / "gone" / "out.mcap")]) == 2
+        assert f"there is no folder {tmp_path / 'gone'}" in capsys.readouterr().err
 
     def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
         out = tmp_path / "out.mcap"

@@ -225,6 +225,16 @@ class TestForeignBags:
         assert "`ros2-memory adopt session` first" in output
         assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in output
 
+    def test_one_that_reaches_beyond_the_window_is_not_sent_to_be_adopted(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        assert forget(39, 65, "--dry-run") == 1
+        output = capsys.readouterr().out
+        assert "stays: session/rec_2.mcap: this recorder did not make it" in output
+        assert "stays: session/rec_3.mcap: it reaches beyond the window" in output
+        assert "each bag with messages in the window stays, for the reason above" in output
+
     def test_one_that_was_adopted_goes(self, bag_dir: Path) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
         assert cli.main(["adopt", "session"]) == 0

@@ -61,6 +61,18 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, capsys: Capture) -> None:
+    assert cli.main(["cat", "/od*", str(folder)]) == 2
+    assert "/od* is a pattern; matching: /odom" in capsys.readouterr().err
+
+
+def test_where_another_program_made_all_recordings_it_is_said_once(
+    folder: Path, capsys: Capture
+) -> None:
+    _, shown = run(capsys, "recordings", folder)
+    assert shown.count("another program") == 1
+
+
 class TestPaths:
     @pytest.mark.parametrize("path", [".", "a", "a/a_0.mcap", "loose/red.mcap"])
     def test_info_and_topics_take_a_folder_or_a_bag(

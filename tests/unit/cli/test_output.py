@@ -79,6 +79,27 @@ def test_the_rows_of_a_table_have_the_names_of_its_columns() -> None:
     assert lines[-1][0] == format_time(T0 + 1.0)
 
 
+def test_a_time_of_a_clock_that_was_never_set_has_its_unit() -> None:
+    assert shown({"earliest": 0.0}).split() == ["earliest", "0", "s", "after", "1970"]
+    assert "2e-09 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
+
+
+def test_counts_by_day_are_a_table_whose_last_row_is_of_all() -> None:
+    reply: JsonValue = {
+        "topic": "/bumper",
+        "columns": ["day", "count", "first", "first_unix"],
+        "rows": [["2026-11-16", 2, "09:00:00", T0], ["2026-11-17", 0, None, None]],
+        "all": [2, "09:00:00", T0],
+    }
+    lines = [line.split() for line in shown(reply).splitlines() if line]
+    assert lines[:3] == [["topic", "/bumper"], ["rows"], ["day", "count", "first"]]
+    assert lines[-3:] == [
+        ["2026-11-16", "2", "09:00:00"],
+        ["2026-11-17", "0", "-"],
+        ["all", "2", "09:00:00"],
+    ]
+
+
 def test_what_there_is_not_is_reported_in_words() -> None:
     assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
     assert shown([]) == "none"

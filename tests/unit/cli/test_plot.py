@@ -180,6 +180,20 @@ def test_the_path_is_that_of_the_poses(bags: Path) -> None:
     assert line.startswith("19.8 m in 69.8 s")
 
 
+def test_a_short_curve_is_drawn_through_each_pose(tmp_path: Path) -> None:
+    turns = [n * math.tau / 100 for n in range(101)]
+    circle = [
+        odom(T0 + n * S // 10, 2 * math.sin(turn), 2 - 2 * math.cos(turn))
+        for n, turn in enumerate(turns)
+    ]
+    write_mcap(tmp_path / "bag.mcap", circle)
+    path, _, _ = scene.path_in(scene_of(tmp_path), None, None)
+    assert len(path.xs) == 101
+    assert all(
+        math.hypot(x, y - 2) == pytest.approx(2) for x, y in zip(path.xs, path.ys, strict=True)
+    )
+
+
 def test_standstills_are_on_the_path(bags: Path) -> None:
     asked = scene_of(bags)
     path, _, _ = scene.path_in(asked, None, None)

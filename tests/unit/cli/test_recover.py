@@ -16,7 +16,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
 from tests.support.fakes import files_limited_to
-from tests.support.housekeepers import copied, files_in, later, recording_now
+from tests.support.housekeepers import copied, files_in, later, own_all, recording_now
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
     assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
     assert printed[1] == "b/b_0.mcap: empty, removed"
-    assert printed[2] == f"{tmp_path / 'a/metadata.yaml'}: rewritten to match the files"
+    assert printed[2] == f"{tmp_path / 'a/metadata.yaml'}: written to match the files"
     assert printed[-1] == str(outcome)
 
 
@@ -260,12 +260,45 @@ def test_nothing_but_a_terminal_sees_it(tmp_path: Path) -> None:
     assert stream.getvalue() == ""
 
 
+def test_a_dry_run_says_what_would_be_changed_and_changes_nothing(tmp_path: Path) -> None:
+    left_open(tmp_path / "rec/rec_0.mcap")
+    (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    printed: list[str] = []
+    outcome = recover_files(tmp_path, printed.append, dry_run=True, clock=later(60))
+    assert (outcome.repaired, outcome.removed) == (1, 1)
+    assert printed[0].startswith("rec/rec_0.mcap: would be repaired")
+    assert printed[1] == "rec/rec_1.mcap: empty, would be removed"
+    assert printed[2].endswith("metadata.yaml: would be written to match the files")
+    assert printed[-1].startswith("nothing was changed")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
+
+
 class TestTheProgram:
+    @pytest.mark.parametrize("answer", ["n\n", ""])
+    def test_asks_before_it_changes_what_another_program_made(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str
+    ) -> None:
+        empty = tmp_path / "rec" / "rec_0.mcap"
+        empty.parent.mkdir()
+        empty.write_bytes(b"")
+        monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+        assert cli.main(["recover", str(tmp_path), "--force"]) == 1
+        assert cli.main(["recover", str(tmp_path), "--force", "--json"]) == 2
+        assert empty.exists()
+        assert cli.main(["recover", str(tmp_path), "--force", "--yes"]) == 0
+        assert not empty.exists()
+
+    def test_does_not_ask_where_this_recorder_made_the_recording(self, tmp_path: Path) -> None:
+        left_open(tmp_path / "rec/rec_0.mcap")
+        own_all(tmp_path)
+        assert cli.main(["recover", str(tmp_path), "--force"]) == 0
+
     def test_exits_0_where_nothing_is_left_unfinished(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         left_open(tmp_path / "a_0.mcap")
-        assert cli.main(["recover", str(tmp_path), "--force"]) == 0
+        assert cli.main(["recover", str(tmp_path), "--force", "--yes"]) == 0
         assert "1 repaired" in capsys.readouterr().out
 
     def test_exits_1_where_a_file_could_not_be_repaired(self, tmp_path: Path) -> None:

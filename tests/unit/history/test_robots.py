@@ -12,7 +12,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
-from tests.support.memories import memory_of
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,6 +51,28 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
     (note,) = warned(memory)
     assert "blue, red overlap in time" in note
     assert "/odom" in note
+
+
+@pytest.mark.parametrize(
+    ("name", "asks"),
+    [
+        ("visits", {"x": 0, "y": 0, "radius_m": 1}),
+        ("visits", {"x": 0, "y": 0, "radius_m": 1, "by": "day"}),
+        ("find_things", {}),
+        ("find_matches", {}),
+        ("find_matches", {"by": "hour"}),
+    ],
+)
+def test_answers_from_messages_of_both_robots_say_so(
+    tmp_path: Path, name: str, asks: dict[str, object]
+) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
+    if name == "find_matches":
+        condition = {"topic": "/odom", "condition_type": "above", "field": "position.x"}
+        asks = {**condition, "value": 5, **asks}
+    answer = asked(memory_of(tmp_path), tmp_path, name, **asks)
+    assert [each for each in answer["notes"] if "as from several robots" in each]
 
 
 def test_two_recorders_of_one_robot_are_not(tmp_path: Path) -> None:

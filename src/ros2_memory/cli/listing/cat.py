@@ -28,7 +28,7 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import format_time, format_value, with_local_times
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
@@ -92,7 +92,7 @@ def cat(
     require_topic(topic, words, "cat")
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     view = View(memory, Call())
-    name = resolve_topic(view, topic)
+    name = _one_topic(view, topic)
     window = parse_window(memory, start, end, last)
     messages = view.stream.messages([name], window, newest_first=tail is not None)
     chosen = islice(messages, limit if tail is None else tail)
@@ -114,6 +114,21 @@ def cat(
         )
     if not count or not view.notes.complete:
         raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _one_topic(view: View, name: str) -> str:
+    """Returns the recorded topic of a name.
+
+    Raises:
+        InvalidArgumentsError: it is a glob.
+        NoDataError: there is none.
+    """
+    timeline = view.snapshot.timeline
+    if any(mark in name for mark in "*?[") and name not in timeline.types:
+        matched = match_topics(timeline.topics(), name)
+        some = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
+        raise InvalidArgumentsError(f"cat prints one topic, and {name} is a pattern; {some}")
+    return resolve_topic(view, name)
 
 
 def _described(window: TimeWindow) -> str:

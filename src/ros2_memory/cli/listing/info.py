@@ -321,7 +321,7 @@ def _for_people(reply: JsonValue) -> dict[str, JsonValue]:
     return {
         key: _without_itself(value)
         for key, value in row.items()
-        if key not in left_out and value not in ([], 0)
+        if key not in left_out and (value not in ([], 0) or key == "earliest")
     }
 
 

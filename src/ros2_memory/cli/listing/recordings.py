@@ -30,8 +30,6 @@ from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
 
-_NOT_SHOWN = frozenset({"end"})
-"""Keys of a row that people have no column for: there is the length."""
 _OWN = "this recorder"
 _OTHERS = "another program"
 _MOMENT = "saved moment"
@@ -59,8 +57,16 @@ def recordings(
         print_line(json.dumps([*rows, *empty]))
     elif rows:
         console = stdout_console()
-        shown = [{key: row[key] for key in row if key not in _NOT_SHOWN} for row in rows]
-        print_reply(console, [row for row in shown if "start" in row])
+        with_messages = [row for row in rows if "start" in row]
+        left_out = {"end"}  # there is the length
+        if all(row["whose"] == _OTHERS for row in with_messages):
+            left_out.add("whose")
+        print_reply(
+            console,
+            [{key: row[key] for key in row if key not in left_out} for row in with_messages],
+        )
+        if with_messages and "whose" in left_out:
+            print_line(f"whose: {_OTHERS} made all of them")
         others: list[JsonValue] = [row for row in rows if "start" not in row]
         if others:
             print_reply(console, {"not_read": others})

@@ -142,7 +142,11 @@ def forget(
     kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
     _print_kept(kept)
     if not plan.to_delete:
-        print_line("no closed bag lies wholly inside the window")
+        print_line(
+            "nothing to delete: each bag with messages in the window stays, for the reason above"
+            if plan.kept
+            else "nothing to delete: no closed bag has messages in the window"
+        )
     elif dry_run:
         print_line(f"would be deleted: {_describe(plan)}")
         for bag in plan.to_delete:
@@ -343,6 +347,8 @@ def _reason_to_keep(
 ) -> str | None:
     if bag.state is BagState.ACTIVE:
         return "it is being written"
+    if not window.covers(bag.start, bag.end):
+        return "it reaches beyond the window"
     if not _may_delete(bag, own):
         folder = own.name_of(bag.path.parent) if own is not None else ""
         if folder:
@@ -358,7 +364,7 @@ def _reason_to_keep(
         return f"a crash left it open{closes}"
     if bag.path.is_relative_to(bag_dir / MOMENTS_FOLDER):
         return "it belongs to a saved moment; delete the moment's folder to forget it"
-    return None if window.covers(bag.start, bag.end) else "it reaches beyond the window"
+    return None
 
 
 def _may_delete(bag: BagFile, own: OwnRecordings | None) -> bool:

@@ -6,6 +6,7 @@ that another recorder wrote, copies on a laptop, files so large that a recorder 
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -17,13 +18,14 @@ from rich.progress import Progress, TaskID
 
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import METADATA_FILE
+from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE, is_kept_apart
+from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import EXIT_NEGATIVE, AsJson, print_line
 from ros2_memory.cli.output import progress_bar
 from ros2_memory.core import directories
-from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
-from ros2_memory.core.text import counted
+from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArgumentsError, RecorderError
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
 from ros2_memory.retention.delete import size_of
@@ -46,15 +48,32 @@ def recover(
             help="Also repair files that changed in the last 30 s. Make sure nothing writes them.",
         ),
     ] = False,
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="Do not ask where another program made the recording."),
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be changed, and change nothing.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Repair MCAP files that a crash, a full disk or a power cut left unfinished.
 
     Rewrites each file in place from everything that can be read of it, and keeps the original until
-    the new file has been read back and is on the disk. Removes files of 0 bytes.
+    the new file has been read back and is on the disk. Removes MCAP files of 0 bytes. Then writes
+    or corrects the metadata.yaml of the recordings that it changed.
+
+    Shows what it would change and asks first, where another program made the recording.
     """
+    if not (yes or dry_run) and (others := foreign_unfinished(path)):
+        if as_json:
+            raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
+        recover_files(path, print_line, force=force, dry_run=True)
+        made = "was not made by this recorder" if len(others) == 1 else "were not made by it"
+        typer.confirm(f"{listed([*map(str, others)])} {made}. Change this?", abort=True)
     lines: list[str] = []
-    outcome = recover_files(path, lines.append if as_json else print_line, force=force)
+    report = lines.append if as_json else print_line
+    outcome = recover_files(path, report, force=force, dry_run=dry_run)
     if as_json:
         print_line(json.dumps({**asdict(outcome), "lines": lines[:-1]}))
     if outcome.failed:
@@ -85,6 +104,7 @@ def recover_files(
     report: Callable[[str], None],
     *,
     force: bool = False,
+    dry_run: bool = False,
     console: Console | None = None,
     clock: Clock | None = None,
 ) -> RecoveryOutcome:
@@ -94,6 +114,7 @@ def recover_files(
         path: the file or directory.
         report: takes a line for each file that was not whole, and one at the end.
         force: also repairs what changed in the last half minute.
+        dry_run: changes nothing, and reports what would be changed.
         console: where a progress bar is shown, if it is a terminal; stderr unless given.
         clock: the wall clock.
 
@@ -103,7 +124,7 @@ def recover_files(
     clock = clock or WallClock()
     files, others = _files_below(path, clock)
     sizes = [size_of(file) for file in files]
-    recovery = _Recovery(clock, force, build_repairer())
+    recovery = _Recovery(clock, force, build_repairer(), dry_run=dry_run)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=max(sum(sizes), 1))
         done = 0
@@ -120,14 +141,34 @@ def recover_files(
             done += size
     for folder in sorted(recovery.changed):
         recovery.correct_metadata(folder, report)
-        # A recording whose metadata.yaml was never written: only its recorder knew all of it.
-        if any(folder.glob(f"*{_MCAP}")) and not size_of(folder / METADATA_FILE):
-            report(f"{folder} has no {METADATA_FILE}: `ros2 bag reindex {folder}` makes one")
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
         report(f"{left} left alone: only MCAP files are repaired")
-    report(str(recovery.outcome))
+    report(f"{'nothing was changed; ' if dry_run else ''}{recovery.outcome}")
     return recovery.outcome
+
+
+def foreign_unfinished(path: Path) -> tuple[Path, ...]:
+    """Returns the folders with files to repair that are in no recorder's list of its recordings.
+
+    Raises:
+        RecorderError: there is no such file or directory.
+    """
+    repairer, found = build_repairer(), set[Path]()
+    for file in _files_below(path, WallClock())[0]:
+        with suppress(BagError):
+            if file.parent not in found and not repairer.is_whole(file):
+                found.add(file.parent)
+    return tuple(sorted(each for each in found if not _is_own(each)))
+
+
+def _is_own(folder: Path) -> bool:
+    whole = folder.absolute()
+    for bag_dir in whole.parents:
+        if (bag_dir / LIST_FILE).exists():
+            own = OwnRecordings(bag_dir)
+            return is_kept_apart(own.name_of(whole)) or own.owns(whole)
+    return False
 
 
 def _advance(bar: Progress, task: TaskID, done: int, read: int) -> None:
@@ -140,8 +181,9 @@ class _Recovery:
     `changed` holds the folders in which a file was repaired or removed.
     """
 
-    def __init__(self, clock: Clock, force: bool, repairer: Repairer) -> None:
+    def __init__(self, clock: Clock, force: bool, repairer: Repairer, *, dry_run: bool) -> None:
         self._clock = clock
+        self._dry_run = dry_run
         self._force = force
         self._repairer = repairer
         self._open_files = open_files()
@@ -156,6 +198,8 @@ class _Recovery:
                 outcome.whole += 1
                 return None
             self._require_unused(file)
+            if self._dry_run:
+                return self._plan(file)
             repaired = self._repairer.repair(file, on_read)
         except BagVanishedError:
             outcome.failed += 1
@@ -178,15 +222,35 @@ class _Recovery:
         )
 
     def correct_metadata(self, folder: Path, report: Callable[[str], None]) -> None:
-        """Rewrites metadata.yaml where it does not describe the files of the recording."""
+        """Makes metadata.yaml describe the files of the recording, where it does not."""
         path = folder / METADATA_FILE
+        existed = size_of(path) > 0
+        if self._dry_run:
+            report(f"{path}: would be {'corrected' if existed else 'written'} to match the files")
+            return
         try:
             if self._repairer.correct_metadata(folder):
-                report(f"{path}: rewritten to match the files")
+                report(f"{path}: {'rewritten' if existed else 'written'} to match the files")
+            elif not existed and any(folder.glob(f"*{_MCAP}")):
+                report(
+                    f"{folder} has no {METADATA_FILE}, and none is written, since its files are "
+                    f"not named after it as {folder.name}_0{_MCAP}: "
+                    f"`ros2 bag reindex {folder}` makes one"
+                )
         except BagError as error:
             report(f"{path} NOT CORRECTED: {error.path}: {error.reason}")
         except (OSError, ValueError) as error:
             report(f"{path} NOT CORRECTED: {error}")
+
+    def _plan(self, file: Path) -> str:
+        """Returns what would be done with an unfinished file."""
+        self.changed.add(file.parent)
+        size = size_of(file)
+        if not size:
+            self.outcome.removed += 1
+            return "empty, would be removed"
+        self.outcome.repaired += 1
+        return f"would be repaired ({counted(size, 'byte')})"
 
     def _require_unused(self, file: Path) -> None:
         """Checks that nothing writes a file, as far as that can be known.

@@ -148,6 +148,7 @@ def draw_plane(
         is_wide = np.ptp(axes.get_xlim()) > 1.4 * np.ptp(axes.get_ylim())
         side = "bottom" if is_wide else "right"
         bar = axes.figure.colorbar(lines, ax=axes, location=side, shrink=0.8, pad=0.02)
+        bar.set_label("time of day")
         _format_times(bar.ax, path.times[0], path.times[-1], of_colors=side)
 
 

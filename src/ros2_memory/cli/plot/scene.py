@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.motion.trajectory import Waypoint
 from ros2_memory.cli.output import format_duration
 from ros2_memory.cli.plot.without_poses import DrawnPath, path_without_poses
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
@@ -20,6 +21,7 @@ from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.no_data import GIVE_TOPIC, require_bags
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
+from ros2_memory.places.pose_frames import placed_waypoints
 from ros2_memory.queries import trajectory_summary
 
 if TYPE_CHECKING:
@@ -28,9 +30,10 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Memory
-    from ros2_memory.results import Event, Recap
+    from ros2_memory.results import Event, Recap, TrajectorySummary
 
 _MOST_WAYPOINTS: Final = 4000
+"""Of a path; one of no more poses is drawn through each of them."""
 _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
 _MOST_SIGNALS: Final = 6
@@ -181,7 +184,7 @@ def path_in(
         except InvalidArgumentsError:
             if each is None or each == frame:
                 raise
-    points = found.trajectory.waypoints
+    points = _every_pose(asked, found) or found.trajectory.waypoints
     if not points:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {found.topic} has a place")
     totals = found.trajectory.totals
@@ -197,6 +200,33 @@ def path_in(
         f"at most {found.trajectory.max_speed:.2f} m/s; by {found.topic}"
     )
     return path, line, found.notes
+
+
+def _every_pose(asked: Scene, found: TrajectorySummary) -> Sequence[Waypoint]:
+    """Returns a waypoint for each pose, where these are few; else none.
+
+    Waypoints of the trajectory leave out what is within some centimetres of a line, so that a curve
+    would be drawn with corners.
+    """
+    view, extractor = asked.view, asked.memory.extractor
+    stored = view.stream.messages([found.topic], asked.window)
+    messages = [*islice(stored, _MOST_WAYPOINTS + 1)]
+    if len(messages) > _MOST_WAYPOINTS or found.skipped:
+        return ()
+    jumps = {each.time for each in found.trajectory.waypoints if each.jump}
+    frames, waypoints = set[str](), list[Waypoint]()
+    for each in messages:
+        message = view.bags.decode(each)
+        pose = None if message is None else extractor.pose(message, each.record.channel.type)
+        if pose is not None and all(map(math.isfinite, pose.position)):
+            frames.add(pose.frame_id)
+            waypoints.append(Waypoint(each.time, pose.position, 0.0, jump=each.time in jumps))
+    if len(frames) != 1:
+        return ()
+    [own] = frames
+    if own == found.frame_id:
+        return waypoints
+    return placed_waypoints(view, found.topic, waypoints, own, found.frame_id)
 
 
 def places_in(memory: Memory, frame: str) -> list[Place]:
