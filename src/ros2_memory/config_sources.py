@@ -216,11 +216,11 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
     except HydraException as error:
         is_cut = text.count("[") != text.count("]") or text.count("{") != text.count("}")
         spaces = "; if it has a space, it needs quotes as a whole" if is_cut else ""
-        folder = f", and a folder of bags as recording.bag_dir={text}" if "/" in text else ""
+        is_path = "/" in text and "=" not in text
+        folder = f" (a folder of bags: recording.bag_dir={text})" if is_path else ""
         raise ConfigError(
             f"{text!r} is not a setting (given {source}); write key=value, such as "
-            f"server.port=9300{folder if '=' not in text else ''}, and key='value' where special "
-            f"characters are in it{spaces}"
+            f"server.port=9300{folder}, and key='value' where special characters are in it{spaces}"
         ) from error
     key = override.key_or_group
     is_group = key in options

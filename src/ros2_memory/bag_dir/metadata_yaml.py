@@ -131,8 +131,7 @@ def correct(recording: Path, reader: BagReader) -> bool:
     text = ""
     with suppress(FileNotFoundError):
         text = read_small_file(path)
-    is_made = all(_is_of_rosbag2(each) and each.suffix == ".mcap" for each in files)
-    if not files or not (text or is_made):
+    if not files or not (text or is_named_by_rosbag2(recording)):
         return False
     contents: dict[str, Contents] = {}
     for each in files:
@@ -143,6 +142,12 @@ def correct(recording: Path, reader: BagReader) -> bool:
     if written != text:
         write_durably(path, written)
     return written != text
+
+
+def is_named_by_rosbag2(recording: Path) -> bool:
+    """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
+    files = [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
+    return all(_is_of_rosbag2(each) and each.suffix == ".mcap" for each in files)
 
 
 def _names_of(files: Iterable[str]) -> set[str]:

@@ -10,8 +10,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps, unix_text
-from ros2_memory.history.no_data import no_data_between, resolve_pose_topic
-from ros2_memory.history.robots import note_robots_on
+from ros2_memory.history.no_data import no_data_between
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.results import Bins, Usual
 
@@ -189,8 +188,6 @@ class BinnedWindow:
 
     def answer(self) -> Bins:
         """Returns the answer, with notes on what could not be read."""
-        by_pose = (resolve_pose_topic(self.view),) if self._by == "place" else ()
-        note_robots_on(self.view, (*by_pose, *self._topics), self.asked)
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
         rows = zip(*self._values, strict=True)

@@ -25,6 +25,7 @@ from ros2_memory.counts.segment_fold import Digested, SegmentFold
 from ros2_memory.counts.time_bins import TrueIntervals
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import condition_of
+from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import TOPIC_EVENTS, collect_events
@@ -83,6 +84,7 @@ def count_matches(
     topics = matching_topics(view, topic)
     binned = BinnedWindow(view, asked, by, topics)
     binned.add_heard("topic_s", topics)
+    note_robots_on(view, topics, asked)
     held = None
     # Events have labels without scores.
     by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score

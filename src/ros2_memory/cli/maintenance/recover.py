@@ -19,6 +19,7 @@ from rich.progress import Progress, TaskID
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE, is_kept_apart
+from ros2_memory.bag_dir.metadata_yaml import is_named_by_rosbag2
 from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import EXIT_NEGATIVE, AsJson, print_line
@@ -144,7 +145,14 @@ def recover_files(
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
         report(f"{left} left alone: only MCAP files are repaired")
-    report(f"{'nothing was changed; ' if dry_run else ''}{recovery.outcome}")
+    if dry_run:
+        done = recovery.outcome
+        report(
+            f"nothing was changed: of the MCAP files {done.whole} are whole, {done.repaired} would "
+            f"be repaired, {done.removed} removed, and {done.failed} not repaired"
+        )
+    else:
+        report(str(recovery.outcome))
     return recovery.outcome
 
 
@@ -226,7 +234,9 @@ class _Recovery:
         path = folder / METADATA_FILE
         existed = size_of(path) > 0
         if self._dry_run:
-            report(f"{path}: would be {'corrected' if existed else 'written'} to match the files")
+            if existed or is_named_by_rosbag2(folder):
+                verb = "corrected" if existed else "written"
+                report(f"{path}: would be {verb} to match the files")
             return
         try:
             if self._repairer.correct_metadata(folder):

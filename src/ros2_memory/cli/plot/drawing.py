@@ -38,7 +38,7 @@ logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it warns of fonts, an
 
 from matplotlib import rc_context  # noqa: E402 - it makes its folder when it is imported
 from matplotlib.collections import LineCollection  # noqa: E402
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter  # noqa: E402
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, DateFormatter  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.patches import Circle as RoundPatch  # noqa: E402
 from matplotlib.patches import Polygon as PolygonPatch  # noqa: E402
@@ -74,6 +74,8 @@ _LONGEST_NAME: Final = 34
 _LEAST_SIDE: Final = 0.4
 """Of the longer side of a plane: the shorter one is no less."""
 _DPI: Final = 130
+_SECONDS_BELOW_S: Final = 600
+"""Beside the colours of a shorter path seconds alone would not be read as such."""
 
 
 class Picture:
@@ -256,7 +258,10 @@ def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") 
     axis = axes.yaxis if of_colors == "right" else axes.xaxis
     locator = AutoDateLocator(tz=zone, maxticks=8)
     axis.set_major_locator(locator)
-    # The title has the date; beside the colours there is no room for it.
-    axis.set_major_formatter(ConciseDateFormatter(locator, tz=zone, show_offset=not of_colors))
+    if of_colors and end - start < _SECONDS_BELOW_S:
+        axis.set_major_formatter(DateFormatter("%H:%M:%S", tz=zone))
+    else:
+        # The title has the date; beside the colours there is no room for it.
+        axis.set_major_formatter(ConciseDateFormatter(locator, tz=zone, show_offset=not of_colors))
     if not of_colors and end > start:
         axes.set_xlim(start / _DAY_S, end / _DAY_S)
