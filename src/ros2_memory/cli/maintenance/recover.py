@@ -146,10 +146,10 @@ def recover_files(
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
         report(f"{left} left alone: only MCAP files are repaired")
     if dry_run:
-        done = recovery.outcome
+        seen = recovery.outcome
         report(
-            f"nothing was changed: of the MCAP files {done.whole} are whole, {done.repaired} would "
-            f"be repaired, {done.removed} removed, and {done.failed} not repaired"
+            f"nothing was changed: of the MCAP files {seen.whole} are whole, {seen.repaired} would "
+            f"be repaired, {seen.removed} removed, and {seen.failed} not repaired"
         )
     else:
         report(str(recovery.outcome))
