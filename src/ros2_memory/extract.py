@@ -29,6 +29,7 @@ from ros2_memory.core.model import (
 )
 from ros2_memory.core.text import listed
 from ros2_memory.messages.conversions import (
+    ANGLES,
     Metric,
     ValueKind,
     euler,
@@ -67,6 +68,8 @@ MAX_SHOWN_CHARS: Final = 20_000
 """A longer value would fill a reply alone, and is thinned harder."""
 
 _LISTED_NAMES: Final = 40
+_TURNS: Final = ("orientation", "rotation")
+"""Fields in which a quaternion is shown as angles."""
 _AS_JSON: Final = json.JSONEncoder(separators=(",", ":")).encode
 
 
@@ -501,8 +504,10 @@ def _no_such_field(type_name: str, path: str, plan: _Plan, message: object) -> s
     if not plan.fields:
         there = f"its fields are: {known}" if names else "it has no fields"
         return f"{type_name} has no field {path!r}; {there}"
+    turned = [f"{name}.{path}" for name in plan.fields if path in ANGLES and name in _TURNS]
+    meant = f" (did you mean {turned[0]}?)" if turned else ""
     return (
-        f"{type_name} has no field {path!r}; its fields are: {', '.join(plan.fields)}; "
+        f"{type_name} has no field {path!r}{meant}; its fields are: {', '.join(plan.fields)}; "
         f"or give a full path in the message, which begins with one of: {known}"
     )
 

@@ -242,6 +242,12 @@ def test_an_unknown_field_is_refused_with_the_path_the_type_and_what_there_is() 
     )
 
 
+def test_an_angle_that_other_tools_return_is_named_where_it_is() -> None:
+    with pytest.raises(InvalidArgumentsError, match=r"did you mean orientation\.yaw_deg\?"):
+        EXTRACTOR.shown(odometry(), ODOMETRY, ["yaw_deg"])
+    assert shown(odometry(), ODOMETRY, "orientation.yaw_deg")
+
+
 def test_an_unknown_field_of_an_unmapped_type_is_refused_with_what_the_message_has() -> None:
     with pytest.raises(InvalidArgumentsError, match="json has no field 'c'; its fields are: a, b"):
         EXTRACTOR.shown({"a": 1, "b": 2}, "json", ["c"])
