@@ -9,7 +9,7 @@ Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores
 integers, so that sums do not depend on their order. Tables of several bags are joined by
 `joined`, which is associative.
 
-A bag of more than some seconds is several *slices*, each with tables as a short bag has them: in a
+A bag of more than a minute is several *slices*, each with tables as a short bag has them: in a
 look of an hour, what was seen before could not be told from what was missed after. So things are
 the same, whether a history is one file or many.
 """
@@ -57,7 +57,9 @@ _MAX_SCORE: Final = 1e6
 _NS_PER_US: Final = 1_000
 _TOGETHER_MESSAGES: Final = 3
 _SLICE_NS: Final = 10_000_000_000
-"""A slice is about this long: `recording.split_duration_s` as shipped, so that its bags are one."""
+"""A slice is about this long: `recording.split_duration_s` as shipped."""
+_UNDIVIDED_NS: Final = 64_000_000_000
+"""A bag of at most this length is one slice: for a split of a minute six take thrice the bytes."""
 
 
 class Spot(IntEnum):
@@ -257,8 +259,9 @@ class _Cluster:
         score = seen.score
         if score is not None:
             score = min(max(score, 0.0), _MAX_SCORE)
-            self.best = max(self.best, round(score * 1000))
-            nth = min(int(score * SCORE_BINS), SCORE_BINS - 1)
+            thousandths = round(score * 1000)  # float32 has 0.7 as 0.69999999
+            self.best = max(self.best, thousandths)
+            nth = min(thousandths * SCORE_BINS // 1000, SCORE_BINS - 1)
             self.scores[nth] = self.scores.get(nth, 0) + 1
 
     def squared_to(self, x: float, y: float) -> float:
@@ -495,8 +498,8 @@ class SlicedSights:
     def __init__(self, span: tuple[Ns, Ns]) -> None:
         self._first, last = span
         length = last - self._first
-        # Rounded: a bag of 10 s that ends with the first message after them is one slice.
-        self._width = length // max(1, (2 * length + _SLICE_NS) // (2 * _SLICE_NS)) + 1
+        slices = 1 if length <= _UNDIVIDED_NS else length // _SLICE_NS
+        self._width = length // slices + 1
         self._slices: dict[int, SightsBuilder] = {}
 
     def at(self, time: Ns) -> SightsBuilder:

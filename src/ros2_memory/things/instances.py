@@ -270,7 +270,7 @@ class _Seen:
 def _counts(sights: Sights, min_score: float) -> Ints:
     """Returns how many detections of each spot have a score that counts."""
     counts = sights.spots[:, Spot.N].copy()
-    lowest = min(int(min_score * SCORE_BINS), SCORE_BINS - 1)
+    lowest = min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
     if lowest > 0:
         low = sights.scores[sights.scores[:, Score.BIN] < lowest]
         np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])

@@ -408,12 +408,12 @@ def answer(memory: Memory, bag_dir: Path, question: dict[str, object]) -> Any:
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(
-    moved=st.integers(30, 60),
+    moved=st.integers(45, 60),
     split_s=st.sampled_from([4.0, 10.0, 17.0]),
     back=st.booleans(),
 )
-@example(moved=30, split_s=10.0, back=True)
-@example(moved=44, split_s=10.0, back=False)
+@example(moved=45, split_s=10.0, back=True)
+@example(moved=54, split_s=10.0, back=False)
 def test_things_are_the_same_in_one_file_and_in_many(
     tmp_path_factory: pytest.TempPathFactory, moved: int, split_s: float, back: bool
 ) -> None:
