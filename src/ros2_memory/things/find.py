@@ -14,7 +14,7 @@ from ros2_memory.analysis.conditions import plain_text
 from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.regions import place_at
-from ros2_memory.core.text import abbreviate, counted, listed
+from ros2_memory.core.text import UNREPORTED, abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
@@ -398,7 +398,7 @@ def _unknown(label: str, key: str, names: Sequence[str]) -> str:
     close = _like(key, names)
     shown = [*dict.fromkeys(close)] or names
     meant = f"; did you mean {close[0]}?" if close else ""
-    return f"no detector reported {abbreviate(label)}; there are: {listed(shown)}{meant}"
+    return f"{UNREPORTED} {abbreviate(label)}; there are: {listed(shown)}{meant}"
 
 
 def _like(key: str, names: Sequence[str]) -> list[str]:
