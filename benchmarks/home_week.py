@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import importlib
 import json
 import multiprocessing
 import os
-import pkgutil
 import shutil
 import sqlite3
 import statistics
@@ -32,8 +30,8 @@ from benchmarks.home.__main__ import made, write
 from benchmarks.home.days import Scale
 from benchmarks.home.things import DAY
 from benchmarks.home.world import START_S, VISION
+from benchmarks.ours import import_queries
 from benchmarks.report import machine
-from ros2_memory import counts, insights, places, things
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.serving.mcp_server import EpisodicServer  # noqa: TC001 - so that forks have it
 
@@ -202,9 +200,7 @@ def speeds(settings: Settings, asked: Sequence[Asked]) -> Iterator[Speed]:
 
 def _import_all(settings: Settings, memory: Memory) -> None:
     """Imports what a server and its first call import, so that forks have it."""
-    for room in (counts, insights, places, things):
-        for each in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
-            importlib.import_module(each.name)
+    import_queries()
     server = build_server(settings, memory)
     asyncio.run(server.dispatcher.answer("get_position_at", {"timestamp": START_S}))
 
