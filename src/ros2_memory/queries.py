@@ -91,7 +91,6 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.pose_frames import placed, placed_waypoints, robot_body, with_place
-from ros2_memory.things.find import unknown_label
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -187,22 +186,16 @@ def position(
         if by_transforms is None:
             raise
         return by_transforms
-    return _position_by(view, name, at, now, tolerance_s=tolerance_s, frame_id=frame_id)
-
-
-def _position_by(
-    view: View,
-    name: str,
-    at: Ns,
-    now: Ns | None,
-    *,
-    tolerance_s: float | None,
-    frame_id: str | None,
-) -> results.Position:
-    """Returns the newest pose of a topic at or before a moment; see `position`."""
-    memory = view.memory
     _require_kind(view, name, "position", "geodetic")
     found = _found_at(view, name, at, tolerance_s)
+    return _position_in(view, found, at, now, frame_id)
+
+
+def _position_in(
+    view: View, found: StoredMessage, at: Ns, now: Ns | None, frame_id: str | None
+) -> results.Position:
+    """Returns the pose in a message, as that of a moment; see `position`."""
+    memory, name = view.memory, found.record.channel.topic
     _note_held(view, found, at)
     message, type_name = decode(view, found), found.record.channel.type
     pose, geodetic = memory.extractor.pose(message, type_name), None
@@ -539,11 +532,7 @@ def _notes_on_never(
     view: View, search: ReverseSearch, until: Ns, condition: Condition, min_score: float | None
 ) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null."""
-    notes = (
-        *_never(view, search, until),
-        *unasked_limit(condition, min_score),
-        *unknown_label(view, search.topics, condition),
-    )
+    notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 

@@ -131,7 +131,7 @@ async def test_no_server_with_the_shipped_defaults_writes_beside_strangers_bags(
     before = state(strangers)
     with serving(strangers, tmp_path / "log", f"storage={storage}", **env) as served:
         async with Client(served.url("/mcp")) as client:
-            await ask_everything(client)
+            await ask_everything(client, of_several_robots=True)
         until(lambda: catalogue(served.get("/health")[1])["state"] == "ready")
         assert state(strangers) == before
     assert state(strangers) == before
@@ -162,7 +162,7 @@ async def test_when_a_recorder_comes_the_catalogue_goes_beside_the_bags_with_all
         digested = [each for each in served.events() if each["event"] == "bag_digested"]
         assert entries(beside) == known == len(digested)
         async with Client(served.url("/mcp")) as client:
-            await ask_everything(client)
+            await ask_everything(client, of_several_robots=True)
         assert len(digested) == len(
             [each for each in served.events() if each["event"] == "bag_digested"]
         )

@@ -550,10 +550,9 @@ def _last(
         found.add(next((row.log_ns for row in reversed(upto) if holds(row)), None))
     if answer is None or answer.get("timestamp") is None:
         early = answer is not None and answer.get("error") == "no_data"
-        # Coordinates may be those of another frame: the note says which one was compared. Of a text
-        # that no label has, those that are like it are named.
+        # Coordinates may be those of another frame: the note says which one was compared.
         notes = [] if answer is None else answer.get("notes", [])
-        noted = all(each.startswith(("near_position compared", "no detector")) for each in notes)
+        noted = all(each.startswith("near_position compared") for each in notes)
         told = answer is None or early or (notes and noted)
         return None if None in found and told else f"it held at {found}"
     right = any(each is not None and _same_time(answer["timestamp"], each) for each in found)

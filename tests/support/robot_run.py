@@ -122,12 +122,18 @@ async def ask(client: Client, name: str, given: dict[str, Any]) -> tuple[Any, bo
     return json.loads(block.text), bool(result.is_error)
 
 
-async def ask_everything(client: Client) -> None:
-    """Every tool and every kind of error that a sound server has."""
+async def ask_everything(client: Client, *, of_several_robots: bool = False) -> None:
+    """Every tool and every kind of error that a sound server has.
+
+    Over the recordings `of_several_robots` at one time there is no path.
+    """
     tools = (await client.list_tools()).tools
     assert {tool.name for tool in tools} == {name for name, _, _ in ANSWERED}
     for name, given, key in ANSWERED:
         reply, is_error = await ask(client, name, given)
+        if of_several_robots and name == "trajectory_summary":
+            assert reply["reason"] == "mixed", reply
+            continue
         assert key in (reply[0] if isinstance(reply, list) else reply), (name, reply)
         assert not is_error
     for name, given, code, expected in REFUSED:

@@ -279,7 +279,7 @@ class Condition:
             self.field is not None
             or isinstance(test, NearPosition)
             or (isinstance(test, Contains) and test.is_number)
-            or (isinstance(test, Equals) and plain_text(test) is not None)
+            or (isinstance(test, Equals) and _plain_text(test) is not None)
         )
 
     @property
@@ -606,7 +606,7 @@ def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> s
 
 def _refusal_for_text(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
     """Returns why a text that spells no number meets none of these; None where it may."""
-    text = plain_text(condition.test)
+    text = _plain_text(condition.test)
     is_narrow = condition.field is not None or isinstance(condition.test, Equals)
     if text is None or not is_narrow or any(map(_has_unknown_part, targets)):
         return None
@@ -620,7 +620,7 @@ def _refusal_for_text(condition: Condition, targets: Sequence[JsonValue]) -> str
     return f"{where} are numbers, {given}: the value must be a number"
 
 
-def plain_text(test: Test) -> str | None:
+def _plain_text(test: Test) -> str | None:
     """Returns the text that a test looks for, unless it spells a boolean or a number."""
     if isinstance(test, Contains):
         needle = test.needle

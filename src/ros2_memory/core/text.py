@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 MAX_NAMED: Final = 3
 """How many names a sentence lists before it counts the rest."""
-UNREPORTED: Final = "no detector reported"
-"""How the note begins that names labels like one which no bag has."""
 _MAX_NAME_CHARS: Final = 160
 _MAX_DEPTH: Final = 3
 _MAX_ITEMS: Final = 8

@@ -112,7 +112,7 @@ def tested(
             yield Tested(time, topic, bool(truth))
         return
     part = _Part(array("q"), bytearray())
-    before = view.notes.keys()
+    before = view.notes.added
     is_kept = len(topics) == 1
     for each in view.stream.messages(topics, window, newest_first=True):
         met = search.matches(each)
@@ -124,5 +124,5 @@ def tested(
         elif is_kept:
             part.times.append(each.time)
             part.met.append(met)
-    if is_kept and view.notes.keys() == before:
+    if is_kept and view.notes.added == before:
         question.keep(topic, window, part)

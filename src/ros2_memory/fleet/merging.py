@@ -15,7 +15,7 @@ from functools import partial
 from heapq import merge
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.text import UNREPORTED, listed
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.tools.reply_json import ROBOT_NAME
 from ros2_memory.tools.reply_size import to_json_text
@@ -173,7 +173,7 @@ def _rows(
         found += merge(*lists, key=order)
     reply: JsonObject = {key: [*found[:limit]]}
     if key == MATCHES:
-        if never := [each.name for each in replies if _is_never(each.value)]:
+        if never := [each.name for each in replies if each.value is None]:
             reply["never"] = [*never]
         return reply
     reply |= _rest(rule, replies, [_without(value, {key, *rule.inherited}) for value in values])
@@ -181,18 +181,6 @@ def _rows(
     if rule.marks_more and (is_cut or any(value.get("more") for value in values)):
         reply["more"] = True
     return reply
-
-
-def _is_never(value: JsonValue) -> bool:
-    """Whether nothing was found, and all was searched; labels like the one sought may be named."""
-    if not isinstance(value, dict):
-        return value is None
-    notes = value.get("notes")
-    return (
-        value.get("timestamp", 0) is None
-        and isinstance(notes, list)
-        and all(str(note).startswith(UNREPORTED) for note in notes)
-    )
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:

@@ -195,12 +195,12 @@ def _searched(view: View, share: Share, count: _Count) -> _Searched:
 
 def _read_count(view: View, topic: str, share: Share) -> tuple[bool, _Count]:
     """Counts the messages of a share; returns also whether all of it could be read."""
-    before = view.notes.keys()
+    before = view.notes.added
     view.stream.originals_since = MAX_NS
     with view.notes.isolated():
         groups = share.groups(view, topic, TimeWindow.everything())
         messages = sum(group.count() for group in groups)
-        is_whole = view.notes.complete and view.notes.keys() == before
+        is_whole = view.notes.complete and view.notes.added == before
     count = _Count(messages, view.stream.originals_since)
     is_sure = is_whole and not view.call.used_active
     asked = _count_asked(view, topic, share)

@@ -295,10 +295,13 @@ class Notes:
 
     Attributes:
         complete: False once something that bears on the answer could not be read.
+        added: how many notes on files were added, again or not. What was computed while it stays
+            the same was read whole; `keys` would not show that a file failed twice.
     """
 
     def __init__(self) -> None:
         self.complete = True
+        self.added = 0
         self._order: dict[str | Reason, None] = {}
         self._notes: dict[NoteKey, Note] = {}
         self._remarks: dict[str, tuple[str, ...]] = {}
@@ -308,6 +311,7 @@ class Notes:
         if isinstance(note, str):
             self._order.setdefault(note)
             return
+        self.added += 1
         self._order.setdefault(note.kind)
         known = self._notes.get((note.kind, note.file))
         if known is None or known.until < note.until:

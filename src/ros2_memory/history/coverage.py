@@ -298,7 +298,7 @@ def _describe_active(snapshot: Snapshot, active: Sequence[SetAside], window: Tim
 def _nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
     if all(aside.answers for aside in active):
         return f"nothing after {unix_text(latest)} is on disk yet"
-    return f"the split being written is not included: nothing after {unix_text(latest)}"
+    return f"the split being written is left out: nothing after {unix_text(latest)}"
 
 
 def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:

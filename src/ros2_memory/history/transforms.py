@@ -245,14 +245,14 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     known = _STATIC.setdefault(view.snapshot.timeline, {})
     if (among, topics) in known:
         return known[among, topics]
-    before = view.notes.keys()
+    before = view.notes.added
     chosen = {str(path): path for path in sessions_of(view).recordings_of(among, topics)}
     found: list[StampedTransform] = []
     for run in _runs_with(view, topics):
         found += _static_in(view, topics, among, chosen, run)
     found = _changes(found)
     # What was noted must be noted in each answer.
-    if view.notes.keys() == before and not view.call.used_active:
+    if view.notes.added == before and not view.call.used_active:
         known[among, topics] = found
     return found
 
@@ -320,7 +320,7 @@ def _static_in(
     is_sure = True
     for stop in _cuts(bags, read.bags):
         part = bags[read.bags : stop]
-        before = view.notes.keys()
+        before = view.notes.added
         with view.notes.isolated():
             try:
                 found = _once_decoded(view, _merged(view, topics, part, window, among))
@@ -329,7 +329,7 @@ def _static_in(
                 raise QueryTimeoutError(
                     f"{error}; {how_far}, and kept: ask again to go on from there"
                 ) from error
-            is_sure &= view.notes.complete and view.notes.keys() == before
+            is_sure &= view.notes.complete and view.notes.added == before
         read = _StaticRead((*read.found, *_changes(found)), stop, is_whole=stop == len(bags))
         if is_sure and not view.call.used_active:
             if key not in kept and len(kept) >= _MOST_KEPT:

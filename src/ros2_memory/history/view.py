@@ -151,9 +151,9 @@ class View:
         counted = _CENSUSES.setdefault(self.snapshot.timeline, {})
         if topic in counted:
             return counted[topic]
-        before = self.notes.keys()
+        before = self.notes.added
         found = self._census(topic)
-        if self.notes.complete and self.notes.keys() == before and not self.call.used_active:
+        if self.notes.complete and self.notes.added == before and not self.call.used_active:
             counted[topic] = found
         return found
 

@@ -231,6 +231,12 @@ class Segment:
         for row, first, last in zip(*(each.tolist() for each in column), strict=True):
             yield TopicExtent(self.bags[row], first, last)
 
+    def bounds(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Returns the log times of the first and the last message of the topic in each bag."""
+        column = _columns(self).of(topic)
+        none = np.empty(0, np.int64)
+        return (none, none) if column is None else (column.firsts, column.lasts)
+
     def bags_with(self, topic: str) -> tuple[BagFile, ...]:
         """Returns the bags that hold the topic, in order; `bags` itself where all do."""
         if all(topic in schema.positions for schema in self._schemas):

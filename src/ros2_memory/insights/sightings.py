@@ -48,7 +48,6 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.pose_frames import placed, with_place
 from ros2_memory.places.scope import Scope
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
-from ros2_memory.things.find import unknown_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -190,8 +189,7 @@ def find_matches(
     if is_nothing:
         topics = matching_topics(view, topic)
         silences = describe_silences(view, topics, searched)
-        unknown = unknown_label(view, topics, condition)
-        for sentence in (*silences, *unasked_limit(condition, min_score), *unknown):
+        for sentence in (*silences, *unasked_limit(condition, min_score)):
             view.notes.add(sentence)
     for sentence in (
         *compared_frames(view, matching_topics(view, topic), condition),

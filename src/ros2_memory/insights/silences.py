@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.analysis.silences import Silence
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
 from ros2_memory.history.coverage import forgotten_spans, recording_gaps, unix_text
+from ros2_memory.index.holes import SHORTEST_GAP_NS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -71,23 +75,31 @@ def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[N
 
     Nothing was recorded, or the topic has a usual rate and was silent.
     """
-    silent = [(each.start, each.end) for each in silences_in(view, window) if each.topic == topic]
-    found: list[tuple[Ns, Ns]] = []
-    for start, end in sorted([*recording_gaps(view, window), *silent]):
-        if found and start <= found[-1][1]:
-            found[-1] = (found[-1][0], max(found[-1][1], end))
-        else:
-            found.append((start, end))
-    return found
+    return united([*recording_gaps(view, window), *_silent(view, topic, window)])
 
 
 def unrecorded_length(view: View, topic: str, path: DrivenPath, elapsed: Elapsed) -> Ns:
-    """Returns for how long no poses were recorded between the first and the last of a path."""
+    """Returns for how long no poses were recorded between the first and the last of a path.
+
+    That is between two bags with poses, whatever others hold, and while the topic was silent.
+    """
+    window = TimeWindow(path.first, path.last + 1)
+    every = [each.bounds(topic) for each in view.snapshot.timeline.segments_in(window)]
+    firsts = np.concatenate([np.empty(0, np.int64), *(first for first, _ in every)])
+    lasts = np.concatenate([np.empty(0, np.int64), *(last for _, last in every)])
+    order = np.argsort(firsts, kind="stable")
+    begins, ends = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
+    apart = begins - ends > SHORTEST_GAP_NS
+    between = zip(ends[apart].tolist(), begins[apart].tolist(), strict=True)
     return sum(
         elapsed.between(max(start, path.first), min(end, path.last))
-        for start, end in unrecorded_times(view, topic, TimeWindow(path.first, path.last + 1))
+        for start, end in united([*between, *_silent(view, topic, window)])
         if start < path.last and path.first < end
     )
+
+
+def _silent(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
+    return [(each.start, each.end) for each in silences_in(view, window) if each.topic == topic]
 
 
 def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:

@@ -163,10 +163,10 @@ class BagStatics:
         cache = _OF_SEGMENTS.setdefault(segment, {}).setdefault(self._topics, {})
         known = cache.get(folder)
         if known is None:
-            before = self._view.notes.keys()
+            before = self._view.notes.added
             found = _gather(self._view, segment, self._topics, folder, cache.keys())
             known = found.get(folder, _Gathered())
-            if self._view.notes.keys() == before:
+            if self._view.notes.added == before:
                 cache.update(found)
         return known
 

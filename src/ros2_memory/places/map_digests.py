@@ -136,7 +136,7 @@ class _MapReader:
             or (sights is not None and sights.wants(each.topic, each.type))
         }
         waiting: dict[str, list[Record]] = {topic: [] for topic in topics}
-        before = self._view.notes.keys()
+        before = self._view.notes.added
         if topics:
             read = self._view.bags.read(bag, sorted(topics), TimeWindow.everything())
             for found in self._view.bags.track_sources(read):
@@ -147,7 +147,7 @@ class _MapReader:
                     batch.clear()
         for batch in waiting.values():
             self._add(batch)
-        self.is_complete = self._view.notes.keys() == before
+        self.is_complete = self._view.notes.added == before
         return self._collector.digest(statics)
 
     def _add(self, batch: Sequence[Record]) -> None:

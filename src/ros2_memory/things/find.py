@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import plain_text
 from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import place_at
-from ros2_memory.core.text import UNREPORTED, abbreviate, counted, listed
+from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
@@ -25,12 +24,10 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
-from ros2_memory.things.labels import plain
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place
@@ -390,42 +387,8 @@ def _notes(
     elif every:
         yield f"it was detected {counted(every, 'time')} in all, and not once in this window"
     elif names:
-        yield _unknown(label, asked, names)
-
-
-def _unknown(label: str, key: str, names: Sequence[str]) -> str:
-    """Returns the sentence on a label that is none of these names, with the nearest ones."""
-    close = _like(key, names)
-    shown = [*dict.fromkeys(close)] or names
-    meant = f"; did you mean {close[0]}?" if close else ""
-    return f"{UNREPORTED} {abbreviate(label)}; there are: {listed(shown)}{meant}"
-
-
-def _like(key: str, names: Sequence[str]) -> list[str]:
-    close = [each for each in names if key in each or each in key]
-    return close + difflib.get_close_matches(key, names, 3)
-
-
-def unknown_label(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
-    """Returns the sentence on labels like a text that no detector has reported, for a "never".
-
-    Nothing where no label is like it, where none of the topics is a detector's, where some label
-    has the text, and while not all bags are known.
-    """
-    text = plain_text(condition.test)
-    if text is None or not text.strip():
-        return ()
-    limits = view.memory.limits
-    try:
-        # A view of its own: what could not be read has no part in the answer.
-        known = known_things(View(view.memory, view.call), limits.min_score, limits.labels)
-    except QueryTimeoutError:
-        return ()
-    sights = known.estimate.sights
-    if known.since is not None or not set(topics) & set(sights.topics):
-        return ()
-    names = sorted(set(map(plain, sights.labels)))
-    is_known = any(text.casefold() in each.casefold() for each in sights.labels)
-    if is_known or not _like(plain(text), names):
-        return ()
-    return (_unknown(text, plain(text), names),)
+        close = [each for each in names if asked in each or each in asked]
+        close += difflib.get_close_matches(asked, names, 3)
+        shown = [*dict.fromkeys(close)] or names
+        meant = f"; did you mean {close[0]}?" if close else ""
+        yield f"no detector reported {abbreviate(label)}; there are: {listed(shown)}{meant}"

@@ -123,10 +123,10 @@ def known_things(
     known = _CACHE.estimate(timeline, key)
     if known is not None:
         return known
-    before = view.notes.keys()
+    before = view.notes.added
     known = _Loader(view).load(min_score, Labels(spellings))
     active = any(bag.state is BagState.ACTIVE for bag in view.snapshot.bags)
-    if known.since is None and not active and view.notes.keys() == before:
+    if known.since is None and not active and view.notes.added == before:
         _CACHE.put_estimate(timeline, key, known)
     return known
 
@@ -213,12 +213,12 @@ class _Loader:
             self._reading = self._view.call.partial_after(READING_S)
         if self._reading.expired():
             return None
-        before = self._view.notes.keys()
+        before = self._view.notes.added
         try:
             digest = self._maps.made(bag, DetectorSights(memory.reader, memory.extractor))
         except QueryTimeoutError:
             return None
-        if bag.state is not BagState.ACTIVE and self._view.notes.keys() == before:
+        if bag.state is not BagState.ACTIVE and self._view.notes.added == before:
             _CACHE.put_sights(key, digest.sights)
         return digest.sights
 

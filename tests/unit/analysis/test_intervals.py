@@ -199,7 +199,7 @@ def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
     start, end = messages[0][0], messages[-1][0]
     for label in seen.throughout(start, end):
         times = sorted({time for time, labels in messages if label in labels})
-        usual = (times[-1] - times[0]) / (len(times) - 1)
+        usual = (times[-1] - times[0]) / max(1, len(times) - 1)
         edges = [start, *times, end]
         assert max(b - a for a, b in pairwise(edges)) <= max(NS_PER_S, 3 * usual)
 

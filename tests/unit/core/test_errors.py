@@ -47,6 +47,7 @@ def test_the_reasons_for_no_data_are_those_that_a_client_knows() -> None:
         "frame_unknown",
         "frames_not_connected",
         "empty_memory",
+        "mixed",
     }
 
 

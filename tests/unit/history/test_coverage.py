@@ -96,7 +96,7 @@ def test_the_split_being_written_is_reported_from_the_end_of_the_one_before_it_o
     snapshot = Snapshot(Timeline.of((split(0),)), active=(active,), scanned_at=T0 + 15 * S)
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 5, 12) == [
-        "the split being written is not included: nothing after 1784023209.000000"
+        "the split being written is left out: nothing after 1784023209.000000"
     ]
 
 

@@ -160,7 +160,7 @@ def test_the_split_being_written_is_reported_where_it_may_hold_newer(tmp_path: P
     active = write_mcap(tmp_path / "rec" / "rec_2.mcap", messages(20), McapLayout(finish=False))
     os.utime(active, ns=(T0 + 29 * S,) * 2)
     memory = memory_of(tmp_path, clock=FixedClock(T0 + 30 * S))
-    written = f"the split being written is not included: nothing after {at(19):.6f}"
+    written = f"the split being written is left out: nothing after {at(19):.6f}"
     newest = asked(memory, tmp_path, "find_last_match", **SEEN)
     assert (newest["timestamp"], newest["notes"]) == (at(10), [written])
     older = asked(memory, tmp_path, "find_last_match", **SEEN, before=at(15))

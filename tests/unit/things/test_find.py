@@ -21,7 +21,6 @@ from tests.support.bags import (
     make,
     odom,
     point,
-    text,
     tf,
     transform,
     write_mcap,
@@ -262,38 +261,6 @@ def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) 
     assert reply["things"] == []
     near = "there are: headphones; did you mean headphones?"
     assert reply["notes"] == [f'no detector reported "phone"; {near}']
-
-
-@pytest.mark.parametrize("recalls", [False, True])
-def test_never_names_the_labels_that_are_like_the_one_that_was_sought(
-    tmp_path: Path, recalls: bool
-) -> None:
-    write(tmp_path, [*looked(0, 20, HERE, ("scissors", 3.0, 0.5)), text(BEGIN * S, "no label")])
-    memory = memory_of(tmp_path, limits=NAMED)
-    memory = recalling(memory, tmp_path) if recalls else memory
-    near = 'no detector reported "scisors"; there are: scissors; did you mean scissors?'
-
-    def notes(tool: str, value: str, topic: str = "/vision/*") -> list[str]:
-        given = {"topic": topic, "condition_type": "contains", "value": value}
-        reply = asked(memory, tmp_path, tool, **given)
-        shown = {} if reply is None else reply
-        return [each for each in shown.get("notes", ()) if "detector" in each]
-
-    for tool in ("find_matches", "find_last_match"):
-        assert notes(tool, "scisors") == [near]
-        assert notes(tool, "scisors", "/chatter") == notes(tool, "chair") == []
-    reply = asked(
-        memory,
-        tmp_path,
-        "find_matches",
-        topic="/vision/*",
-        condition_type="contains",
-        value="scissors",
-        start=BEGIN - 60,
-        end=BEGIN + 0.01,
-        min_score=1.0,
-    )
-    assert not any("detector" in each for each in reply.get("notes", ()))
 
 
 def test_detections_without_a_place_are_reported(tmp_path: Path) -> None:
