@@ -328,7 +328,9 @@ def _topic_events(
             continue
         seen = found.visible.scoring(min_score) if min_score else found.visible
         below += found.visible.size - seen.size
-        ends = [begin for begin, _ in unrecorded_times(view, topic, TimeWindow(start, end))]
+        ends: list[Ns] = []
+        if found.toggles:
+            ends = [begin for begin, _ in unrecorded_times(view, topic, TimeWindow(start, end))]
         events += [*_flips(topic, found, ends), *map(_error, _errors(view, topic, found, there))]
         visible.append(seen)
         throughout.update(seen.throughout(start, end))

@@ -47,7 +47,7 @@ _CACHE_MB: Final = 8
 """Bags digested before the program looks which others closed meanwhile."""
 _SHARED: Final = 512
 """A second process takes half of more bags than these."""
-_FREE_CORES: Final = 1.5
+_FREE_CORES: Final = 1.0
 """Cores less the load average, from which on there is room for two."""
 _LOOK_S: Final = 2.0
 _BAR_WIDTH: Final = 40
