@@ -30,7 +30,6 @@ from benchmarks.home.__main__ import made, write
 from benchmarks.home.days import Scale
 from benchmarks.home.things import DAY
 from benchmarks.home.world import START_S, VISION
-from benchmarks.ours import import_queries
 from benchmarks.report import machine
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.serving.mcp_server import EpisodicServer  # noqa: TC001 - so that forks have it
@@ -200,7 +199,6 @@ def speeds(settings: Settings, asked: Sequence[Asked]) -> Iterator[Speed]:
 
 def _import_all(settings: Settings, memory: Memory) -> None:
     """Imports what a server and its first call import, so that forks have it."""
-    import_queries()
     server = build_server(settings, memory)
     asyncio.run(server.dispatcher.answer("get_position_at", {"timestamp": START_S}))
 

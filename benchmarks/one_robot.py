@@ -211,7 +211,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"| {' | '.join(figure)} |", flush=True)
 
     anyio.run(anyio.sleep, 0)  # a server has imported what runs its calls when it is asked
-    ours.import_queries()
     forked = multiprocessing.get_context("fork")  # imports are not counted
 
     def alone(call: Asked) -> Figure:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import importlib
 import json
-import pkgutil
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
@@ -42,14 +40,6 @@ def settings_for(bag_dir: Path) -> Settings:
 def overrides(bag_dir: Path) -> list[str]:
     """What of the configuration is not as shipped."""
     return [f"recording.bag_dir='{bag_dir}'", "logging.level=error"]
-
-
-def import_queries() -> None:
-    """Imports the queries of all tools, which a server imports when they are asked for."""
-    for room in ("counts", "insights", "places", "things"):
-        package = importlib.import_module(f"ros2_memory.{room}")
-        for each in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            importlib.import_module(each.name)
 
 
 def memory(settings: Settings) -> Memory:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
 _JOINED_AGAIN_S: Final = 5.0
-"""Whoever asks for a robot that there is not has the lake looked at, but no more often."""
+"""Least time between two looks into the lake for a robot that is asked for and not known."""
 LAKE_REFRESH_S: Final = 60.0
 """How old what is known of a lake may be: at most one commit of a table is made in this time."""
 

@@ -137,10 +137,7 @@ def test_the_server_imports_nothing_that_records_deletes_or_is_for_people(
     )
     ((*there,),) = imported(program, env)
     observing = {"opentelemetry.sdk", "prometheus_client", "ros2_memory.observability.prometheus"}
-    asked = {
-        f"ros2_memory.{room}" for room in ("counts", "insights.recap", "queries", "things.find")
-    }
-    absent = DELETING | RECORDING | PEOPLE | FLEET | observing | {"httpx", "jsonschema"} | asked
+    absent = DELETING | RECORDING | PEOPLE | FLEET | observing | {"httpx", "jsonschema"}
     assert absent & {*there} == set()
 
 

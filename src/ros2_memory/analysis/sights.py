@@ -9,8 +9,8 @@ Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores
 integers, so that sums do not depend on their order. Tables of several bags are joined by
 `joined`, which is associative.
 
-A bag of more than a minute is several *slices*, each with tables as a short bag has them: in a
-look of an hour, what was seen before could not be told from what was missed after. So things are
+A bag of more than a minute is several *slices*, each with the tables of a short bag: the sum over
+an hour does not show whether a thing was missed before or after it was last seen. So things are
 the same, whether a history is one file or many.
 """
 

@@ -37,7 +37,7 @@ _TIME_OF_DAY_WIDTH: Final = 12
 _MIN_TEXT_WIDTH: Final = 16
 """Columns that a text keeps where a table is wider than the terminal."""
 _ALL: Final = "all"
-"""The key of a table's last row, and what stands in its first column."""
+"""The key of a table's last row, and the text of its first column."""
 _KEYS_OF_TIMES: Final = frozenset({"start", "end", "earliest", "latest", "first_ts", "last_ts"})
 _VECTOR_KEYS: Final = frozenset({"x", "y", "z", "w", "yaw_deg", "frame_id"})
 _TIME_IN_NOTE: Final = re.compile(r"\b\d{10}\.\d{3,9}\b")
@@ -114,8 +114,8 @@ def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]
         for row in rows
         if isinstance(row, list)
     ]
-    told = {names, "rows", _ALL} if isinstance(every, list) else {names, "rows"}
-    return {key: each for key, each in value.items() if key not in told} | {"rows": named}
+    shown = {names, "rows", _ALL} if isinstance(every, list) else {names, "rows"}
+    return {key: each for key, each in value.items() if key not in shown} | {"rows": named}
 
 
 def _is_shown(column: str) -> bool:

@@ -176,7 +176,7 @@ class Fleet:
             return ()
         with self._lock:
             found = [*self._join(self.robots)]
-            # Another one: whoever goes through them sees no change.
+            # A new dict: other threads iterate over the old one.
             self.robots = {**self.robots, **{each.name: each for each in found}}
         return found
 

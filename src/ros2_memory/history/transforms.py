@@ -99,7 +99,7 @@ _STATIC_READ: Final[WeakKeyDictionary[Segment | Timeline, dict[_StaticKey, _Stat
     WeakKeyDictionary()
 )
 _MOST_KEPT: Final = 64
-"""Sessions whose static transforms are kept of a segment: mostly they are one."""
+"""Sessions of a segment whose static transforms stay in memory; most segments have one."""
 _BAGS_AT_ONCE: Final = 16
 """Bags of which all static transforms are read before any are kept."""
 

@@ -1,10 +1,8 @@
 """Fills the catalogue: digests every closed bag that has no entry, the newest first.
 
 A kill at any moment loses at most the bag that is being digested: entries are written whole or not
-at all. The queries whose answers are stored are imported when that is done, since a server answers
-sooner without them.
+at all.
 """
-# ruff: noqa: PLC0415 - as the docstring says
 
 from __future__ import annotations
 
@@ -28,10 +26,21 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns, ns_from_unix
+from ros2_memory.counts.field_numbers import store_shared_ranges
+from ros2_memory.counts.sighting_runs import store_shared_texts, topics_with_texts
+from ros2_memory.history.bag_fold import JOINED_VERSION, counted_once
 from ros2_memory.history.context import Call
+from ros2_memory.history.driven_path import store_shared_paths
+from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
+from ros2_memory.insights.changes_before import topics_with_changes
+from ros2_memory.insights.drive import drive_in, store_shared_standstills
+from ros2_memory.insights.topic_events import events_in, store_shared_events
+from ros2_memory.places.bag_statics import BagStatics
+from ros2_memory.places.map_digests import MapDigests
+from ros2_memory.queries import list_recorded_topics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -118,8 +127,6 @@ class Backfill:
 
         Looked up once for each timeline and state of the catalogue.
         """
-        from ros2_memory.places.map_digests import MapDigests
-
         newest = self.catalogue.newest()
         if self._stale is None or self._stale[:2] != (timeline, newest):
             maps = MapDigests(self._view_of(timeline))
@@ -203,8 +210,6 @@ class Backfill:
         return [bag for bag in bags if self._key(bag) not in renewed] if renewed else [*bags]
 
     def _statics_of(self, bag: BagFile) -> Statics:
-        from ros2_memory.places.bag_statics import BagStatics
-
         view = self._view_of(self._memory.index.snapshot().timeline)
         return BagStatics(view).of(bag)
 
@@ -224,15 +229,6 @@ class Backfill:
         answer. What was computed once is not looked at again, but for the hour before the bags
         that were digested since.
         """
-        from ros2_memory.counts.field_numbers import store_shared_ranges
-        from ros2_memory.counts.sighting_runs import store_shared_texts, topics_with_texts
-        from ros2_memory.history.driven_path import store_shared_paths
-        from ros2_memory.history.no_data import resolve_pose_topic
-        from ros2_memory.insights.changes_before import topics_with_changes
-        from ros2_memory.insights.drive import store_shared_standstills
-        from ros2_memory.insights.topic_events import store_shared_events
-        from ros2_memory.queries import list_recorded_topics
-
         with suppress(EpisodicError):
             rows = list_recorded_topics(self._memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
@@ -315,11 +311,6 @@ def store_joined(memory: Memory) -> None:
 
     Nothing is looked at where all of it was stored, be it by another process.
     """
-    from ros2_memory.history.bag_fold import counted_once
-    from ros2_memory.insights.changes_before import topics_with_changes
-    from ros2_memory.insights.drive import drive_in
-    from ros2_memory.insights.topic_events import events_in
-
     view = View(memory, Call(stores_joined=True))
     mark, numbers = _settled(view)
     if memory.recall is None or not numbers:
@@ -347,8 +338,6 @@ def _settled(view: View) -> tuple[str, list[int]]:
     And the name of the mark that their bags' digests were joined, and those of overlapping
     recordings stored.
     """
-    from ros2_memory.history.bag_fold import JOINED_VERSION
-
     timeline, limits = view.snapshot.timeline, view.memory.limits
     known = [view.bags.digests_of(each) for each in timeline.segments if timeline.is_settled(each)]
     numbers = [number for each in known if each is not None for number in each.numbers.values()]

@@ -1,9 +1,7 @@
 """What `/health` shows, and the tasks that read the bag directory between queries.
 
-The reply stays small whatever is wrong: all faults are counted, and the newest few are named. What
-it is made of is imported at the first report: over stdio nobody asks for one.
+The reply stays small whatever is wrong: all faults are counted, and the newest few are named.
 """
-# ruff: noqa: PLC0415 - as the docstring says
 
 from __future__ import annotations
 
@@ -17,7 +15,11 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.history.context import short_name
+from ros2_memory.index.listed_splits import absent_splits
+from ros2_memory.insights.status import clock_faults, left_open, problems_of
 from ros2_memory.serving.fair_queue import FairQueue
+from ros2_memory.tools.reply_json import moment, seconds
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -67,7 +69,6 @@ async def read_listings(memory: Memory) -> None:
 
     Those of a week take a sixth of that look.
     """
-    from ros2_memory.index.listed_splits import absent_splits
 
     def read() -> None:
         try:
@@ -156,10 +157,6 @@ def _problems(report: JsonObject) -> list[JsonValue]:
 
 
 def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
-    from ros2_memory.history.context import short_name
-    from ros2_memory.insights.status import clock_faults, left_open, problems_of
-    from ros2_memory.tools.reply_json import moment, seconds
-
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.heartbeat()
@@ -226,8 +223,6 @@ def _catalogue(backfill: Backfill) -> JsonObject:
 
 
 def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
-    from ros2_memory.tools.reply_json import seconds
-
     error, held, waits = heartbeat.last_error, heartbeat.age_held, heartbeat.waiting_for
     unshipped = heartbeat.unshipped
     shown: JsonObject = {

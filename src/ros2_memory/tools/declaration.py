@@ -73,22 +73,19 @@ class ToolName:
 class ToolDeclaration:
     """A query and all its names.
 
-    `query` and `count` import the function that they return, at the first call: a program starts
-    without the queries that nobody asks.
     `shows_example`: its schema alone does not show how it is called.
-    The function of `count` answers in place of that of `query` where `by` is given. It need not
-    take arguments that only bound what is shown (`SHOWN_ALONE`); others that it does not take are
-    refused.
+    `count` answers in place of `query` where `by` is given. It need not take arguments that only
+    bound what is shown (`SHOWN_ALONE`); others that it does not take are refused.
     """
 
     names: tuple[ToolName, ...]
     description: str
     arguments: type[Arguments]
-    query: Callable[[], Query]
+    query: Query
     blocking: bool = False
     writes: bool = False
     shows_example: bool = False
-    count: Callable[[], Query] | None = None
+    count: Query | None = None
 
     def tools(self, defaults: Mapping[str, object], *, plain_times: bool = False) -> Iterator[Tool]:
         """Yields a tool for each name; `defaults` fill the description's placeholders.
@@ -131,11 +128,12 @@ class ToolDeclaration:
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))
-        by = None if self.count is None else arguments.pop("by")
-        if self.count is None or by is None:
-            return lambda memory, call: self.query()(memory, call, **arguments)
-        count = self.count()
-        taken = inspect.signature(count).parameters
+        if self.count is None:
+            return lambda memory, call: self.query(memory, call, **arguments)
+        by = arguments.pop("by")
+        if by is None:
+            return lambda memory, call: self.query(memory, call, **arguments)
+        count, taken = self.count, inspect.signature(self.count).parameters
         refused = [
             self.arguments.model_fields[name].alias or name
             for name, value in arguments.items()

@@ -1,10 +1,17 @@
 """The tools beyond the specification: what happened, where and when, in one call each."""
-# ruff: noqa: PLC0415 - `ToolDeclaration` says why
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ros2_memory.counts.matches import count_matches
+from ros2_memory.counts.stays import count_visits
+from ros2_memory.insights.compare import compare
+from ros2_memory.insights.recap import recap_or_before
+from ros2_memory.insights.saved_moments import list_moments, remember_moment, show_moment
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.insights.status import memory_status
+from ros2_memory.insights.type_fields import describe_type
+from ros2_memory.places.visits import visits
+from ros2_memory.things.find import find_things
 from ros2_memory.tools.arguments import (
     CompareArguments,
     MatchesArguments,
@@ -19,82 +26,6 @@ from ros2_memory.tools.arguments import (
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
-if TYPE_CHECKING:
-    from ros2_memory.tools.declaration import Query
-
-
-def _count_matches() -> Query:
-    from ros2_memory.counts.matches import count_matches
-
-    return count_matches
-
-
-def _count_visits() -> Query:
-    from ros2_memory.counts.stays import count_visits
-
-    return count_visits
-
-
-def _compare() -> Query:
-    from ros2_memory.insights.compare import compare
-
-    return compare
-
-
-def _recap_or_before() -> Query:
-    from ros2_memory.insights.recap import recap_or_before
-
-    return recap_or_before
-
-
-def _list_moments() -> Query:
-    from ros2_memory.insights.saved_moments import list_moments
-
-    return list_moments
-
-
-def _remember_moment() -> Query:
-    from ros2_memory.insights.saved_moments import remember_moment
-
-    return remember_moment
-
-
-def _show_moment() -> Query:
-    from ros2_memory.insights.saved_moments import show_moment
-
-    return show_moment
-
-
-def _find_matches() -> Query:
-    from ros2_memory.insights.sightings import find_matches
-
-    return find_matches
-
-
-def _memory_status() -> Query:
-    from ros2_memory.insights.status import memory_status
-
-    return memory_status
-
-
-def _describe_type() -> Query:
-    from ros2_memory.insights.type_fields import describe_type
-
-    return describe_type
-
-
-def _visits() -> Query:
-    from ros2_memory.places.visits import visits
-
-    return visits
-
-
-def _find_things() -> Query:
-    from ros2_memory.things.find import find_things
-
-    return find_things
-
-
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
     "When, where, how often and how long a condition was true, newest first. "
@@ -106,10 +37,10 @@ _SIGHTINGS = ToolDeclaration(
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
     "position (at when), place: of the thing, score}}], total}}.",
     MatchesArguments,
-    _find_matches,
+    find_matches,
     blocking=True,
     shows_example=True,
-    count=_count_matches,
+    count=count_matches,
 )
 _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
@@ -118,7 +49,7 @@ _RECAP = ToolDeclaration(
     "duration_s, text, in, score, before: what changed in the 10 s before}}], counts}}. With "
     "around: {{before: [{{text, s_before}}], after (5 s), nearest first, recorded, robot, state}}.",
     RecapArguments,
-    _recap_or_before,
+    recap_or_before,
     blocking=True,
 )
 _STATUS = ToolDeclaration(
@@ -126,7 +57,7 @@ _STATUS = ToolDeclaration(
     "Whether the recorder runs, how old the newest data is, topics that fell silent, "
     "damaged files, how many days of data the disk budget holds, and the newest saved moments.",
     NoArguments,
-    _memory_status,
+    memory_status,
 )
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
@@ -135,9 +66,9 @@ _VISITS = ToolDeclaration(
     "for every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
     "closest_m, ago_s}}], total, minutes}} or {{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,
-    _visits,
+    visits,
     blocking=True,
-    count=_count_visits,
+    count=count_visits,
 )
 _THINGS = ToolDeclaration(
     (ToolName("find_things", "Things"),),
@@ -146,7 +77,7 @@ _THINGS = ToolDeclaration(
     "last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "
     "times}}]}}], total, labels}}.",
     ThingsArguments,
-    _find_things,
+    find_things,
     blocking=True,
 )
 _COMPARE = ToolDeclaration(
@@ -158,33 +89,33 @@ _COMPARE = ToolDeclaration(
     "movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
     "farthest_apart, minutes, errors, silent_s}}.",
     CompareArguments,
-    _compare,
+    compare,
     blocking=True,
 )
 TYPE = ToolDeclaration(
     (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
     TypeArguments,
-    _describe_type,
+    describe_type,
 )
 MOMENTS = ToolDeclaration(
     (ToolName("list_moments", "Saved moments"),),
     "Moments saved by remember_moment or a rule, newest first.",
     NoArguments,
-    _list_moments,
+    list_moments,
 )
 MOMENT = ToolDeclaration(
     (ToolName("show_moment", "A saved moment"),),
     "One saved moment.",
     MomentArguments,
-    _show_moment,
+    show_moment,
 )
 _SAVE_MOMENT = ToolDeclaration(
     (ToolName("remember_moment", "Save a moment"),),
     "Saves the bags around now from deletion. Reply: {{moment, bags, pending: the rest is "
     "still being written}}.",
     SaveMomentArguments,
-    _remember_moment,
+    remember_moment,
     blocking=True,
     writes=True,
 )

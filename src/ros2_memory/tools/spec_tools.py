@@ -3,15 +3,19 @@
 A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
 `ToolName`s differ. The order of the declarations is the order in which clients see the tools.
 """
-# ruff: noqa: PLC0415 - `ToolDeclaration` says why
 
 from __future__ import annotations
 
 from functools import partial
 from typing import TYPE_CHECKING
 
+from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
+from ros2_memory.counts.numbers import count_range
+from ros2_memory.counts.path import count_path
+from ros2_memory.insights.at_each import at_each
+from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
@@ -32,11 +36,10 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
-    from ros2_memory import results
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.view import TimeRange
-    from ros2_memory.tools.declaration import Query, Tool
+    from ros2_memory.tools.declaration import Tool
 
 
 def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
@@ -72,9 +75,7 @@ def build_tools(
 def _list_topics(
     memory: Memory, call: Call, *, pattern: str | None
 ) -> tuple[results.TopicRow, ...]:
-    from ros2_memory.queries import list_recorded_topics
-
-    rows = list_recorded_topics(memory, call)
+    rows = queries.list_recorded_topics(memory, call)
     if pattern is None or not rows:
         return rows
     matched = {*match_topics([row.topic for row in rows], pattern)}
@@ -99,81 +100,8 @@ def _trajectory(
     max_waypoints: int,
 ) -> results.TrajectorySummary | results.DrivenInside:
     """Returns the whole way, or what was driven inside of a region."""
-    from ros2_memory.places.driven_inside import driven_inside
-    from ros2_memory.queries import trajectory_summary
-
-    query = trajectory_summary if where is None else partial(driven_inside, where=where)
+    query = queries.trajectory_summary if where is None else partial(driven_inside, where=where)
     return query(memory, call, span, topic=topic, frame_id=frame_id, max_waypoints=max_waypoints)
-
-
-def _data_time_range() -> Query:
-    from ros2_memory.queries import data_time_range
-
-    return data_time_range
-
-
-def _topic_value() -> Query:
-    from ros2_memory.insights.at_each import at_each
-    from ros2_memory.queries import topic_value
-
-    return at_each(topic_value)
-
-
-def _topic_range() -> Query:
-    from ros2_memory.queries import topic_range
-
-    return topic_range
-
-
-def _position() -> Query:
-    from ros2_memory.insights.at_each import at_each
-    from ros2_memory.queries import position
-
-    return at_each(position)
-
-
-def _velocity() -> Query:
-    from ros2_memory.insights.at_each import at_each
-    from ros2_memory.queries import velocity
-
-    return at_each(velocity)
-
-
-def _transform() -> Query:
-    from ros2_memory.insights.at_each import at_each
-    from ros2_memory.queries import transform
-
-    return at_each(transform)
-
-
-def _frames() -> Query:
-    from ros2_memory.queries import frames
-
-    return frames
-
-
-def _find_last_match() -> Query:
-    from ros2_memory.queries import find_last_match
-
-    return find_last_match
-
-
-def _value_when() -> Query:
-    from ros2_memory.queries import value_when
-
-    return value_when
-
-
-def _count_range() -> Query:
-    from ros2_memory.counts.numbers import count_range
-
-    return count_range
-
-
-def _count_path() -> Query:
-    from ros2_memory.counts.path import count_path
-
-    return count_path
 
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
@@ -190,7 +118,7 @@ _DECLARATIONS = (
         "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; if there are too "
         "many, the busiest.",
         TopicListArguments,
-        lambda: _list_topics,
+        _list_topics,
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded time range"),),
@@ -198,7 +126,7 @@ _DECLARATIONS = (
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, times "
         "in Unix s and local ISO, null if nothing is recorded.",
         NoArguments,
-        _data_time_range,
+        queries.data_time_range,
     ),
     ToolDeclaration(
         _at_and_ago("topic", "A topic's value", at="at_time"),
@@ -206,7 +134,7 @@ _DECLARATIONS = (
         "(default {tolerance}, too little for slow topics; latched: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
-        _topic_value,
+        at_each(queries.topic_value),
     ),
     ToolDeclaration(
         (
@@ -218,8 +146,8 @@ _DECLARATIONS = (
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
         "max, max_at}}}} of all messages}}.",
         TopicRangeArguments,
-        _topic_range,
-        count=_count_range,
+        queries.topic_range,
+        count=count_range,
     ),
     ToolDeclaration(
         _at_and_ago("position", "Robot position"),
@@ -227,7 +155,7 @@ _DECLARATIONS = (
         "(counter-clockwise from x), timestamp, topic, frame_id}}; for NavSatFix latitude, "
         "longitude and altitude, and x, y, z are null.",
         PositionArguments,
-        _position,
+        at_each(queries.position),
     ),
     ToolDeclaration(
         _at_and_ago("velocity", "Robot velocity"),
@@ -235,7 +163,7 @@ _DECLARATIONS = (
         "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}. In the robot's own frame "
         "x is forward and positive angular z turns left.",
         MotionArguments,
-        _velocity,
+        at_each(queries.velocity),
     ),
     ToolDeclaration(
         _at_and_ago("transform", "Transform"),
@@ -243,14 +171,14 @@ _DECLARATIONS = (
         "interpolated. Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, "
         "parent, child, clock}}.",
         TransformArguments,
-        _transform,
+        at_each(queries.transform),
     ),
     ToolDeclaration(
         (ToolName("list_frames", "Frames"),),
         "Lists every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
         "static}}]}}.",
         NoArguments,
-        _frames,
+        queries.frames,
         blocking=True,
     ),
     ToolDeclaration(
@@ -259,7 +187,7 @@ _DECLARATIONS = (
         "frame_id, age_s}}, or null if never ({{timestamp: null, value: null, notes}} if something "
         "could not be read).",
         LastMatchArguments,
-        _find_last_match,
+        queries.find_last_match,
         blocking=True,
         shows_example=True,
     ),
@@ -269,7 +197,7 @@ _DECLARATIONS = (
         "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
         "value_timestamp, condition_topic, value_topic, frame_id}}, or null as find_last_match.",
         ValueWhenArguments,
-        _value_when,
+        queries.value_when,
         blocking=True,
     ),
     ToolDeclaration(
@@ -281,8 +209,8 @@ _DECLARATIONS = (
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
         "...}}; with where: only the path inside it, and visits.",
         TrajectoryArguments,
-        lambda: _trajectory,
+        _trajectory,
         blocking=True,
-        count=_count_path,
+        count=count_path,
     ),
 )

@@ -31,9 +31,9 @@ from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.counts import sighting_runs
 from ros2_memory.history.context import Call
 from ros2_memory.index import timeline
+from ros2_memory.serving import backfill as serving_backfill
 from ros2_memory.serving.backfill import BACKLOG, Backfill, Progress, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
@@ -121,7 +121,7 @@ def test_beside_a_full_catalogue_only_bags_that_may_come_and_go_are_looked_at_ag
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [text(start, "word", "/said")])
     looked: list[TimeWindow] = []
     monkeypatch.setattr(
-        sighting_runs, "store_shared_texts", lambda _view, _topic, window: looked.append(window)
+        serving_backfill, "store_shared_texts", lambda _view, _topic, window: looked.append(window)
     )
 
     def windows() -> list[TimeWindow]:

@@ -424,10 +424,10 @@ def test_a_time_argument_replaces_the_span() -> None:
 
 @pytest.mark.parametrize("declaration", DECLARATIONS, ids=lambda each: each.names[0].name)
 def test_a_query_has_a_parameter_for_each_argument(declaration: ToolDeclaration) -> None:
-    memory, call, *parameters = inspect.signature(declaration.query()).parameters
+    memory, call, *parameters = inspect.signature(declaration.query).parameters
     assert (memory, call) == ("memory", "call")
     arguments = set(declaration.arguments.model_fields)
     assert set(parameters) == arguments - ({"by"} if declaration.count else set())
     if declaration.count is not None:
-        memory, call, *counting = inspect.signature(declaration.count()).parameters
+        memory, call, *counting = inspect.signature(declaration.count).parameters
         assert {"by"} <= set(counting) <= arguments

@@ -146,7 +146,7 @@ def _low_priority_backfill(settings: Settings) -> Backfill:
     """Returns what fills the catalogue in a process that other programs go before."""
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
-    # Each bag is read once. What is kept of its chunks would take more than all else.
+    # Each bag is read once: a larger cache of chunks would take most of the memory, and not help.
     cache_mb = min(_CACHE_MB, settings.reader.chunk_cache_mb)
     return build_backfill(
         settings, build_memory(settings, shared_parts(settings, cache_mb=cache_mb))

@@ -234,7 +234,7 @@ class LakeIndex:
             known = self._older.pop(last, _Window())
             window = self._window(days, span, known, f"{FOLDER}-{last}")
             self._older[last] = window
-            # Another one: whoever goes through them sees no change.
+            # A new dict: other threads iterate over the old one.
             kept = [*self._older.items()][-_MOST_WINDOWS:]
             self._older = dict(kept)
             return window

@@ -282,7 +282,7 @@ function showKey() {
   const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
   const left = view.paths_left_out;
-  // Without poses there is no map: the reason stands in its place.
+  // Without poses there is no map: the reason is shown instead.
   const isEmpty = Boolean(view.no_path) && !(view.places || []).length;
   at("map").hidden = at("map-tools").hidden = isEmpty;
   if (isEmpty) {
