@@ -12,6 +12,8 @@ from ros2_memory.bootstrap import build_digester
 from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.history.context import Memory
+from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.files import Lake
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.warehouse import LakeLocation, location_of
@@ -100,3 +102,27 @@ def lake_column(folder: Path, table: str, column: str) -> list[object]:
     with where.opened() as catalog:
         found = where.tables(catalog, [table])[table].scan(selected_fields=(column,)).to_arrow()
     return sorted(found[column].to_pylist(), key=str)
+
+
+def ship_and_ask(where: LakeLocation, folder: Path) -> None:
+    """Ships two bags of a robot, each by two processes in turn, and asks the lake for them.
+
+    The second process finds nothing new.
+    """
+    for number in (0, 1):
+        write_bag(folder, number)
+        for shipped in (1, 0):
+            with where.opened() as catalog:
+                tables = where.tables(catalog, TABLES)
+                robots = [robot_bags("hall", folder)]
+                shipper = Shipper(where, tables, robots, FixedClock(LATER), messages=())
+                assert shipper.run().bags == shipped
+    with where.opened() as catalog:
+        engine = DuckdbEngine()
+        lake = Lake(catalog, engine, where.namespace, where.translated)
+        assert lake.robots() == ["hall"]
+        sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
+        found = lake.select(sql, ["sightings"], robots=["hall"]).to_pylist()
+        engine.close()
+    assert [row["label"] for row in found] == ["cup", "cup"]
+    assert len({row["bag_id"] for row in found}) == 2

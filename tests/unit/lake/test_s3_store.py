@@ -12,13 +12,8 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
-from ros2_memory.lake.files import Lake
-from ros2_memory.lake.shipper import Shipper
-from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.warehouse import LakeLocation
-from tests.support.clocks import FixedClock
-from tests.support.lakes import LATER, robot_bags, write_bag
+from tests.support.lakes import ship_and_ask
 
 moto = pytest.importorskip("moto.server", reason="needs moto, which no lock has")
 pytestmark = pytest.mark.skipif(
@@ -41,23 +36,7 @@ def test_bags_are_shipped_once_into_a_bucket_and_asked(tmp_path: Path) -> None:
         where.state_dir.mkdir()
         endpoint = where.properties["s3.endpoint"]
         urlopen(Request(f"{endpoint}/robots", method="PUT")).close()  # noqa: S310 - of this host
-        for number in (0, 1):
-            write_bag(tmp_path / "hall", number)
-            for shipped in (1, 0):  # the second process finds nothing new
-                with where.opened() as catalog:
-                    robots = [robot_bags("hall", tmp_path / "hall")]
-                    tables = where.tables(catalog, TABLES)
-                    shipper = Shipper(where, tables, robots, FixedClock(LATER), messages=())
-                    assert shipper.run().bags == shipped
-        with where.opened() as catalog:
-            engine = DuckdbEngine()
-            lake = Lake(catalog, engine, where.namespace, where.translated)
-            assert lake.robots() == ["hall"]
-            sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
-            found = lake.select(sql, ["sightings"], robots=["hall"]).to_pylist()
-            engine.close()
-        assert [row["label"] for row in found] == ["cup", "cup"]
-        assert len({row["bag_id"] for row in found}) == 2
+        ship_and_ask(where, tmp_path / "hall")
         kept = [each for each in (tmp_path / "state").rglob("*") if each.is_file()]
         assert not any(SECRET.encode() in each.read_bytes() for each in kept)
     finally:
