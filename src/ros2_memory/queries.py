@@ -75,7 +75,7 @@ from ros2_memory.history.view import (
     open_view,
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
-from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.insights.field_extremes import (
     MAX_MESSAGES,
@@ -419,7 +419,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
     _note_odd_bags(view)
-    for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
+    for sentence in describe_absent(memory.absent_splits(snapshot)):
         view.notes.add(sentence)
     undecodable = undecodable_topics(view)
     steps = clock_steps(view)

@@ -77,12 +77,16 @@ class SegmentDigests:
         self._cache = cache
         failures = catalogue.failures
         closed = [bag for bag in segment.bags if bag.state is BagState.CLOSED]
-        numbers = catalogue.find([BagKey.of(bag, cache.bag_dir) for bag in closed])
+        # By number is faster than by path. An entry that is gone may have been replaced.
+        there = catalogue.existing([bag.entry for bag in closed if bag.entry])
+        others = [bag for bag in closed if bag.entry not in there]
+        found = catalogue.find([BagKey.of(bag, cache.bag_dir) for bag in others]) if others else []
+        by_path = {bag.file: number for bag, number in zip(others, found, strict=True)}
         self.as_of = as_of if catalogue.failures == failures else _UNKNOWN_STATE
         self.numbers: dict[str, int] = {
             bag.file: number
-            for bag, number in zip(closed, numbers, strict=True)
-            if number is not None
+            for bag in closed
+            if (number := by_path.get(bag.file, bag.entry)) is not None
         }
         self.whole = len(self.numbers) == len(segment.bags)
         self.is_outdated = False

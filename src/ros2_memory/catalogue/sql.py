@@ -82,6 +82,13 @@ def entry_rows(
     ).fetchall()
 
 
+def existing_rows(connection: sqlite3.Connection, row_ids: Sequence[int]) -> list[sqlite3.Row]:
+    """Returns those of these row ids that an entry has."""
+    return connection.execute(
+        f"SELECT id FROM bags WHERE id {_AMONG}", (json.dumps(row_ids),)
+    ).fetchall()
+
+
 def topic_rows(
     connection: sqlite3.Connection, columns: str, topic: str, row_ids: Sequence[int]
 ) -> list[sqlite3.Row]:

@@ -49,6 +49,7 @@ from ros2_memory.catalogue.sql import (
     any_is_gone,
     delete_entries,
     entry_rows,
+    existing_rows,
     insert_entry,
     map_rows,
     message_rows,
@@ -160,12 +161,12 @@ class Catalogue(CatalogueDatabase):
 
         def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
             found: dict[str, BagFile] = {}
-            configs = self._usable(connection)
+            configs, offset = self._usable(connection), self.offset
             for number, text in connection.execute("SELECT id, text FROM shapes").fetchall():
                 schema = decode_schema(text)
                 model = model_of(connection, number, COUNTS)
                 cursor = connection.execute(
-                    "SELECT path, size, mtime, sidecar, counts FROM bags"  # noqa: S608
+                    "SELECT path, size, mtime, sidecar, counts, id FROM bags"  # noqa: S608
                     f" WHERE {OF_CONFIGS} AND shape = ?",
                     (configs, number),
                 )
@@ -175,11 +176,12 @@ class Catalogue(CatalogueDatabase):
                     )
                     starts, ends = _time_spans(counts)
                     for row, numbers, start, end in zip(rows, counts, starts, ends, strict=True):
-                        path, size, mtime, sidecar, _ = row
+                        path, size, mtime, sidecar, _, row_id = row
                         summary = BagSummary.decoded(schema, numbers.tobytes())
                         file = root + path
+                        entry, state = offset + row_id, BagState.CLOSED
                         found[file] = BagFile(
-                            file, size, mtime, BagState.CLOSED, summary, start, end, sidecar
+                            file, size, mtime, state, summary, start, end, sidecar, entry
                         )
             return found
 
@@ -206,6 +208,16 @@ class Catalogue(CatalogueDatabase):
 
         found: dict[BagKey, int] = self.read(ask, {})
         return [found.get(key) for key in keys]
+
+    def existing(self, numbers: Sequence[int]) -> set[int]:
+        """Returns which of these entries exist; what has replaced one has another number."""
+
+        def ask(connection: sqlite3.Connection) -> set[int]:
+            offset = self.offset
+            rows = existing_rows(connection, self.row_ids(numbers))
+            return {offset + row[0] for row in rows}
+
+        return self.read(ask, set())
 
     # Each of the next eight reads one topic of some entries. Entries that hold none of the topic,
     # and those that were deleted meanwhile, are left out.
@@ -380,14 +392,7 @@ class Catalogue(CatalogueDatabase):
             row_ids = self.row_ids(numbers)
             if len(row_ids) < len(numbers):
                 return None
-            key = json.dumps([question, *row_ids])
-            row = connection.execute(
-                "SELECT answer FROM remembered WHERE question = ?", (key,)
-            ).fetchone()
-            if row is None:
-                return None
-            model = model_of(connection, NO_TOPIC, _kind_of(question))
-            return unpacked(row[0], model).decode("utf-8", "surrogatepass")
+            return _stored_text(connection, question, row_ids)
 
         return self.read(ask, None)
 
@@ -427,6 +432,23 @@ class Catalogue(CatalogueDatabase):
                     "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
                     (json.dumps([question, *row_ids]), min(row_ids), stored),
                 )
+
+        self.write(write)
+
+    def text(self, name: str) -> str | None:
+        """Returns the text that was stored under a name, if any."""
+        return self.read(lambda connection: _stored_text(connection, name, ()), None)
+
+    def store_text(self, name: str, text: str) -> None:
+        """Stores a text that depends on no entry, until the newest of now is deleted."""
+
+        def write(connection: sqlite3.Connection) -> None:
+            stored = packed_by_model(connection, NO_TOPIC, _kind_of(name), text.encode())
+            connection.execute(
+                "INSERT OR REPLACE INTO remembered"
+                " SELECT ?, id, ? FROM bags ORDER BY id DESC LIMIT 1",
+                (json.dumps([name]), stored),
+            )
 
         self.write(write)
 
@@ -575,6 +597,18 @@ def _summary_of(connection: sqlite3.Connection, row_id: int) -> BagSummary:
     schema, plain = decode_schema(text), unpacked(counts, model_of(connection, number, COUNTS))
     [numbers] = decode_counts([plain], len(schema.topics))
     return BagSummary.decoded(schema, numbers.tobytes())
+
+
+def _stored_text(
+    connection: sqlite3.Connection, question: str, row_ids: Sequence[int]
+) -> str | None:
+    """Returns the answer to a question that is stored for these entries, if any."""
+    key = json.dumps([question, *row_ids])
+    row = connection.execute("SELECT answer FROM remembered WHERE question = ?", (key,)).fetchone()
+    if row is None:
+        return None
+    model = model_of(connection, NO_TOPIC, _kind_of(question))
+    return unpacked(row[0], model).decode("utf-8", "surrogatepass")
 
 
 def _kind_of(question: str) -> str:

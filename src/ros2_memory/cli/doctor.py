@@ -53,7 +53,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
-from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import bags_with_remarks, nothing_here
 from ros2_memory.queries import data_time_range
@@ -306,7 +306,7 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
         do = "answers use the readable part; copy the bags again for the rest"
         yield _warning("bags", f"{bags}: {names}", do)
-    for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
+    for sentence in describe_absent(memory.absent_splits(snapshot)):
         yield _warning("bags", sentence, "copy the missing data from its source")
     # The reason names the key where a configured folder would help.
     missing = [each for each in covered.undecodable if _MSG_FOLDERS in each.reason]

@@ -12,6 +12,7 @@ from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns
+from ros2_memory.index.listed_splits import absent_splits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.index.listed_splits import Absent
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.retention.policy import RetentionLimits
@@ -123,6 +125,11 @@ class Memory:
         """
         kept = self.limits.kept
         return self.index.foreign(snapshot) if kept is not None and kept.keeps_foreign else None
+
+    def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
+        """Returns what recordings' metadata.yaml lists and is not there."""
+        store = None if self.recall is None else self.recall.catalogue
+        return absent_splits(snapshot, self.index.bag_dir, store)
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.

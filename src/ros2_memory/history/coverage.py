@@ -194,7 +194,7 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
 
 
 def _absent(view: View) -> Sequence[SetAside]:
-    return absent_files(view.snapshot, view.memory.index.bag_dir)
+    return absent_files(view.memory.absent_splits(view.snapshot))
 
 
 def _is_whole(bag: BagFile) -> bool:

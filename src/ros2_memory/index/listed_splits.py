@@ -6,16 +6,16 @@ since, or never copied, leave no other trace.
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
-from functools import lru_cache
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
-from ros2_memory.bag_dir.metadata_yaml import Listing, bare_name, read_listing
+from ros2_memory.bag_dir.metadata_yaml import bare_name, read_listing
 from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
@@ -23,11 +23,14 @@ from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.index.scan import settled
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.index.snapshot import Snapshot
 
-_MAX_CACHED_FOLDERS: Final = 8192
+_MAX_CACHED_FOLDERS: Final = 65_536
+_FEW: Final = 32
+"""One of so many recordings is read faster than what was found of all of them is stored."""
+_STORED: Final = "listed 1"
 _MISSING: Final = "metadata.yaml lists it, but it is missing"
 
 
@@ -47,22 +50,49 @@ class Absent(NamedTuple):
     unreadable: bool = False
 
 
-class _Folder(NamedTuple):
-    """A recording's folder: what its metadata.yaml lists, and which bag files lie there.
+class Store(Protocol):
+    """Stores texts by name for later processes; what it has stored it may lose at any time."""
 
-    Names are without `.zstd`.
+    def text(self, name: str) -> str | None:
+        """Returns the text that was stored under a name, if any."""
+
+    def store_text(self, name: str, text: str) -> None:
+        """Stores a text under a name."""
+
+
+_Stamp: TypeAlias = "tuple[int, int, int]"
+"""Mtime and size of a metadata.yaml, and mtime of its folder: of names added and deleted."""
+
+
+class _Listed(NamedTuple):
+    """A recording's metadata.yaml compared with the bag files in its folder.
+
+    Attributes:
+        first: names (without `.zstd`) and messages of the missing files before any that is there.
+        later: those of all others that are missing.
+        bags: how many of the files that are there hold a message by it; None: it lists no file.
+        messages: of these, or of all files where `is_total`; None where that is not known.
+        is_total: it has no number for each file.
     """
 
-    listing: Listing
-    present: frozenset[str]
-    has_handover: bool
+    first: tuple[tuple[str, int], ...] = ()
+    later: tuple[tuple[str, int], ...] = ()
+    bags: int | None = None
+    messages: int | None = None
+    is_total: bool = False
 
 
-def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
+_KNOWN: Final[dict[tuple[Path, str], tuple[_Stamp, _Listed]]] = {}
+"""By bag directory and folder: how it was, and what it held then."""
+
+
+def absent_splits(snapshot: Snapshot, bag_dir: Path, store: Store | None = None) -> list[Absent]:
     """Returns what is missing of the recordings of a snapshot.
 
     A recorder of ours deletes the oldest splits of its recordings, whose metadata.yaml still lists
     them: those before the first split that is left are not missing.
+
+    `store` has what earlier processes found in folders that have not changed since.
     """
     if not snapshot.metadata_folders:
         return []
@@ -74,29 +104,19 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
             bags[name] += tally.bags
             messages[name] += tally.messages
     absent = []
-    for path in snapshot.metadata_folders:
-        try:
-            folder = _folder(bag_dir, path, snapshot.scanned_at)
-        except FileNotFoundError:
-            continue
-        except (OSError, ValueError):
+    for path, listed_there in _listed(snapshot, bag_dir, store):
+        if listed_there is None or listed_there.bags is None:
             absent.append(Absent(path, unreadable=True))
             continue
-        if folder is not None:
-            # Asked only where the first file is missing: it takes longer than all else here.
-            begins = folder.present.issuperset(folder.listing.names[:1])
-            is_own = not begins and _may_be_deleted(own, bag_dir, Path(path))
-            absent.append(_compare(path, folder, bags[path], messages[path], is_own=is_own))
+        # Asked only where the first file is missing: it takes longer than all else here.
+        is_own = bool(listed_there.first) and _may_be_deleted(own, bag_dir, Path(path))
+        absent.append(_compare(path, listed_there, bags[path], messages[path], is_own=is_own))
     return [each for each in absent if each.files or each.messages or each.unreadable]
 
 
-def absent_files(snapshot: Snapshot, bag_dir: Path) -> list[SetAside]:
-    """Returns the missing files of `absent_splits`, as closed files that cannot be read."""
-    return [
-        SetAside(Path(each.folder) / name, _MISSING)
-        for each in absent_splits(snapshot, bag_dir)
-        for name in each.files
-    ]
+def absent_files(absent: Sequence[Absent]) -> list[SetAside]:
+    """Returns missing files as closed files that cannot be read."""
+    return [SetAside(Path(each.folder) / name, _MISSING) for each in absent for name in each.files]
 
 
 def describe_absent(absent: Sequence[Absent]) -> Iterator[str]:
@@ -134,48 +154,106 @@ def _may_be_deleted(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
         return True
 
 
-def _compare(path: str, folder: _Folder, bags: int, messages: int, *, is_own: bool) -> Absent:
-    """Compares a listing with the files beside it: `bags` bags, which hold `messages` messages."""
-    listing = folder.listing
-    if not listing.names:
-        return Absent(path, unreadable=True)
-    names = listing.names
-    deleted = takewhile(lambda name: name not in folder.present, names) if is_own else ()
-    expected = names[len([*deleted]) :]
-    missing = [name for name in expected if name not in folder.present]
-    there = [name for name in names if name in folder.present]
-    lost = sum(listing.messages.get(name, 0) for name in missing)
-    # A bag that is damaged or cut by a handover holds fewer that count, and is not compared.
-    if not folder.has_handover and bags == sum(listing.messages.get(name, 1) > 0 for name in there):
-        if listing.messages:
-            lost += max(sum(listing.messages.get(name, 0) for name in there) - messages, 0)
-        elif listing.total is not None and expected == names:
-            lost += max(listing.total - messages, 0)
-    return Absent(path, tuple(missing), lost)
+def _compare(path: str, found: _Listed, bags: int, messages: int, *, is_own: bool) -> Absent:
+    """Compares what is listed with the bags of a folder, which hold `messages` messages."""
+    missing = found.later if is_own else (*found.first, *found.later)
+    lost = sum(count for _, count in missing)
+    # A bag that is damaged or cut by a handover holds fewer that count, and is not compared. Nor is
+    # the number of all files together, where some were deleted.
+    is_comparable = bags == found.bags and not (found.is_total and is_own)
+    if found.messages is not None and is_comparable:
+        lost += max(found.messages - messages, 0)
+    return Absent(path, tuple(name for name, _ in missing), lost)
 
 
-def _folder(bag_dir: Path, folder: str, now: int) -> _Folder | None:
-    """Reads a folder with a metadata.yaml; None while that is being written.
+def _listed(
+    snapshot: Snapshot, bag_dir: Path, store: Store | None
+) -> Iterator[tuple[str, _Listed | None]]:
+    """Yields the folders with a metadata.yaml that is not being written, and what that lists.
+
+    None where the folder or the file cannot be read.
+    """
+    prefix, now = f"{bag_dir}/", snapshot.scanned_at
+    stored: Mapping[str, tuple[_Stamp, _Listed]] | None = None
+    kept: dict[str, tuple[_Stamp, _Listed]] = {}
+    read = 0
+    for path in snapshot.metadata_folders:
+        name = path.removeprefix(prefix)
+        try:
+            stamp = _stamp(path)
+            if not settled(stamp[0], now):
+                continue
+            known = _KNOWN.get((bag_dir, path))
+            if known is None or known[0] != stamp:
+                stored = _stored(store) if stored is None else stored
+                known = stored.get(name)
+            if known is None or known[0] != stamp:
+                known = stamp, _read(bag_dir, path)
+                read += 1
+        except FileNotFoundError:
+            continue
+        except (OSError, ValueError):
+            yield path, None
+            continue
+        # A folder that changed just now may change again within the same mtime.
+        if settled(stamp[2], now):
+            _KNOWN[bag_dir, path] = kept[name] = known
+        yield path, known[1]
+    if len(_KNOWN) > _MAX_CACHED_FOLDERS:
+        _KNOWN.clear()
+    if store is not None and read * _FEW > len(kept) > 0:
+        store.store_text(_STORED, json.dumps(kept))
+
+
+def _stamp(folder: str) -> _Stamp:
+    # As texts: a path for each folder takes longer than to look at it.
+    status = os.lstat(f"{folder}/{METADATA_FILE}")
+    return status.st_mtime_ns, status.st_size, os.stat(folder).st_mtime_ns  # noqa: PTH116
+
+
+def _stored(store: Store | None) -> dict[str, tuple[_Stamp, _Listed]]:
+    """Returns what is stored of folders, by name; nothing where a damaged file holds other text."""
+    found: dict[str, tuple[_Stamp, _Listed]] = {}
+    text = None if store is None else store.text(_STORED)
+    try:
+        for name, (stamp, stored) in json.loads(text or "{}").items():
+            written, size, changed = map(int, stamp)
+            *missing, bags, messages, is_total = stored
+            first, later = (tuple((str(file), int(n)) for file, n in each) for each in missing)
+            numbers = (
+                None if bags is None else int(bags),
+                None if messages is None else int(messages),
+            )
+            found[name] = (written, size, changed), _Listed(first, later, *numbers, bool(is_total))
+    except (ValueError, TypeError, AttributeError):
+        return {}
+    return found
+
+
+def _read(bag_dir: Path, folder: str) -> _Listed:
+    """Reads a folder with a metadata.yaml.
 
     Raises:
         OSError: the folder or the file cannot be read.
         ValueError: metadata.yaml is not a regular file.
     """
-    # As texts: a path for each folder takes longer than to look at it.
-    status = os.lstat(f"{folder}/{METADATA_FILE}")
-    changed = os.stat(folder).st_mtime_ns  # noqa: PTH116
-    if not settled(status.st_mtime_ns, now):
-        return None
-    # A folder that changed just now may change again within the same mtime: it is not cached.
-    read = _read_folder if settled(changed, now) else _read_folder.__wrapped__
-    return read(bag_dir, folder, (status.st_mtime_ns, status.st_size, changed))
-
-
-@lru_cache(maxsize=_MAX_CACHED_FOLDERS)
-def _read_folder(bag_dir: Path, folder: str, _stamp: tuple[int, int, int]) -> _Folder:
     with opened(bag_dir, Path(folder)) as descriptor:
-        names = os.listdir(descriptor)  # noqa: PTH208 - of a descriptor
+        files = os.listdir(descriptor)  # noqa: PTH208 - of a descriptor
         listing = read_listing(METADATA_FILE, descriptor)
-    present = frozenset(bare_name(name) for name in names if bag_kind(name))
-    unique = tuple(dict.fromkeys(map(bare_name, listing.names)))
-    return _Folder(listing._replace(names=unique), present, HANDOVER_FILE in names)
+    present = {bare_name(name) for name in files if bag_kind(name)}
+    names = tuple(dict.fromkeys(map(bare_name, listing.names)))
+    if not names:
+        return _Listed()
+    counts = listing.messages
+    gone = [*takewhile(lambda name: name not in present, names)]
+    first = tuple((name, counts.get(name, 0)) for name in gone)
+    there = [name for name in names if name in present]
+    later = tuple((name, counts.get(name, 0)) for name in names[len(gone) :] if name not in present)
+    messages = sum(counts.get(name, 0) for name in there) if counts else listing.total
+    return _Listed(
+        first,
+        later,
+        bags=sum(counts.get(name, 1) > 0 for name in there),
+        messages=None if HANDOVER_FILE in files else messages,
+        is_total=not counts,
+    )

@@ -18,7 +18,7 @@ from ros2_memory.history.coverage import (
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.saved_moments import newest_moments, unlisted
 from ros2_memory.insights.silences import silences_of
@@ -167,7 +167,7 @@ def missing_data(view: View) -> Iterator[str]:
     if odd := len(bags_with_remarks(snapshot)):
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} incomplete or contradictory; data_time_range has the details"
-    yield from describe_absent(absent_splits(snapshot, view.memory.index.bag_dir))
+    yield from describe_absent(view.memory.absent_splits(snapshot))
     if undecodable := {each.topic for each in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"

@@ -16,7 +16,6 @@ import anyio.to_thread
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.history.context import short_name
-from ros2_memory.index.listed_splits import absent_splits
 from ros2_memory.insights.status import clock_faults, left_open, problems_of
 from ros2_memory.serving.fair_queue import FairQueue
 from ros2_memory.tools.reply_json import moment, seconds
@@ -72,7 +71,7 @@ async def read_listings(memory: Memory) -> None:
 
     def read() -> None:
         try:
-            absent_splits(memory.index.snapshot(), memory.index.bag_dir)
+            memory.absent_splits(memory.index.snapshot())
         except Exception:
             log.exception("listings_not_read")
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.catalogue.store import FILE, FOLDER, BagKey
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index import timeline
+from ros2_memory.index.segment import Segment
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.memories import memory_of, recalling
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
-    from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Record
 
 T0 = 1_700_000_000 * 10**9
@@ -45,6 +45,26 @@ def test_a_segment_whose_bags_all_have_an_entry_is_complete_after_the_first_look
     notes = recall.digests_for(run, recall.catalogue.newest())
     assert len(notes.numbers) == 2
     assert recall.complete_digests(run) is notes
+
+
+def test_bags_that_the_catalogue_restored_are_not_looked_up_by_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory, run = recorded(tmp_path)
+    recall = recalling(memory, tmp_path).recall
+    assert recall is not None
+    catalogue = recall.catalogue
+    found = recall.digests_for(run, catalogue.newest()).numbers
+    restored = Segment([*catalogue.known_files(tmp_path).values()])
+    with monkeypatch.context() as patched:
+        patched.setattr(catalogue, "find", None)
+        assert recall.digests_for(restored, catalogue.newest()).numbers == found
+    # Another program digests a bag again.
+    catalogue.forget([BagKey.of(run.bags[0], tmp_path).path])
+    recalling(memory, tmp_path)
+    again = recall.looked_up_again(restored, catalogue.newest())
+    assert again.whole
+    assert again.numbers[run.bags[0].file] == catalogue.newest()
 
 
 def test_a_segment_with_a_bag_without_an_entry_is_not_complete(tmp_path: Path) -> None:

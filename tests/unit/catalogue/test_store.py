@@ -62,6 +62,29 @@ def catalogue_in(folder: Path, base: str = "config", **entries: str) -> Catalogu
     return Catalogue([folder / FOLDER / FILE], DigestConfig(base, entries))
 
 
+def test_a_text_is_stored_until_the_newest_entry_is_deleted(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.store_text("name", "of no entry")
+    assert catalogue.text("name") is None
+    assert catalogue.put(KEY, DIGEST)
+    for each in ("one", "zw\u00f6lf"):
+        catalogue.store_text("name", each)
+        assert catalogue.text("name") == each
+    assert catalogue.text("another") is None
+    catalogue.forget([KEY.path])
+    assert catalogue.text("name") is None
+
+
+def test_an_entry_that_was_replaced_does_not_exist(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    assert catalogue.put(KEY, DIGEST)
+    [before] = catalogue.find([KEY])
+    assert before is not None
+    assert catalogue.existing([before, before + 1]) == {before}
+    assert catalogue.put(KEY, DIGEST)
+    assert catalogue.existing([before]) == set()
+
+
 def made(folder: Path) -> None:
     catalogue = catalogue_in(folder)
     assert catalogue.path is not None
@@ -82,7 +105,7 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     path = str(tmp_path / KEY.path)
     summary, (_, size, mtime_ns, sidecar_ns) = DIGEST.summary, KEY
     content = (summary, summary.start, summary.end)
-    file = BagFile(path, size, mtime_ns, BagState.CLOSED, *content, sidecar_ns)
+    file = BagFile(path, size, mtime_ns, BagState.CLOSED, *content, sidecar_ns, number)
     assert again.known_files(tmp_path) == {path: file}
     for held in DIGEST.topics:
         evidence = again.zone_maps(held.topic, [number])[number]
