@@ -150,7 +150,7 @@ def _was_at(asked: Asked) -> list[Question]:
             lambda found: {
                 "x": replies.number(found[0], "x"),
                 "y": replies.number(found[0], "y"),
-                "room": replies.place(found[0]),
+                "room": replies.places(found[0]),
             },
         ),
         Question(

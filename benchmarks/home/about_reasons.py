@@ -78,7 +78,8 @@ def _blind(asked: Asked) -> list[Question]:
         (silence,) = [
             each
             for each in silences(found)
-            if replies.time(each, "end", "to") > asked.day(asked.last)
+            if each["topic"] == VISION.topic
+            and replies.time(each, "end", "to") > asked.day(asked.last)
         ]
         return {
             "from": replies.time(silence, "start", "from"),

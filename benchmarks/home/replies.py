@@ -98,6 +98,16 @@ def text(found: Row, *names: str) -> str:
     return value
 
 
+def places(found: Row) -> str:
+    """Returns the names of the place that something is in, and of those around it.
+
+    Raises:
+        UnreadableError: the reply names no place.
+    """
+    around = found.get("also_in")
+    return ", ".join([place(found), *map(str, around if isinstance(around, list) else ())])
+
+
 def place(found: Row) -> str:
     """Returns the name of the place that something is in, wherever the reply has it.
 

@@ -21,7 +21,7 @@ from ros2_memory.core.errors import (
     NoDataReason,
 )
 from ros2_memory.core.model import Pose, Sample, TimeWindow
-from ros2_memory.core.regions import place_at
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -236,10 +236,10 @@ def _position_of_body(
         return None
     parent = frame_id or body.parent
     found = frame_history.transform_at(view, parent, body.child, at).transform
-    place = place_at(view.memory.limits.places, parent, *found.translation[:2])
+    places = places_at(view.memory.limits.places, parent, *found.translation[:2])
     view.notes.add(f"by transforms, of {body.child} in {parent}: no topic has the robot's poses")
     note_unread(view, TimeWindow.around(at, TF_CACHE_NS))
-    pose = Pose(found.translation, found.rotation, parent, place)
+    pose = Pose(found.translation, found.rotation, parent, places)
     age = None if now is None else now - at
     topic = next(iter(view.memory.limits.tf_topics))
     return results.Position(topic, at, pose, age, notes=view.notes.sentences())

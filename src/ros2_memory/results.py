@@ -363,9 +363,9 @@ class Event:
     """Something that happened at `start`, and lasted until `end` if it took time.
 
     With `goes_on`, the real end is not known. `before`: what changed before, nearest first.
-    `place`: the named place that the robot was in. `score`: the best one of a thing in view.
-    `skipped`: how much of its time the clock skipped. `point`: where it happened (m), in the frame
-    of the recap, where that is known of the robot itself.
+    `places`: the named places that the robot was in, the smallest first. `score`: the best one of a
+    thing in view. `skipped`: how much of its time the clock skipped. `point`: where it happened
+    (m), in the frame of the recap, where that is known of the robot itself.
     """
 
     kind: str
@@ -374,7 +374,7 @@ class Event:
     text: str
     goes_on: bool = False
     before: tuple[PastChange, ...] = ()
-    place: str | None = None
+    places: tuple[str, ...] = ()
     score: float | None = None
     skipped: Ns = 0
     point: tuple[float, float] | None = None
@@ -570,7 +570,7 @@ class ThingStay:
     end: Ns
     place: Vector3
     count: int
-    inside: str | None = None
+    inside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -597,7 +597,7 @@ class Thing:
             labels of other things.
         place: its last one (m), in `frame_id`; `spread_m` is the root mean square distance of its
             detections there.
-        inside: the named place that it is in.
+        inside: the named places that it is in, the smallest first.
         best, median: of its scores; None without any.
         robot: x, y (m) and yaw (rad) from which it was last seen; None where that is not known.
         moved: its places in order, where there are several.
@@ -611,7 +611,7 @@ class Thing:
     place: Vector3
     spread_m: float
     frame_id: str
-    inside: str | None
+    inside: tuple[str, ...]
     first: Ns
     last: Ns
     count: int
@@ -660,7 +660,7 @@ class MoverSeen:
     at_once: int
     count: int
     place: Vector3
-    inside: str | None
+    inside: tuple[str, ...]
     last: Ns
 
 
@@ -699,7 +699,7 @@ class StandstillPlace(NamedTuple):
     """
 
     place: tuple[float, float]
-    inside: str | None
+    inside: tuple[str, ...]
     seconds: Pair
     since: tuple[Ns | None, Ns | None]
 
@@ -708,7 +708,7 @@ class FarFromOther(NamedTuple):
     """A point of a path (m): its distance from the other, and when the robot was first there."""
 
     place: tuple[float, float]
-    inside: str | None
+    inside: tuple[str, ...]
     away_m: float
     time: Ns
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ros2_memory.core.regions import Circle, Place
+from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.map_digests import MapDigests
@@ -325,9 +325,11 @@ def test_the_body_is_placed_in_the_map_and_in_a_named_place(tmp_path: Path) -> N
         transform(at, "base_link", "arm", (0.0, 9.0, 0.0)),
     )
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [tf(at, *chain)])
-    door = Place("door", "map", Circle(6.0, 0.0, 0.5))
-    found = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 1, limits={"places": (door,)})
-    assert (found["x"], found["frame_id"], found["in"]) == (6.0, "map", "door")
+    hall = Place("hall", "map", Rectangle(0.0, 9.0, -2.0, 2.0))
+    limits = {"places": (hall, Place("door", "map", Circle(6.0, 0.0, 0.5)))}
+    found = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 1, limits=limits)
+    assert (found["x"], found["frame_id"]) == (6.0, "map")
+    assert (found["in"], found["also_in"]) == ("door", ["hall"])
     assert found["yaw_deg"] == pytest.approx(30)
     asked_for = {"timestamp": T0_S + 1, "frame_id": "odom"}
     assert ask(tmp_path, False, "get_position_at", **asked_for)["x"] == 1.0

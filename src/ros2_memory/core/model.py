@@ -196,14 +196,14 @@ class Sample:
 class Pose:
     """Position (m) and orientation in `frame_id`; a zero or NaN quaternion is no orientation.
 
-    `frame_id` is empty where the message names none. `place` is the named place that it is in, if
-    that was asked for.
+    `frame_id` is empty where the message names none. `places` are the named places that it is
+    in, the smallest first, if that was asked for.
     """
 
     position: Vector3
     orientation: Quaternion | None
     frame_id: str = ""
-    place: str | None = None
+    places: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -192,10 +192,10 @@ class Place:
     region: Region
 
 
-def place_at(places: Sequence[Place], frame_id: str, x: float, y: float) -> str | None:
-    """Returns the name of the smallest place of a frame that a point is in; None in none."""
+def places_at(places: Sequence[Place], frame_id: str, x: float, y: float) -> tuple[str, ...]:
+    """Returns the names of the places of a frame that a point is in, the smallest first."""
     inside = [each for each in places if each.frame_id == frame_id and each.region.contains(x, y)]
-    return min(inside, key=lambda each: _area(each.region)).name if inside else None
+    return tuple(each.name for each in sorted(inside, key=lambda each: _area(each.region)))
 
 
 def _area(region: Region) -> float:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.topic_events import has_errors
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import place_at
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
 from ros2_memory.history.driven_path import length_notes, pose_frame
@@ -201,7 +201,7 @@ def _paths_apart(
     for at in stood_at(*stands):
         this, other = (unix_from_ns(each) for each in at.durations)
         if differ(this, other, _LEAST["stood_s"]):
-            inside = place_at(places, frame, at.x, at.y)
+            inside = places_at(places, frame, at.x, at.y)
             stood.append(StandstillPlace((at.x, at.y), inside, Pair(this, other), at.since))
     stood.sort(key=lambda each: -abs((each.seconds.this or 0.0) - (each.seconds.other or 0.0)))
     points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
@@ -213,7 +213,7 @@ def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther |
     """Returns a point with its named place; None where the paths are equal."""
     if point.away_m < _LEAST_APART_M:
         return None
-    inside = place_at(places, frame, point.x, point.y)
+    inside = places_at(places, frame, point.x, point.y)
     return FarFromOther((point.x, point.y), inside, point.away_m, point.time)
 
 

@@ -282,12 +282,12 @@ def _with_way_there(view: View, answer: Recap, window: TimeWindow, there: _There
 
 
 def _in_place(event: Event, places: RobotPlaces) -> Event:
-    """Returns an event of the robot itself with the named place that it was in then."""
+    """Returns an event of the robot itself with the named places that it was in then."""
     if event.kind not in _OF_ROBOT:
         return event
     stood = event.kind == "stop" and event.end is not None
     at = (event.start + (event.end or 0)) // 2 if stood else event.start
-    return replace(event, place=places.place_at(at))
+    return replace(event, places=places.names_at(at))
 
 
 def found_events(

@@ -15,7 +15,7 @@ from ros2_memory.analysis.bag_frames import HOLD_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.regions import place_at
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.history.transforms import connects, edges, transform_at
 
@@ -154,13 +154,13 @@ def _unreachable(frame_id: str, own_frame: str) -> str:
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
-    """Returns a pose with the name of the place that it is in, where places are named."""
+    """Returns a pose with the names of the places that it is in."""
     places = view.memory.limits.places
     for frame in dict.fromkeys(each.frame_id for each in places):
         there = pose_in(view, pose, frame, time, recording)
         if there is None:
             continue
-        name = place_at(places, frame, *there.position[:2])
-        if name is not None:
-            return replace(pose, place=name)
+        names = places_at(places, frame, *there.position[:2])
+        if names:
+            return replace(pose, places=names)
     return pose

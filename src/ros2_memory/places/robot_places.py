@@ -18,7 +18,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.regions import place_at
+from ros2_memory.core.regions import places_at
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
@@ -55,13 +55,13 @@ class RobotPlaces:
             return None
         return _on_track(self._track, time)
 
-    def place_at(self, time: Ns) -> str | None:
-        """Returns the named place that the robot was in; None in none, or if it is not known."""
+    def names_at(self, time: Ns) -> tuple[str, ...]:
+        """Returns the named places that the robot was in, if that is known; the smallest first."""
         places = self.view.memory.limits.places
         if not any(each.frame_id == self.map_frame for each in places):
-            return None
+            return ()
         point = _on_track(self._track, time)
-        return None if point is None else place_at(places, self.map_frame, *point)
+        return () if point is None else places_at(places, self.map_frame, *point)
 
     @cached_property
     def _track(self) -> RobotTrack | None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.core.regions import place_at
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.results import ComparedMover, ComparedThing, ComparedThings, MoverSeen, ThingStay
 from ros2_memory.things.instances import most_at_once
@@ -111,7 +111,7 @@ class ThingsBetween:
             at_once=most_at_once(seen),
             count=int(estimate.counts[rows].sum()),
             place=(x / _MM, y / _MM, z / _MM),
-            inside=place_at(self._places, frame, x / _MM, y / _MM),
+            inside=places_at(self._places, frame, x / _MM, y / _MM),
             last=last,
         )
 
@@ -208,7 +208,7 @@ class ThingsBetween:
             end=int(spots[:, Spot.LAST].max()),
             place=(stay.x / _MM, stay.y / _MM, stay.z / _MM),
             count=int(np.sum(estimate.counts[seen.spots])),
-            inside=place_at(self._places, frame, stay.x / _MM, stay.y / _MM),
+            inside=places_at(self._places, frame, stay.x / _MM, stay.y / _MM),
         )
 
 

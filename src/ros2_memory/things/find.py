@@ -12,7 +12,7 @@ import numpy as np
 
 from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.regions import place_at
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
@@ -175,7 +175,7 @@ class _Finder:
             place=_place(last.x, last.y, last.z),
             spread_m=last.dev_mm / _MM,
             frame_id=frame,
-            inside=place_at(self.places, frame, last.x / _MM, last.y / _MM),
+            inside=places_at(self.places, frame, last.x / _MM, last.y / _MM),
             first=int(spots[:, Spot.FIRST].min()),
             last=int(spots[:, Spot.LAST].max()),
             count=int(self.known.estimate.counts[every].sum()),
@@ -229,7 +229,7 @@ class _Finder:
             place=_place(x, y, z),
             spread_m=dev / _MM,
             frame_id=frame,
-            inside=place_at(self.places, frame, x / _MM, y / _MM),
+            inside=places_at(self.places, frame, x / _MM, y / _MM),
             first=int(spots[:, Spot.FIRST].min()),
             last=int(spots[newest, Spot.LAST]),
             count=int(result.counts[rows].sum()),
@@ -267,7 +267,7 @@ class _Finder:
             end=int(spots[:, Spot.LAST].max()),
             place=_place(last.x, last.y, last.z),
             count=int(self.known.estimate.counts[rows].sum()),
-            inside=place_at(self.places, frame, last.x / _MM, last.y / _MM),
+            inside=places_at(self.places, frame, last.x / _MM, last.y / _MM),
         )
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:

@@ -95,11 +95,16 @@ def rounded(number: float, places: int) -> float | None:
 
 
 def planar_pose(pose: Pose) -> JsonObject:
-    """Returns a position, its yaw, and the named place that it is in."""
+    """Returns a position, its yaw, and the named places that it is in."""
     unit = None if pose.orientation is None else normalised(pose.orientation)
-    place: JsonObject = {} if pose.place is None else {"in": pose.place}
     heading = degrees(None if unit is None else yaw(unit))
-    return {**metres(pose.position), "yaw_deg": heading, **place}
+    return {**metres(pose.position), "yaw_deg": heading, **inside(pose.places)}
+
+
+def inside(places: Sequence[str]) -> JsonObject:
+    """Returns the smallest of the named places that a point is in, and those around it."""
+    reply: JsonObject = {"in": places[0]} if places else {}
+    return {**reply, "also_in": [*places[1:]]} if places[1:] else reply
 
 
 def with_notes(

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.core.text import shortened
-from ros2_memory.tools.reply_json import degrees, moment, render, rounded, seconds, with_notes
+from ros2_memory.tools.reply_json import (
+    degrees,
+    inside,
+    moment,
+    render,
+    rounded,
+    seconds,
+    with_notes,
+)
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
@@ -17,7 +25,8 @@ if TYPE_CHECKING:
 
 _MOST_COMPARED: Final = 5
 _MOST_STAYS: Final = (8, 5, 3, 2)
-_SHORT: Final = ("label", "moves", "at_once", "place", "frame_id", "in", "last_seen", "moved_times")
+_PLACED: Final = ("place", "frame_id", "in", "also_in")
+_SHORT: Final = ("label", "moves", "at_once", *_PLACED, "last_seen", "moved_times")
 _MISSED: Final = "not_seen_where_expected"
 _HOW: Final = "in short form; ask with label or where for their scores, states and moves"
 _LONGEST: Final = 6_000
@@ -78,9 +87,8 @@ def _thing(thing: results.Thing, answer: results.Things, most_stays: int) -> Jso
     reply["spread_m"] = rounded(thing.spread_m, 2)
     if thing.frame_id != answer.frame_id:
         reply["frame_id"] = thing.frame_id
-    if thing.inside is not None:
-        reply["in"] = thing.inside
     reply |= {
+        **inside(thing.inside),
         "first_seen": moment(thing.first),
         "last_seen": moment(thing.last),
         "ago_s": seconds(answer.now - thing.last),
@@ -110,7 +118,7 @@ def _stay(stay: results.ThingStay) -> JsonObject:
         "from": moment(stay.start),
         "to": moment(stay.end),
         "place": {"x": rounded(x, 2), "y": rounded(y, 2)},
-        **({} if stay.inside is None else {"in": stay.inside}),
+        **inside(stay.inside),
         "times": stay.count,
     }
 
@@ -229,10 +237,9 @@ def _at(stay: results.ThingStay) -> JsonObject:
     return _point(stay.place[:2], stay.inside)
 
 
-def _point(place: tuple[float, float], inside: str | None) -> JsonObject:
+def _point(place: tuple[float, float], places: Sequence[str]) -> JsonObject:
     x, y = place
-    named: JsonObject = {} if inside is None else {"in": inside}
-    return {"x": rounded(x, 2), "y": rounded(y, 2), **named}
+    return {"x": rounded(x, 2), "y": rounded(y, 2), **inside(places)}
 
 
 def _pair(pair: results.Pair, places: int) -> JsonObject:

@@ -11,6 +11,7 @@ from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
 from ros2_memory.tools.reply_json import (
     ROBOT_NAME,
     LocalTimes,
+    inside,
     metres,
     moment,
     planar_pose,
@@ -316,8 +317,7 @@ def _event(event: results.Event, now: Ns, local: LocalTimes) -> JsonObject:
     }
     if event.end is not None:
         reply["duration_s"] = seconds(event.end - event.start - event.skipped)
-    if event.place is not None:
-        reply["in"] = event.place
+    reply |= inside(event.places)
     if event.score is not None:
         reply["score"] = rounded(event.score, 4)
     if event.before:

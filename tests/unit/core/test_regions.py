@@ -15,7 +15,7 @@ from ros2_memory.core.regions import (
     Region,
     Steps,
     parts_inside,
-    place_at,
+    places_at,
 )
 
 CIRCLE = Circle(1.0, 2.0, 1.5)
@@ -74,7 +74,7 @@ def test_of_places_within_each_other_the_smallest_is_named() -> None:
         Place("dock", "map", Circle(1, 1, 0.5)),
         Place("yard", "odom", Rectangle(0, 5, 0, 5)),
     )
-    assert place_at(places, "map", 1.2, 1.0) == "dock"
-    assert place_at(places, "map", 3.0, 1.0) == "kitchen"
-    assert place_at(places, "map", 7.0, 1.0) is None
-    assert place_at(places, "odom", 3.0, 1.0) == "yard"
+    assert places_at(places, "map", 1.2, 1.0) == ("dock", "kitchen")
+    assert places_at(places, "map", 3.0, 1.0) == ("kitchen",)
+    assert places_at(places, "map", 7.0, 1.0) == ()
+    assert places_at(places, "odom", 3.0, 1.0) == ("yard",)

@@ -652,17 +652,17 @@ def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
     found = recap(memory, Call(), span)
     own = recap(memory, Call(), span, frame_id="odom")
     assert (found.frame_id, own.frame_id) == ("map", "odom")
-    assert [(each.text, each.place) for each in found.events if each.kind == "stop"] == [
-        ("stood at x 0.00, y 1.00", "room"),
-        ("stood at x 0.00, y 2.00", "room"),
-        ("stood at x 0.00, y 3.00", "corner"),
+    assert [(each.text, each.places) for each in found.events if each.kind == "stop"] == [
+        ("stood at x 0.00, y 1.00", ("room",)),
+        ("stood at x 0.00, y 2.00", ("room",)),
+        ("stood at x 0.00, y 3.00", ("corner", "room")),
     ]
     assert [each.text for each in own.events if each.kind == "stop"] == [
         "stood at x 0.00, y 0.00",
         "stood at x 2.00, y 0.00",
         "stood at x 4.00, y 0.00",
     ]
-    assert [each.place for each in own.events] == [each.place for each in found.events]
+    assert [each.places for each in own.events] == [each.places for each in found.events]
     with pytest.raises(InvalidArgumentsError, match="frame_id"):
         recap(memory, Call(), span, frame_id="moon")
 
@@ -696,14 +696,14 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
     assert there.inside / S == pytest.approx(16, abs=0.2)
     assert there.distance_m == pytest.approx(6, abs=0.1)
     assert (there.stood or 0) / S == pytest.approx(10, abs=0.2)
-    assert [(each.kind, each.text.partition(",")[0], each.place) for each in there.events] == [
-        ("thing", "plant in view", None),
-        ("thing", "cup in view", None),
-        ("error", "error: base: stuck", "room"),
-        ("flip", "/bumper became true", "room"),
-        ("flip", "/bumper became false", "room"),
-        ("stop", "stood at x 4.00", "room"),
-        ("thing", "plant in view", None),
+    assert [(each.kind, each.text.partition(",")[0], each.places) for each in there.events] == [
+        ("thing", "plant in view", ()),
+        ("thing", "cup in view", ()),
+        ("error", "error: base: stuck", ("room",)),
+        ("flip", "/bumper became true", ("room",)),
+        ("flip", "/bumper became false", ("room",)),
+        ("stop", "stood at x 4.00", ("room",)),
+        ("thing", "plant in view", ()),
     ]
     never = recap(memory, Call(), span, where="elsewhere")
     assert (never.visits, never.events, never.distance_m, never.stood) == (0, (), 0, 0)

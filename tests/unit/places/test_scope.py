@@ -94,7 +94,7 @@ def test_matches_count_while_the_robot_is_in_a_place(tmp_path: Path, seed: int) 
     assert len(found.sightings) in {len(there), len(there) - 1}  # some are shorter than a second
     for each in found.sightings:
         assert each.robot is not None
-        assert (each.robot.frame_id, each.robot.place) == ("map", "corner")
+        assert (each.robot.frame_id, each.robot.places) == ("map", ("corner", "room"))
         assert any(
             (visit.arrived or 0) <= each.first and each.last <= (visit.departed or 2**62)
             for visit in there
@@ -124,7 +124,7 @@ def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_anot
     memory = in_places(memory_of(tmp_path))
     at, place = truth.times[150], truth.places[150]
     own = position(memory, Call(), AtTime(at_s=at / S))
-    assert (own.pose.frame_id, own.pose.place) == ("odom", "room")
+    assert (own.pose.frame_id, own.pose.places) == ("odom", ("room",))
     there = position(memory, Call(), AtTime(at_s=at / S), frame_id="map")
     assert there.pose.frame_id == "map"
     assert there.pose.position[:2] == pytest.approx(place, abs=0.05)

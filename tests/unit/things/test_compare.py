@@ -273,7 +273,11 @@ def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
 
 
 def test_a_comparison_is_cut_to_6_kb_however_much_differs() -> None:
-    at, name, pair = BEGIN * S + 565_926_123, "upstairs living room", Pair(100000.12, 34.56)
+    at, name, pair = (
+        BEGIN * S + 565_926_123,
+        ("upstairs living room", "upstairs"),
+        Pair(100000.12, 34.56),
+    )
     stay = ThingStay(at, at, (-112.34, -113.45, 1.0), 1000, name)
     thing = ComparedThing("l" * 99, stay, stay, at, 1000)
     seen = MoverSeen(3, 10_000, (-112.34, -113.45, 1.0), name, at)

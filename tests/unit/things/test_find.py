@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.regions import Place, Rectangle
+from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import (
     Msg,
@@ -106,6 +106,14 @@ def ask(bag_dir: Path, limits: QuerySettings = NAMED, **given: object) -> Any:
     return asked(memory, bag_dir, "find_things", **given)
 
 
+def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    table = Place("table", "map", Circle(3.0, 0.0, 1.0))
+    reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
+    [mug] = reply["things"]
+    assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])
+
+
 def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path) -> None:
     write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     reply = ask(tmp_path, label="coffee mug")
@@ -115,6 +123,7 @@ def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path
     assert (mug["label"], mug["also_seen_as"]) == ("mug", ["Mug"])
     assert mug["place"] == {"x": 3.0, "y": 0.5, "z": 0.7}
     assert mug["in"] == "kitchen"
+    assert "also_in" not in mug
     assert (mug["first_seen"], mug["last_seen"]) == (BEGIN, BEGIN + 19)
     assert mug["count"] == 20
     assert mug["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}

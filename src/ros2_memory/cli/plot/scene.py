@@ -390,5 +390,5 @@ def event_lines(found: Recap | None) -> Iterator[str]:
         at = datetime.fromtimestamp(unix_from_ns(each.start)).astimezone()
         length = unix_from_ns(_until(each) - each.start)
         took = f" ({format_duration(length)})" if length >= 1 else ""
-        where = f", in {each.place}" if each.place else ""
+        where = f", in {each.places[0]}" if each.places else ""
         yield f"{at:%H:%M:%S}  {each.text}{where}{took}"

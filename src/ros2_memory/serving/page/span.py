@@ -431,8 +431,8 @@ def event_shown(event: Event) -> JsonObject:
         shown["goes_on"] = True
     if event.point is not None:
         shown["x"], shown["y"] = (rounded(each, 2) for each in event.point)
-    if event.place is not None:
-        shown["in"] = event.place
+    if event.places:
+        shown["in"] = event.places[0]
     return shown
 
 
@@ -486,8 +486,8 @@ def _thing(thing: Thing) -> JsonObject:
         "last": _s(thing.last),
         "times": thing.count,
     }
-    if thing.inside is not None:
-        shown["in"] = thing.inside
+    if thing.inside:
+        shown["in"] = thing.inside[0]
     if thing.moves:
         shown["moves"] = True
     if thing.best is not None:
