@@ -93,15 +93,20 @@ def note_unread(
 
 
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on messages known to be missing in a window, and one on deleted ones."""
+    """Yields a sentence for each way in which messages of a window are known to be missing."""
     losses = read_losses(bag_dir, window.start, window.stop)
-    for forgotten, what in (
-        (False, "lost before {they} recorded, or never published"),
-        (True, "deleted by request"),
+    for by, what in (
+        (("counter", "rosbag2"), "lost before {they} recorded"),
+        # A publisher that skipped one leaves the same mark as a loss.
+        (
+            ("stamps",),
+            "missing by the cadence of header stamps (never published, or lost)",
+        ),
+        (("forgotten",), "deleted by request"),
     ):
         topics: dict[str, int] = {}
         for loss in losses:
-            if (loss.by == "forgotten") == forgotten and not loss.interrupts:
+            if loss.by in by:
                 topics[loss.topic] = topics.get(loss.topic, 0) + loss.lost
         if topics:
             most = sorted(topics, key=lambda topic: (-topics[topic], topic))

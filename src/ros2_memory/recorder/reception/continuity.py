@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from statistics import median_low
+from statistics import fmean, median_low
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -68,11 +68,15 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Hole:
-    """Messages that are missing between two that are not."""
+    """Messages that are missing between two that are not.
+
+    An open one may still turn out to be a late message: too few follow to tell.
+    """
 
     before: Position
     after: Position
     missing: int
+    is_open: bool = False
 
 
 def reader_of(schema: Schema) -> tuple[Kind, Callable[[bytes], int]] | None:
@@ -100,6 +104,9 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
 
     None where no cadence is to be seen, so that nothing can be expected: few messages, irregular
     ones, or several publishers.
+
+    A message that was stamped late leaves a wide step, too, but then the next ones follow in a
+    burst. So what counts is how far behind the cadence the messages after the step remain.
     """
     if len(positions) < FEWEST:
         return None
@@ -107,18 +114,24 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
         return None
     steps = [(one, other, other.value - one.value) for one, other in pairwise(positions)]
     lengths = [length for _, _, length in steps if length > 0]
-    period = 1 if kind == "counter" else median_low(lengths or [0])
-    allowed = 0.0 if kind == "counter" else _TOLERANCE * period
-    regular = sum(abs(length - period) <= allowed for length in lengths)
-    if period <= 0 or regular < REGULAR * len(steps):
+    usual = 1 if kind == "counter" else median_low(lengths or [0])
+    allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
+    regular = [length for length in lengths if abs(length - usual) <= allowed]
+    if usual <= 0 or len(regular) < REGULAR * len(steps):
         return None
+    period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
     found: list[Hole] = []
-    for one, other, length in steps:
+    for index, (one, other, length) in enumerate(steps):
         missing = round(length / period) - 1
         wide = length > (2 - _TOLERANCE) * period
         short = other.log_time - one.log_time <= LONGEST_NS and missing <= MOST_MISSING
-        if wide and short:
-            found.append(Hole(one, other, missing))
+        if not (wide and short):
+            continue
+        enough = 1 if kind == "counter" else missing + FEWEST
+        later = positions[index + 1 : index + 1 + enough]
+        behind = min(each.value - nth * period for nth, each in enumerate(later, 1)) - one.value
+        if (missing := round(behind / period)) > 0:
+            found.append(Hole(one, other, missing, len(later) < enough))
     return found
 
 

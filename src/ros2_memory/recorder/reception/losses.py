@@ -1,7 +1,8 @@
 """Adds up what is missing in closed splits, across splits and overlapping recordings.
 
 A hole counts once the next split has been measured, and the other recording of a handover up to
-there: until then that one may turn out to have its messages. After a split that does not show
+there: until then that one may turn out to have its messages. One at the end of a split waits for
+the next one, too: the messages there tell it from a late one. After a split that does not show
 what it has of a topic, the topic is followed from the start.
 """
 
@@ -41,6 +42,8 @@ class _Pending:
     hole: Hole
     found_at: int
     """How many splits had been measured before."""
+    missed: int
+    """How many are missing in this recording."""
 
 
 class LossCounter:
@@ -54,7 +57,9 @@ class LossCounter:
         self._reached: dict[str, Ns] = {}
         # The values of the newest splits by topic, ascending.
         self._recent: deque[tuple[str, Mapping[str, array[int]]]] = deque(maxlen=_RECENT)
-        self._last: dict[tuple[str, str], Position] = {}
+        # The end of what was measured, by recording and topic: from the first open hole on, or the
+        # last message.
+        self._ends: dict[tuple[str, str], Sequence[Position]] = {}
         self._pending: list[_Pending] = []
         self._lately: deque[Loss] = deque(maxlen=10_000)
         self.counted: set[str] = set()
@@ -65,9 +70,9 @@ class LossCounter:
 
     def unclear(self, recording: str, topics: Collection[str] | None = None) -> None:
         """Notes that the next split does not show what it has of these topics; None: of any."""
-        self._last = {
-            key: at
-            for key, at in self._last.items()
+        self._ends = {
+            key: end
+            for key, end in self._ends.items()
             if key[0] != recording or (topics is not None and key[1] not in topics)
         }
 
@@ -85,17 +90,12 @@ class LossCounter:
         due = [each for each in self._pending if self._is_settled(each)]
         self._pending = [each for each in self._pending if each not in due]
         for topic, found in split.items():
-            last = self._last.get((recording, topic))
-            positions = found.positions
-            if last is None or last.value < positions[0].value:
-                positions = positions if last is None else [last, *positions]
-                self._last[recording, topic] = positions[-1]
-            new = holes(positions, found.kind)
+            new = self._new_holes(recording, topic, found)
             if new is None:
                 continue
             self.counted.add(topic)
             for hole in new:
-                pending = _Pending(recording, topic, found.kind, hole, self._measured)
+                pending = _Pending(recording, topic, found.kind, hole, self._measured, hole.missing)
                 if all(self._remains(pending, *each) for each in self._recent):
                     known = [*self._pending, *due]
                     pending.hole = replace(
@@ -132,8 +132,45 @@ class LossCounter:
                 found[loss.topic] = found.get(loss.topic, 0) + loss.lost
         return found
 
+    def _new_holes(self, recording: str, topic: str, found: Progress) -> list[Hole] | None:
+        """Returns the holes that the next split of a recording adds; None without a cadence."""
+        end, positions = self._ends.get((recording, topic), ()), found.positions
+        if end and end[-1].value >= positions[0].value:
+            return holes(positions, found.kind)
+        positions = [*end, *positions]
+        self._ends[recording, topic] = positions[-1:]
+        new = holes(positions, found.kind)
+        if new is None:
+            return None
+        still_open = next((hole.before for hole in new if hole.is_open), None)
+        if still_open is not None:
+            self._ends[recording, topic] = positions[positions.index(still_open) :]
+        if not end:
+            return new
+        self._look_again(recording, topic, end[0], new)
+        return [hole for hole in new if hole.before.value >= end[-1].value]
+
+    def _look_again(
+        self, recording: str, topic: str, first: Position, found: Sequence[Hole]
+    ) -> None:
+        """Corrects the open holes of a topic, from a first message on, by what was found since."""
+        now = {hole.before: hole for hole in found}
+        for each in self._pending:
+            if (each.recording, each.topic) != (recording, topic) or not each.hole.is_open:
+                continue
+            if each.hole.before.value < first.value:
+                continue
+            hole = now.get(each.hole.before)
+            missed = 0 if hole is None else hole.missing
+            missing = each.hole.missing + missed - each.missed
+            is_open = hole is not None and hole.is_open
+            each.hole, each.missed = replace(each.hole, missing=missing, is_open=is_open), missed
+        self._pending = [each for each in self._pending if each.hole.missing > 0]
+
     def _is_settled(self, pending: _Pending) -> bool:
-        """Whether no recording that is being measured may still have what is missing."""
+        """Whether nothing more can show that less is missing."""
+        if pending.hole.is_open and self._measured - pending.found_at < _RECENT:
+            return False
         return all(
             self._reached.get(name, 0) >= pending.hole.after.log_time
             for name, heard in self._heard.items()

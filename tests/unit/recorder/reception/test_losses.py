@@ -38,6 +38,57 @@ def test_as_many_are_missing_as_were_taken_out(missing: set[int]) -> None:
     assert sum(hole.missing for hole in found) == len(missing)
 
 
+def stamped(late: dict[int, float], lost: set[int], jitter: list[float]) -> list[Position]:
+    """Returns 400 messages on a cadence; who is late stamps all that were due at once, in order."""
+    found: list[Position] = []
+    earliest = 0.0
+    for tick in range(400):
+        due = tick + jitter[tick % len(jitter)]
+        earliest = max(earliest + 0.002, due + late.get(tick, 0.0))
+        if tick not in lost:
+            at = T0 + round(earliest * PERIOD)
+            found.append(Position(at, at + 1000))
+    return found
+
+
+LENGTH = st.integers(1, 12)
+JITTER = st.lists(st.floats(-0.05, 0.05), min_size=7, max_size=30)
+# Late now and then: a topic that is seldom on time has no cadence.
+LATE = st.dictionaries(st.integers(1, 12).map(lambda n: n * 30), st.floats(0.5, 6.0), max_size=3)
+
+
+@given(late=LATE, jitter=JITTER)
+def test_who_is_late_and_catches_up_at_once_lost_nothing(
+    late: dict[int, float], jitter: list[float]
+) -> None:
+    assert holes(stamped(late, set(), jitter), "stamps") == []
+
+
+@given(late=LATE, jitter=JITTER, first=st.integers(1, 12).map(lambda n: n * 30 + 15), length=LENGTH)
+def test_what_is_lost_is_found_among_late_messages(
+    late: dict[int, float], jitter: list[float], first: int, length: int
+) -> None:
+    lost = {*range(first, first + length)}
+    found = holes(stamped(late, lost, jitter), "stamps")
+    assert found is not None
+    assert sum(hole.missing for hole in found) == length
+
+
+@given(late=st.integers(80, 99), by=st.floats(0.8, 6.0), jitter=JITTER, lost=st.booleans())
+def test_a_late_message_at_the_end_of_a_split_is_told_by_the_next_split(
+    late: int, by: float, jitter: list[float], lost: bool
+) -> None:
+    positions = stamped({late: by}, {97, 98, 99} if lost else set(), jitter)
+    counter = LossCounter()
+    cut = 100 - 3 * lost
+    losses = [
+        loss
+        for part in (positions[:cut], positions[cut:250], positions[250:])
+        for loss in counter.measured("a", {"/odom": Progress("stamps", part)})
+    ]
+    assert sum(loss.lost for loss in [*losses, *counter.flush()]) == 3 * lost
+
+
 def test_nothing_is_expected_of_what_has_no_cadence() -> None:
     irregular = [0, 1, 5, 6, 15, 17, 30, 31, 50, 52, 80, 81]
     assert holes(at(irregular), "stamps") is None
