@@ -33,6 +33,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.coverage import (
     by_remark,
+    deleted_length,
     describe_misdated,
     describe_odd,
     not_covered,
@@ -428,7 +429,10 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         latest=snapshot.dating.latest,
         now=memory.now(now, snapshot.latest),
         bags=len(snapshot.bags),
-        gaps=tuple(results.Gap(*each) for each in recording_gaps(view)),
+        gaps=tuple(
+            results.Gap(start, end, deleted_length(view, TimeWindow(start, end)))
+            for start, end in recording_gaps(view)
+        ),
         incomplete=left_open(snapshot),
         active=snapshot.active,
         damaged=snapshot.damaged,

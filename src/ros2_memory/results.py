@@ -67,10 +67,14 @@ class Undecodable:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A time without a bag; `end` is where data begins again."""
+    """A time without a bag; `end` is where data begins again.
+
+    `deleted` is how much of it was recorded, and deleted by retention since.
+    """
 
     start: Ns
     end: Ns
+    deleted: Ns = 0
 
 
 @dataclass(frozen=True, slots=True)

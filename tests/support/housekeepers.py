@@ -13,7 +13,7 @@ from mcap.writer import Writer
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.layout import LIST_FILE, MOMENT_FILE
+from ros2_memory.bag_dir.layout import DELETED_FILE, LIST_FILE, MOMENT_FILE, OWN_FOLDER
 from ros2_memory.bag_dir.state.own_recordings import OwnRecordings, folders_with_bags
 from ros2_memory.bag_dir.state.request_queue import PendingRequest
 from ros2_memory.core.directories import identity_of
@@ -128,14 +128,19 @@ def recorder_at_work(bag_dir: Path, clock: Clock) -> Iterator[None]:
 
 
 def files_in(bag_dir: Path) -> list[str]:
-    """Every file and directory, relative to the bag directory."""
-    return sorted(path.relative_to(bag_dir).as_posix() for path in bag_dir.rglob("*"))
+    """Every file and directory, relative to the bag directory, but the list of what is gone."""
+    found = {path.relative_to(bag_dir).as_posix() for path in bag_dir.rglob("*")}
+    found.discard(DELETED_FILE)
+    if not any(each.startswith(f"{OWN_FOLDER}/") for each in found):
+        found.discard(OWN_FOLDER)
+    return sorted(found)
 
 
 def size_of(bag_dir: Path) -> int:
-    """The bytes of all files, each inode once."""
+    """The bytes of all files that the budget counts, each inode once."""
+    files = (path for path in bag_dir.rglob("*") if path.is_file())
     sizes = {
-        path.stat().st_ino: path.stat().st_size for path in bag_dir.rglob("*") if path.is_file()
+        path.stat().st_ino: path.stat().st_size for path in files if path != bag_dir / DELETED_FILE
     }
     return sum(sizes.values())
 

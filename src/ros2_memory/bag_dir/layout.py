@@ -24,6 +24,7 @@
       .episodic/screened.json      what `recording.exclude_when` holds back (see `screened_file`)
       .episodic/shipped.jsonl      which bags are in a lake (see `shipped_file`)
       .episodic/forgotten.jsonl    what a lake has to forget (see `forgotten_file`)
+      .episodic/deleted.jsonl      what retention deleted (see `deleted_file`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
@@ -66,6 +67,7 @@ TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
 SCREENED_FILE: Final = f"{OWN_FOLDER}/screened.json"
 SHIPPED_FILE: Final = f"{OWN_FOLDER}/shipped.jsonl"
 FORGOTTEN_FILE: Final = f"{OWN_FOLDER}/forgotten.jsonl"
+DELETED_FILE: Final = f"{OWN_FOLDER}/deleted.jsonl"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""

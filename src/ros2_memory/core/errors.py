@@ -49,6 +49,7 @@ class NoDataReason(StrEnum):
     TOPIC_NOT_RECORDED = "topic_not_recorded"
     OUTSIDE_RANGE = "outside_range"
     GAP = "gap"
+    DELETED = "deleted"
     BETWEEN_MESSAGES = "between_messages"
     NOT_CLOSED_YET = "not_closed_yet"
     UNDECODABLE = "undecodable"

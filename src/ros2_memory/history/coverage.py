@@ -12,6 +12,7 @@ The first few of each kind are named, and the others counted:
   on disk of it answers, from the end of that on;
 - bags that a crash left open, up to the last time that their files were written to;
 - closed bags of which parts could not be read, or that contradict themselves;
+- gaps, and times before the memory begins, of which retention deleted what was recorded;
 - messages that the recorder found to be missing (`bag_dir.state.lost_file`);
 - stretches that `recording.exclude_when` excluded;
 - bags that a wrong clock dated, except where the answer is that there is nothing.
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
+from ros2_memory.bag_dir.state.deleted_file import deleted_spans
 from ros2_memory.bag_dir.state.lost_file import INTERRUPTIONS, read_losses
 from ros2_memory.bag_dir.state.screened_file import excluded_between
 from ros2_memory.core.bag_summary import (
@@ -31,7 +33,7 @@ from ros2_memory.core.bag_summary import (
     READ_WITHOUT_INDEXES,
 )
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import united
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile, SetAside
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.clock_faults import ClockFault
@@ -80,6 +83,7 @@ def note_unread(
     bag_dir = view.memory.index.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
         for sentence in (
+            *describe_deleted(view.snapshot, bag_dir, window),
             *describe_interrupted(view.snapshot, bag_dir, window),
             *describe_lost(bag_dir, window),
             *describe_excluded(bag_dir, window),
@@ -123,14 +127,66 @@ def describe_interrupted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) 
     """
     known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
     found: dict[str, list[str]] = {}
-    for start, end in snapshot.gaps if known else ():
+    gone = deleted_spans(bag_dir) if known else ()
+    gaps = (part for each in snapshot.gaps for part in _unrecorded(snapshot, each, gone))
+    for start, end in gaps if known else ():
         cause = next((each for each in known if each.start < end and start < each.stop), None)
         if cause is not None and window.overlaps(start, end):
-            span = f"{unix_text(start)} to {unix_text(end)} ({unix_from_ns(end - start):.3g} s)"
-            found.setdefault(cause.by, []).append(span)
+            found.setdefault(cause.by, []).append(_span_text(start, end))
     for by, spans in found.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
         yield f"nothing was recorded from {named}, because {INTERRUPTIONS[by]}"
+
+
+def _span_text(start: Ns, end: Ns) -> str:
+    return f"{unix_text(start)} to {unix_text(end)} ({unix_from_ns(end - start):.3g} s)"
+
+
+def _unrecorded(
+    snapshot: Snapshot, gap: tuple[Ns, Ns], gone: Sequence[tuple[Ns, Ns]]
+) -> Sequence[tuple[Ns, Ns]]:
+    """Returns the parts of a gap in which nothing was recorded that was deleted since."""
+    parts = without([gap], gone)
+    if parts == [gap]:
+        return parts
+    # Before the first message that was deleted, and after the last, is as little as between others.
+    return [(start, end) for start, end in parts if end - start > snapshot.shortest_gap]
+
+
+def deleted_between(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Spans:
+    """Returns the parts of a window that were recorded, and that retention deleted since.
+
+    Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
+    """
+    gone = deleted_spans(bag_dir)
+    if not gone:
+        return []
+    found: Spans = []
+    if window.start > MIN_NS and snapshot.earliest is not None:
+        found += [(start, min(stop, snapshot.earliest)) for start, stop in gone]
+    for gap in snapshot.gaps:
+        if window.overlaps(*gap):
+            found += without([gap], _unrecorded(snapshot, gap, gone))
+    first, last = window.asked()
+    return [
+        (max(start, window.start), min(stop, window.stop))
+        for start, stop in found
+        if stop - start > snapshot.shortest_gap and start < last and first < stop
+    ]
+
+
+def deleted_length(view: View, window: TimeWindow) -> Ns:
+    """Returns for how long something was recorded in a window that retention deleted since."""
+    parts = deleted_between(view.snapshot, view.memory.index.bag_dir, window)
+    return sum(stop - start for start, stop in parts)
+
+
+def describe_deleted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence on the parts of a window that retention deleted, if it did."""
+    spans = [_span_text(*each) for each in deleted_between(snapshot, bag_dir, window)]
+    if spans:
+        named = listed(spans[-MAX_NAMED:], len(spans))
+        yield f"recorded, and deleted by retention since: {named}"
 
 
 def was_forgotten(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
@@ -185,13 +241,14 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     """Returns why a search of topics in a window was not complete; empty where it was.
 
     It was where all that closed files hold of the window was read, and nothing of the topics was
-    deleted by request. A file that is being written
+    deleted by request, nor by retention between two bags. A file that is being written
     does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     whole = all(map(_is_whole, view.snapshot.timeline.faulty(window)))
     excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
     forgotten = any(was_forgotten(view.memory.index.bag_dir, each, window) for each in topics)
+    forgotten |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
     if view.notes.complete and whole and not lost and not excluded and not forgotten:
         return ()
     note_unread(view, window, nothing=True)
@@ -385,14 +442,16 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     missing = sum(max(each, 0) for each in (*outside, *gaps))
     whole = end - start
     window = f"between {unix_text(start)} and {unix_text(end)}"
+    asked_for = TimeWindow(start, end)
+    deleted = deleted_between(view.snapshot, memory.index.bag_dir, asked_for)
     if gap_around(view, asked) is not None:
-        view.notes.add(f"nothing was recorded {window}")
+        what = "is here any more of what was recorded" if deleted else "was recorded"
+        view.notes.add(f"nothing {what} {window}")
     elif gaps or max(outside) > _EDGE_NS:
         part = unix_from_ns(max(whole - missing, 0))
         places = 0 if whole >= 100 * NS_PER_S else 1
-        view.notes.add(
-            f"recorded only {part:.{places}f} of {unix_from_ns(whole):.{places}f} s {window}"
-        )
+        what = "here are only" if deleted else "recorded only"
+        view.notes.add(f"{what} {part:.{places}f} of {unix_from_ns(whole):.{places}f} s {window}")
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:

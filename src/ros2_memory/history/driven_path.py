@@ -141,7 +141,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
             "of the steps: distance_m may be too long, because noise cannot be removed"
         )
     if totals.gaps:
-        without = "without a valid pose" if path.invalid else "in which nothing was recorded"
+        without = "without a valid pose" if path.invalid else "without a pose"
         yield (
             f"{counted(totals.gaps, 'gap')} {without}, {totals.gap_m:.2f} m across in straight "
             "lines (gap_m): left out of distance_m"

@@ -23,6 +23,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.context import short_name
 from ros2_memory.history.coverage import (
     being_written,
+    deleted_between,
     gap_around,
     note_unread,
     note_unrecorded,
@@ -375,7 +376,11 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         when = f"after {unix_text(start)}"
     else:
         when = f"between {unix_text(start)} and {unix_text(end)}"
-    detail = [f"nothing was recorded {when}"]
+    deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, asked)
+    what = "is here any more of what was recorded" if deleted else "was recorded"
+    detail = [f"nothing {what} {when}"]
+    if deleted:
+        detail.append("it was deleted by retention")
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
         reason = between(view, asked)
@@ -457,8 +462,10 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
     While one recording takes over from another, the older one may not be on disk as far as the
     newer one begins: what lies between is no gap.
     """
-    written = being_written(view.snapshot, window)
-    return NoDataReason.NOT_CLOSED_YET if written else NoDataReason.GAP
+    if being_written(view.snapshot, window):
+        return NoDataReason.NOT_CLOSED_YET
+    deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, window)
+    return NoDataReason.DELETED if deleted else NoDataReason.GAP
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:

@@ -68,11 +68,16 @@ def pauses_between(bags: Sequence[BagFile]) -> Iterator[Pause]:
 
 def gaps_of(pauses: Iterable[Pause], presences: Mapping[str, Presence]) -> list[tuple[Ns, Ns]]:
     """Returns the pauses that are gaps: those far longer than the most frequent topic's period."""
-    periods = filter(None, map(usual_period, presences.values()))
-    least = _GAP_PERIODS * min(periods, default=0)
+    least = shortest_gap(presences)
     return [
         (each.start, each.end) for each in pauses if each.end - each.start > max(each.least, least)
     ]
+
+
+def shortest_gap(presences: Mapping[str, Presence]) -> Ns:
+    """Returns how long a pause between two recordings may be without being a gap."""
+    periods = filter(None, map(usual_period, presences.values()))
+    return max(SHORTEST_GAP_NS, _GAP_PERIODS * min(periods, default=0))
 
 
 class SuspectedHole(NamedTuple):

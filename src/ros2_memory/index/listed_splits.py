@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
 from ros2_memory.bag_dir.metadata_yaml import bare_name, read_listing
+from ros2_memory.bag_dir.state.deleted_file import read_deleted
 from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
 from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
@@ -23,7 +24,7 @@ from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.index.scan import settled
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from ros2_memory.index.snapshot import Snapshot
 
@@ -89,8 +90,9 @@ _KNOWN: Final[dict[tuple[Path, str], tuple[_Stamp, _Listed]]] = {}
 def absent_splits(snapshot: Snapshot, bag_dir: Path, store: Store | None = None) -> list[Absent]:
     """Returns what is missing of the recordings of a snapshot.
 
-    A recorder of ours deletes the oldest splits of its recordings, whose metadata.yaml still lists
-    them: those before the first split that is left are not missing.
+    A recorder of ours deletes splits of its recordings, whose metadata.yaml still lists them. Those
+    that it noted are not missing, nor are those before the first split that is left: versions
+    before the notes deleted the oldest.
 
     `store` has what earlier processes found in folders that have not changed since.
     """
@@ -103,14 +105,16 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, store: Store | None = None)
         for name, tally in segment.tallies.items():
             bags[name] += tally.bags
             messages[name] += tally.messages
-    absent = []
+    absent, deleted = [], read_deleted(bag_dir)
     for path, listed_there in _listed(snapshot, bag_dir, store):
         if listed_there is None or listed_there.bags is None:
             absent.append(Absent(path, unreadable=True))
             continue
         # Asked only where the first file is missing: it takes longer than all else here.
         is_own = bool(listed_there.first) and _may_be_deleted(own, bag_dir, Path(path))
-        absent.append(_compare(path, listed_there, bags[path], messages[path], is_own=is_own))
+        known = deleted.get(path.removeprefix(f"{bag_dir}/"))
+        gone = frozenset[str]() if known is None else frozenset(known.files)
+        absent.append(_compare(path, listed_there, bags[path], messages[path], gone, is_own=is_own))
     return [each for each in absent if each.files or each.messages or each.unreadable]
 
 
@@ -154,13 +158,19 @@ def _may_be_deleted(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
         return True
 
 
-def _compare(path: str, found: _Listed, bags: int, messages: int, *, is_own: bool) -> Absent:
-    """Compares what is listed with the bags of a folder, which hold `messages` messages."""
-    missing = found.later if is_own else (*found.first, *found.later)
+def _compare(
+    path: str, found: _Listed, bags: int, messages: int, gone: Collection[str], *, is_own: bool
+) -> Absent:
+    """Compares what is listed with the bags of a folder, which hold `messages` messages.
+
+    `gone` are names of files that retention deleted.
+    """
+    every = found.later if is_own else (*found.first, *found.later)
+    missing = [each for each in every if each[0] not in gone]
     lost = sum(count for _, count in missing)
     # A bag that is damaged or cut by a handover holds fewer that count, and is not compared. Nor is
     # the number of all files together, where some were deleted.
-    is_comparable = bags == found.bags and not (found.is_total and is_own)
+    is_comparable = bags == found.bags and not (found.is_total and (is_own or gone))
     if found.messages is not None and is_comparable:
         lost += max(found.messages - messages, 0)
     return Absent(path, tuple(name for name, _ in missing), lost)

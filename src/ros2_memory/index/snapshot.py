@@ -17,7 +17,14 @@ from ros2_memory.analysis.silences import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
-from ros2_memory.index.holes import SHORTEST_GAP_NS, between, gaps_of, pauses_between, rates_of
+from ros2_memory.index.holes import (
+    SHORTEST_GAP_NS,
+    between,
+    gaps_of,
+    pauses_between,
+    rates_of,
+    shortest_gap,
+)
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
@@ -175,6 +182,11 @@ class Snapshot:
             last = max(part.bags, key=lambda bag: bag.end)
             newest = last if newest is None or last.end > newest.end else newest
         return gaps_of(found, self._presences)
+
+    @cached_property
+    def shortest_gap(self) -> Ns:
+        """How long a pause between two recordings may be without being one of `gaps`."""
+        return shortest_gap(self._presences)
 
     @cached_property
     def suspected_holes(self) -> tuple[SuspectedHole, ...]:

@@ -18,7 +18,9 @@ from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import (
+    deleted_length,
     note_edges,
     note_unread,
     note_unrecorded,
@@ -155,7 +157,7 @@ def recap(
     )
     events = [*_stops(drive, places), *_drops(drive), *reported]
     events += [
-        Event("gap", begin, until, "nothing was recorded")
+        Event("gap", begin, until, _why_nothing(view, begin, until))
         for begin, until in recording_gaps(view, TimeWindow(start, end))
     ]
     events += [*_clock_steps(view, window), *_silences(view, window)]
@@ -357,6 +359,14 @@ def _topic_events(
         for each in things.longest(most)
     ]
     return events, things.size, throughout
+
+
+def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
+    deleted = unix_from_ns(deleted_length(view, TimeWindow(begin, until)))
+    if not deleted:
+        return "nothing was recorded"
+    whole = unix_from_ns(until - begin)
+    return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted by retention"
 
 
 def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:

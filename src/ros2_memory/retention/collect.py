@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.layout import other_form
+from ros2_memory.bag_dir.metadata_yaml import bare_name
+from ros2_memory.bag_dir.state.deleted_file import append_deleted, deleted_of
 from ros2_memory.bag_dir.state.shipped_file import ReceiptBook
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
@@ -27,7 +29,9 @@ from ros2_memory.retention.recorded_time import relative_recording
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
+    from ros2_memory.bag_dir.state.deleted_file import Deleted
     from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
@@ -145,6 +149,7 @@ class GarbageCollector:
         self._carried_since: dict[str, float] = {}
         self._reported: set[str] = set()
         self._emptied: set[Path] = set()
+        self._unwritten: list[Deleted] = []
 
     def apply(
         self, known: KnownBags, snapshot: Snapshot, free_bytes_wanted: int | None = None
@@ -249,8 +254,30 @@ class GarbageCollector:
             if each.path in latched and self._is_in_grace(each.path, run):
                 run.remaining.add(each.path)
                 run.waiting.add(each.path)
-            if each.path not in run.remaining:
-                self._delete(each, run)
+        going = [each for each in to_delete if each.path not in run.remaining]
+        self._note(going)
+        for each in going:
+            self._delete(each, run)
+        # Where the disk was full, there is room now.
+        self._note(())
+
+    def _note(self, going: Sequence[StoredBag]) -> None:
+        """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
+        splits: dict[str, list[tuple[str, Ns, Ns]]] = {}
+        for each in going:
+            name = relative_recording(each.recording, self._bag_dir)
+            splits.setdefault(name, []).append((bare_name(each.path), each.start, each.end))
+        self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
+        if not self._unwritten:
+            return
+        try:
+            append_deleted(self._bag_dir, self._unwritten)
+        except OSError as error:
+            if not going:
+                _log.warning("deletions_not_written", reason=error.strerror or str(error))
+                self._unwritten = self._unwritten[-MOST_AT_ONCE:]
+        else:
+            self._unwritten.clear()
 
     def _is_in_grace(self, path: str, run: _Pass) -> bool:
         """Whether queries may still look for latched messages in a bag, though they are carried."""

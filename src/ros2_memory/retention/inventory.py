@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
     CARRY_FILE,
+    DELETED_FILE,
     LOCK_FILE,
     MOMENT_FILE,
     MOMENTS_FOLDER,
@@ -292,7 +293,8 @@ class Inventory:
         for folder in OWN_FOLDERS:
             with suppress(OSError):
                 own += (self._root / folder).iterdir()
-        return sum(map(size_of, own))
+        # Deleting bags makes that list longer.
+        return sum(size_of(each) for each in own if each != self._root / DELETED_FILE)
 
 
 def _file(device: int, stamp: Stamp) -> StoredFile:

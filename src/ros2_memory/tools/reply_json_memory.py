@@ -36,6 +36,7 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
             "start": unix_rounded_up(gap.start),
             "end": unix_rounded_up(gap.end),
             "duration_s": seconds(gap.end - gap.start),
+            **({"deleted_s": seconds(gap.deleted)} if gap.deleted else {}),
             **local.of(gap.start, gap.end),
         }
         for gap in answer.gaps

@@ -41,6 +41,7 @@ def test_the_reasons_for_no_data_are_those_that_a_client_knows() -> None:
         "topic_not_recorded",
         "outside_range",
         "gap",
+        "deleted",
         "between_messages",
         "not_closed_yet",
         "undecodable",

@@ -1,0 +1,177 @@
+"""What retention deleted is known as deleted: it is not missing, nor was it never recorded."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import structlog
+
+from ros2_memory.bag_dir.layout import DELETED_FILE
+from ros2_memory.bag_dir.state import deleted_file
+from ros2_memory.bag_dir.state.deleted_file import (
+    append_deleted,
+    deleted_of,
+    deleted_spans,
+    read_deleted,
+)
+from ros2_memory.bag_dir.state.lost_file import EVERY_TOPIC, Loss, append_losses
+from ros2_memory.index.listed_splits import absent_splits
+from tests.support.clocks import SettableClock
+from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept, recording, size_of
+from tests.support.memories import asked, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0_S = T0 // S
+TRUE = {"topic": "/odom", "condition_type": "above", "value": 1e6, "field": "position.x"}
+
+
+def listed(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Path]:
+    """A recording with the metadata.yaml that rosbag2 writes at its end."""
+    made = recording(bag_dir, name, start, splits)
+    (bag_dir / name / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 9\n"
+        f"  message_count: {10 * splits}\n  relative_file_paths:\n"
+        + "".join(f"    - {path.name}\n" for path in made)
+        + "  files:\n"
+        + "".join(f"    - path: {path.name}\n      message_count: 10\n" for path in made)
+    )
+    return made
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    """Of the recording of a minute, the moment at 10 to 30 s is left; another one follows later."""
+    listed(tmp_path, A, 0)
+    young = listed(tmp_path, B, 100)
+    kept(house_of(tmp_path), tmp_path, 12, 28)
+    split = young[0].stat().st_size
+    house_of(tmp_path, max_bytes=size_of(tmp_path) - 4 * split + split // 2).apply()
+    assert len([*(tmp_path / A).glob("*.mcap")]) == 2
+    return tmp_path
+
+
+def ask(bag_dir: Path, tool: str, **given: object) -> Any:
+    return asked(memory_of(bag_dir, clock=SettableClock(NOW)), bag_dir, tool, **given)
+
+
+def test_splits_that_retention_deleted_around_a_moment_are_not_missing(bag_dir: Path) -> None:
+    memory = memory_of(bag_dir, clock=SettableClock(NOW))
+    assert absent_splits(memory.index.snapshot(), bag_dir) == []
+    assert ask(bag_dir, "memory_status")["trust"] == "nothing is known to be missing"
+    # A file that somebody else deleted is.
+    (bag_dir / B / f"{B}_3.mcap").unlink()
+    assert "lists 1 missing file and 10 messages" in ask(bag_dir, "memory_status")["trust"]
+
+
+def test_a_gap_that_retention_made_is_named_so_by_every_tool(bag_dir: Path) -> None:
+    [gap] = ask(bag_dir, "data_time_range")["gaps"]
+    assert (gap["start"] - T0_S, gap["end"] - T0_S, gap["deleted_s"]) == (29, 100, 30)
+    at = ask(bag_dir, "get_position_at", timestamp=T0_S + 45)
+    assert (at["reason"], "deleted by retention" in at["notes"][0]) == ("deleted", True)
+    window = {"start": T0_S + 32, "end": T0_S + 57}
+    told = ask(bag_dir, "get_topic_in_range", topic="/odom", **window)
+    assert told["reason"] == "deleted"
+    assert "deleted by retention" in str(told)
+    path = ask(bag_dir, "trajectory_summary", start=T0_S + 15, end=T0_S + 120)
+    assert any("deleted by retention" in note for note in path["notes"])
+    events = ask(bag_dir, "recap", start=T0_S + 15, end=T0_S + 120)["events"]
+    told = "nothing is here: 30.0 of 71.0 s were deleted by retention"
+    assert any(told in str(each) for each in events)
+
+
+def test_a_search_across_what_was_deleted_says_so(bag_dir: Path) -> None:
+    told = ask(bag_dir, "find_last_match", **TRUE)
+    assert told["timestamp"] is None
+    assert any("deleted by retention" in note for note in told["notes"])
+    # The memory begins later than what was deleted before, which a search of all leaves out.
+    (bag_dir / "moments").rename(bag_dir / ".moments")
+    shutil.rmtree(bag_dir / A)
+    assert ask(bag_dir, "find_last_match", **TRUE) is None
+    early = ask(bag_dir, "get_topic_in_range", topic="/odom", start=T0_S + 31, end=T0_S + 40)
+    assert (early["reason"], "deleted by retention" in str(early)) == ("outside_range", True)
+
+
+def test_what_was_recorded_and_deleted_did_not_end_with_the_recorder(bag_dir: Path) -> None:
+    died = Loss(EVERY_TOPIC, T0 + 59 * S, T0 + 99 * S, 0, "unclean")
+    append_losses(bag_dir, [died])
+    trust = ask(bag_dir, "memory_status")["trust"]
+    assert trust == (
+        f"nothing was recorded from {T0_S + 59}.000001 to {T0_S + 100}.000000 (41 s), because the "
+        "recorder ended without a shutdown"
+    )
+
+
+def test_a_deletion_is_written_down_before_it_happens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed(tmp_path, A, 0)
+    listed(tmp_path, B, 3 * 3600)
+
+    def crash(*_: object) -> int:
+        assert read_deleted(tmp_path)[A].files[:1] == (f"{A}_0.mcap",)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ros2_memory.retention.collect.remove_bag", crash)
+    with pytest.raises(KeyboardInterrupt):
+        house_of(tmp_path, max_age_h=1).apply()
+    # What was not deleted after all answers as ever.
+    assert ask(tmp_path, "get_position_at", timestamp=T0_S + 45)["x"] == 45
+    assert ask(tmp_path, "get_position_at", timestamp=T0_S + 3000)["reason"] == "gap"
+
+
+def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_there_is_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = listed(tmp_path, A, 0)
+    listed(tmp_path, B, 3 * 3600)
+    house = house_of(tmp_path, max_age_h=1)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
+        patched.setattr(deleted_file, "append_durably", full)
+        house.apply()
+    assert "deletions_not_written" in {each["event"] for each in captured}
+    assert not any(path.exists() for path in old)
+    for path in listed(tmp_path, A, 30):
+        assert path.exists()
+    house.apply()
+    assert deleted_spans(tmp_path) == ((T0, T0 + 89 * S + 1),)
+
+
+def test_the_list_stays_short_however_long_the_robot_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(deleted_file, "_MOST_BYTES", 20_000)
+    (tmp_path / "here").mkdir()
+    append_deleted(tmp_path, [deleted_of("here", [("here_0.mcap", T0 - 50 * S, T0 - 40 * S)])])
+    for n in range(1000):
+        name = f"rec_{n // 60}"
+        at = T0 + n * 10 * S + (500 * S if n >= 700 else 0)
+        append_deleted(tmp_path, [deleted_of(name, [(f"{name}_{n}.mcap", at, at + 9 * S)])])
+    assert (tmp_path / DELETED_FILE).stat().st_size < 21_000
+    assert read_deleted(tmp_path)["here"].files == ("here_0.mcap",)
+    assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [-50, 0, 7500]
+
+
+def test_a_split_in_which_the_clock_was_set_shows_no_time(tmp_path: Path) -> None:
+    splits = [("a_0.mcap", 0, T0), ("a_1.mcap", T0, T0 + 9 * S), ("a_2.mcap", 5, 4)]
+    append_deleted(tmp_path, [deleted_of("a", splits)])
+    assert deleted_spans(tmp_path) == ((T0, T0 + 9 * S + 1),)
+    assert len(read_deleted(tmp_path)["a"].files) == 3
+
+
+@pytest.mark.parametrize("line", ["", "{", "[" * 5000, '{"recording": 1}', '{"recording": "a"'])
+def test_lines_that_mean_nothing_are_ignored(tmp_path: Path, line: str) -> None:
+    append_deleted(tmp_path, [deleted_of("a", [("a_0.mcap", T0, T0 + S)])])
+    with (tmp_path / DELETED_FILE).open("a") as stream:
+        stream.write(line)
+    append_deleted(tmp_path, [deleted_of("b", [("b_0.mcap", T0, T0 + S)])])
+    assert [*read_deleted(tmp_path)] == ["a", "b"]
+    assert json.loads((tmp_path / DELETED_FILE).read_text().splitlines()[0])["recording"] == "a"
