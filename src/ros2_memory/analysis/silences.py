@@ -20,7 +20,9 @@ Presences of parts of a memory add up exactly, in whichever parts it is cut.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from itertools import accumulate
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -131,12 +133,17 @@ def usual_period(presence: Presence) -> Ns | None:
     return period if 2 * presence.messages * period >= presence.length else None
 
 
-def silences(presences: Mapping[str, Presence], together: Iterable[Iterable[str]]) -> list[Silence]:
+def silences(
+    presences: Mapping[str, Presence],
+    together: Iterable[Iterable[str]],
+    gaps: Sequence[Span] = (),
+) -> list[Silence]:
     """Returns the silences of all topics, in order of time.
 
     Args:
         presences: by topic, in the whole memory.
         together: the topics of each bag; of bags with the same topics once is enough.
+        gaps: when nothing was recorded, in order: also pauses of less than `SHORTEST_NS`.
     """
     periods = {
         topic: period
@@ -155,7 +162,7 @@ def silences(presences: Mapping[str, Presence], together: Iterable[Iterable[str]
             on[others] = _heard([presences[each].runs for each in sorted(others)])
         limit = shortest_silence(period)
         runs = _merged(presences[topic].runs, limit)
-        found += _reported([*_silences_of(topic, runs, on[others], limit)], runs)
+        found += _reported([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
     return sorted(found, key=lambda each: (each.start, each.end, each.topic))
 
 
@@ -188,7 +195,7 @@ def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
 
 
 def _silences_of(
-    topic: str, runs: Sequence[Span], on: Sequence[Span], limit: Ns
+    topic: str, runs: Sequence[Span], on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
 ) -> Iterator[Silence]:
     """Yields where a topic is absent for longer than a limit while the robot is on."""
     end = max(runs[-1][1], on[-1][1] if on else runs[-1][1])
@@ -198,6 +205,7 @@ def _silences_of(
         while at < len(on) and on[at][1] <= start:
             at += 1
         pieces: list[Span] = []
+        length = 0
         until, parted = start, False
         for span in on[at:]:
             parted = span[0] - until > LONGEST_OFF_NS
@@ -205,12 +213,20 @@ def _silences_of(
                 break
             until = span[1]
             first, last = max(span[0], start), min(span[1], stop)
-            if last - first > limit:
+            recorded = last - first - _length_in(gaps, first, last)
+            if recorded > limit:
                 pieces.append((first, last))
+                length += recorded
         if pieces:
-            length = sum(last - first for first, last in pieces)
             goes_on = stop == end and not parted
             yield Silence(topic, pieces[0][0], pieces[-1][1], length, goes_on)
+
+
+def _length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
+    """Returns how much of a time lies in gaps."""
+    begin = bisect_right(gaps, first, key=itemgetter(1))
+    end = bisect_left(gaps, last, key=itemgetter(0))
+    return sum(min(last, until) - max(first, start) for start, until in gaps[begin:end])
 
 
 def _reported(found: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:

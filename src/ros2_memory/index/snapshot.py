@@ -138,7 +138,7 @@ class Snapshot:
     def silences(self) -> tuple[Silence, ...]:
         """Where topics with a usual rate were silent, in order of time; see `analysis.silences`."""
         together = frozenset(chain.from_iterable(part.together for part in self._dated))
-        return tuple(silences(self._presences, together))
+        return tuple(silences(self._presences, together, self.gaps))
 
     def shortest_silence(self, topic: str) -> Ns:
         """Returns how long a topic of `silences` must have no message to count as silent."""

@@ -113,7 +113,7 @@ def _doubts(answer: results.Status) -> Iterator[str]:
         yield f"{one.topic} was silent for {seconds(one.length):.0f} s{still}"
     elif topics:
         named = next(iter(topics)) if len(topics) == 1 else counted(len(topics), "topic")
-        yield f"{named} fell silent {len(answer.silences)} times (see fell_silent)"
+        yield f"{named} fell silent {len(answer.silences)} times (see silences)"
     if len(answer.clock_steps) == 1:
         [(_, by)] = answer.clock_steps
         how = f"{seconds(by):.3g} s ahead" if by > 0 else f"back by {seconds(-by):.3g} s or more"

@@ -57,6 +57,21 @@ def test_a_gap_inside_a_silence_does_not_count_and_does_not_part_it() -> None:
     ]
 
 
+def test_a_short_outage_of_the_recorder_is_no_part_of_a_silence() -> None:
+    presences = {
+        ODOM: heard((0, 99 * S), (128 * S, 200 * S)),
+        SEEN: heard((0, 98 * S), (129 * S, 200 * S)),
+    }
+    [silence] = silences(presences, [presences])
+    assert silence.length == 31 * S
+    gap = (99 * S, 128 * S)
+    assert silences(presences, [presences], [gap]) == []
+    # What is silent before and after it is so in all.
+    presences[SEEN] = heard((0, 80 * S), (150 * S, 200 * S))
+    [silence] = silences(presences, [presences], [(0, S), gap, (180 * S, 190 * S)])
+    assert (silence.start, silence.end, silence.length) == (80 * S, 150 * S, 41 * S)
+
+
 def test_a_silence_begins_where_the_robot_is_on_again() -> None:
     odom = heard((0, 2 * HOUR), (5 * HOUR, 9 * HOUR))
     assert found(odom=odom, seen=heard((0, 2 * HOUR - S), (6 * HOUR, 9 * HOUR))) == [
