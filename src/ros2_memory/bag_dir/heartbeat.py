@@ -13,8 +13,9 @@ import json
 import os
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from pydantic import Field, TypeAdapter
 
@@ -23,9 +24,6 @@ from ros2_memory.bag_dir.json_fields import Count, Int64, json_object, validated
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
 HEARTBEAT_FILE: Final = "recorder.json"
 MAX_INTERVAL_S: Final = 3600.0
 """A longer interval is refused: such a heartbeat would count as live for days."""
@@ -33,6 +31,8 @@ MAX_INTERVAL_S: Final = 3600.0
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 _BLOCK_BYTES: Final = 512  # the unit of `st_blocks` on every file system
 _LIVE_INTERVALS: Final = 3
+_ENDED: Final = frozenset("ZX")
+"""States of processes that have ended and were not waited for yet."""
 _MIN_LIVE_NS: Final[Ns] = 15 * NS_PER_S
 
 _Pid: TypeAlias = Annotated[int, Field(strict=True, ge=1, le=MAX_NS)]
@@ -77,6 +77,7 @@ class Heartbeat:
         unshipped: which bags were deleted before they were shipped, where `retention` requires
             that, since the recorder started, as a sentence; else None.
         waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
+        process: what tells the process from another of the same id (see `process_of`).
     """
 
     pid: _Pid
@@ -99,15 +100,60 @@ class Heartbeat:
     held_back: str | None = None
     failing_rules: tuple[str, ...] = ()
     unshipped: str | None = None
+    process: str | None = None
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.
 
         That is within three intervals (at least 15 s) of `updated`, on either side: a heartbeat
-        from the future was written before the clock was set back.
+        from the future was written before the clock was set back. Where its process can be looked
+        up, as on the robot itself, it must not have ended.
         """
         limit = max(ns_from_unix(_LIVE_INTERVALS * self.interval_s), _MIN_LIVE_NS)
-        return abs(now - self.updated) <= limit
+        return abs(now - self.updated) <= limit and not self._has_ended()
+
+    def _has_ended(self) -> bool:
+        system, _, began = (self.process or "").rpartition("/")
+        if not system or system != _system():
+            return False
+        state, since = _state_of(self.pid)
+        if state:
+            return state in _ENDED or since != began
+        try:
+            # Processes of others may be hidden in /proc.
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return True
+        except (OSError, OverflowError):
+            return False
+        return False
+
+
+def process_of(pid: int) -> str | None:
+    """Returns what no other process has: the boot, its namespace of process ids, and its start.
+
+    None where there is no such process, or no /proc.
+    """
+    system, (state, began) = _system(), _state_of(pid)
+    return f"{system}/{began}" if system and state else None
+
+
+@cache
+def _system() -> str:
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot}/{Path('/proc/self/ns/pid').readlink()}"
+    except OSError:
+        return ""
+
+
+def _state_of(pid: int) -> tuple[str, str]:
+    """Returns the state and the start (ticks since boot) of a process; empty if it is not found."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        return fields[0], fields[19]
+    except (OSError, IndexError):
+        return "", ""
 
 
 class HeartbeatReading(NamedTuple):

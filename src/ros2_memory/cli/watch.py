@@ -104,7 +104,7 @@ class Observation:
         if status.recorder is None:
             return "none"
         times = f", restarted {counted(status.restarts, 'time')}" if status.restarts else ""
-        return f"{status.recorder}{times}{'' if status.live else ', no heartbeat'}"
+        return f"{status.recorder}{times}"
 
     @property
     def problems(self) -> list[str]:

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
 _UNHEARD_NS: Final[Ns] = 30 * NS_PER_S
 """As long as a silence lasts at least."""
+DIED: Final = "died"
 MAX_MOMENTS: Final = 5
 """Saved moments in a status; the resource has more."""
 _SILENT_PERIODS: Final = 10
@@ -70,7 +71,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         earliest=snapshot.dating.earliest,
         latest=latest,
         heard=heard,
-        recorder=None if heartbeat is None else str(heartbeat.state),
+        recorder=None if heartbeat is None else state_of(heartbeat, live=live),
         live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
@@ -98,6 +99,12 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
         ),
     )
+
+
+def state_of(heartbeat: Heartbeat, *, live: bool) -> str:
+    """Returns the recorder's state; `died` where it ended without saying so."""
+    is_over = live or heartbeat.state is RecorderState.STOPPED
+    return str(heartbeat.state) if is_over else DIED
 
 
 def _heard(snapshot: Snapshot) -> Ns | None:

@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
@@ -116,6 +116,7 @@ class HeartbeatWriter:
             held_back=self._held_back(),
             failing_rules=self._failing_rules(),
             unshipped=self._unshipped(),
+            process=process_of(os.getpid()),
         )
 
     def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:

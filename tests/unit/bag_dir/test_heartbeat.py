@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from ros2_memory.bag_dir.heartbeat import (
     HEARTBEAT_FILE,
     Heartbeat,
     RecorderState,
+    process_of,
     read_heartbeat,
     write_heartbeat,
 )
@@ -34,6 +37,7 @@ NEWER = frozenset(
         "held_back",
         "unshipped",
         "failing_rules",
+        "process",
     }
 )
 """Keys that older recorders did not write."""
@@ -84,6 +88,22 @@ def test_what_was_written_is_read(
     folder = tmp_path_factory.mktemp("bags")
     write_heartbeat(folder, beat)
     assert read_heartbeat(folder) == (beat, None)
+
+
+def test_a_recorder_that_was_killed_is_not_live_any_more() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        beat = replace(BEAT, pid=process.pid, process=process_of(process.pid))
+        assert beat.process is not None
+        assert beat.is_live(NOW + 10 * S)
+        assert not beat.is_live(NOW + 20 * S)
+        # Another process may have the number by now, or the system was started again.
+        assert not replace(beat, process=f"{beat.process}1").is_live(NOW)
+        assert replace(beat, process=f"0{beat.process}1").is_live(NOW)
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert not beat.is_live(NOW)
+    assert not beat.is_live(NOW)
+    assert process_of(process.pid) is None
 
 
 def test_a_heartbeat_leaves_no_other_file(tmp_path: Path) -> None:

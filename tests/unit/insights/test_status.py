@@ -164,9 +164,7 @@ def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Pa
     assert note.endswith(": 0.000000 to 1.000000")
 
 
-@pytest.mark.parametrize(
-    ("now", "told"), [("wall", ("recording", False)), ("latest", (None, None))]
-)
+@pytest.mark.parametrize(("now", "told"), [("wall", ("died", False)), ("latest", (None, None))])
 def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     now: Literal["wall", "latest"], told: tuple[str | None, bool | None], tmp_path: Path
 ) -> None:

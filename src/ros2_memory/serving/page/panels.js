@@ -143,7 +143,6 @@ function faults(title, kind, range) {
     ...listing(rows)];
 }
 const recorderOf = (status) => (status.recorder === null ? "" : status.recorder
-  + (status.recorder_alive ? "" : ", no heartbeat")
   + (status.restarts ? `, ${counted(status.restarts, "restart")}` : ""));
 
 function showState(host, status, range) {
@@ -153,8 +152,7 @@ function showState(host, status, range) {
     || (own ? "no heartbeat yet" : state.recording ? "not shown for one recording"
       : "none in this deployment");
   const halted = status.latest !== null && status.now === status.latest;
-  const failing = status.recorder !== null && status.recorder !== "stopped"
-    && !status.recorder_alive;
+  const failing = status.recorder === "died";
   const budget = status.budget;
   const list = el("dl", {},
     entry("Recorder", el("span", { class: failing ? "bad" : "" }, recorder)),
