@@ -442,7 +442,8 @@ class SilentTopic:
 class Budget:
     """The bytes of all bags, the limit, and the growth per day; None where not known.
 
-    `foreign`: the bytes of bags that the recorder did not make; they are in none of the others.
+    `used` is what a live recorder counts, its own files (`state`) and sidecars too. `foreign`: the
+    bytes of bags that the recorder did not make; they are in none of the others.
     """
 
     used: int
@@ -450,6 +451,7 @@ class Budget:
     per_day: int | None
     max_age: Ns | None
     foreign: int | None = None
+    state: int = 0
 
 
 @dataclass(frozen=True, slots=True)

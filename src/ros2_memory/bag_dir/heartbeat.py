@@ -77,6 +77,8 @@ class Heartbeat:
         unshipped: which bags were deleted before they were shipped, where `retention` requires
             that, since the recorder started, as a sentence; else None.
         waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
+        counted_bytes: what the budget counts, by the last pass of retention; None before.
+        state_bytes: how much of that is no recording: `.episodic` and logs.
         process: what tells the process from another of the same id (see `process_of`).
     """
 
@@ -101,6 +103,8 @@ class Heartbeat:
     failing_rules: tuple[str, ...] = ()
     unshipped: str | None = None
     process: str | None = None
+    counted_bytes: Count | None = None
+    state_bytes: Count = 0
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.

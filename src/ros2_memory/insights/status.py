@@ -205,7 +205,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
 
 
 def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
-    """Returns what the bags take, how fast that grows, and how much may be kept.
+    """Returns what counts in the budget, how fast that grows, and how much may be kept.
 
     Growth is only predicted while a live recorder records. Where none is configured there is no
     budget either.
@@ -230,9 +230,12 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
                 continue
             grown += bag.size
             since = min(bag.start, latest if since is None else since)
+    state = 0
+    if heartbeat.counted_bytes is not None:
+        used, state = heartbeat.counted_bytes, heartbeat.state_bytes
     span = 0 if latest is None or since is None else latest - since
     per_day = grown * _GROWTH_NS // span if span >= _LEAST_GROWTH_NS else None
-    return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes)
+    return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes, state)
 
 
 def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:

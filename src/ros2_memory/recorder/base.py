@@ -168,6 +168,13 @@ class Housekeeper:
         """Describes the bags that were deleted before they were shipped, as they had to be."""
         return None
 
+    def usage(self) -> tuple[int, int] | None:
+        """Returns the bytes that the budget counts, and those of them that are no recording.
+
+        None before the first pass.
+        """
+        return None
+
     def faults(self) -> Mapping[str, str]:
         """Maps each task that failed in the background, such as `apply`, to the reason."""
         return {}

@@ -32,6 +32,7 @@ class HeartbeatWriter:
         failing_rules: why each rule of `recording.exclude_when` that fails cannot be evaluated.
         unshipped: describes bags that were deleted though they were in no lake and had to be, or
             None.
+        usage: gives what the budget counts, see `Housekeeper`.
         expected: gives the topics that are to be recorded by name.
         reception: knows what was lost.
 
@@ -53,10 +54,12 @@ class HeartbeatWriter:
         held_back: Callable[[], str | None] = lambda: None,
         failing_rules: Callable[[], tuple[str, ...]] = tuple,
         unshipped: Callable[[], str | None] = lambda: None,
+        usage: Callable[[], tuple[int, int] | None] = lambda: None,
     ) -> None:
         self._held_back = held_back
         self._failing_rules = failing_rules
         self._unshipped = unshipped
+        self._usage = usage
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
@@ -95,6 +98,7 @@ class HeartbeatWriter:
         if announced is not None and announced not in names:
             names.append(announced)
         subscribed = frozenset[str]().union(*(each.subscribed for each in sessions.running))
+        usage = self._usage()
         silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
         return Heartbeat(
             pid=os.getpid(),
@@ -117,6 +121,8 @@ class HeartbeatWriter:
             failing_rules=self._failing_rules(),
             unshipped=self._unshipped(),
             process=process_of(os.getpid()),
+            counted_bytes=None if usage is None else usage[0],
+            state_bytes=0 if usage is None else usage[1],
         )
 
     def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
@@ -138,4 +144,4 @@ class HeartbeatWriter:
 
 
 def _without_amounts(heartbeat: Heartbeat) -> Heartbeat:
-    return replace(heartbeat, updated=0, bytes_written=0)
+    return replace(heartbeat, updated=0, bytes_written=0, counted_bytes=None, state_bytes=0)

@@ -55,6 +55,7 @@ REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30
 """A larger file would delay recording by minutes; `ros2-memory recover` repairs it."""
 
+_MB: Final = 10**6
 _MCAP: Final = ".mcap"
 _LAST_STEPS: Final = 2
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -134,12 +135,14 @@ class Housekeeping(Housekeeper):
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
         self._clock = clock
+        self._max_bytes = limits.max_total_bytes
         self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._over_budget = False
         self._out_of_reach = False
         self._collected = Collected()
+        self._usage: tuple[int, int] | None = None
         self._unshipped: tuple[int, Sequence[str]] = (0, ())
 
     def repair(self) -> None:
@@ -280,11 +283,16 @@ class Housekeeping(Housekeeper):
             f"(retention.max_total_gb, min_free_gb): {listed(newest, count)}"
         )
 
+    def usage(self) -> tuple[int, int] | None:
+        """Returns the bytes that the budget counts, and those of them that are no recording."""
+        return self._usage
+
     def _apply(self, free_bytes_wanted: int | None = None) -> None:
         begun = time.perf_counter_ns()
         self._update_moments()
         before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
         self._collected = collected
+        self._usage = collected.total_bytes, collected.state_bytes
         wanted = {} if free_bytes_wanted is None else {"free_bytes_wanted": free_bytes_wanted}
         (_log.info if collected.bags else _log.debug)(
             "retention_applied",
@@ -294,6 +302,7 @@ class Housekeeping(Housekeeper):
             carried=collected.carried,
             failed=collected.failed,
             total_bytes=collected.total_bytes,
+            state_bytes=collected.state_bytes,
             foreign_bytes=collected.foreign_bytes,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
             **wanted,
@@ -438,11 +447,16 @@ class Housekeeping(Housekeeper):
     def _report_over_budget(self, collected: Collected) -> None:
         """Reports once that the budget cannot be kept."""
         if not collected.fits and not self._over_budget:
+            state, saved = collected.state_bytes, collected.saved_bytes
+            others = collected.total_bytes - state - saved
             _log.error(
                 "budget_not_held",
                 total_bytes=collected.total_bytes,
-                reason="the remaining bags may not be deleted: open, damaged or newest ones; "
-                "raise retention.max_total_gb or look for damaged files",
+                state_bytes=state,
+                reason=f"of what may not be deleted, the recorder's and the server's own files "
+                f"(.episodic, .ros_log) take {state / _MB:.3g} MB, saved moments {saved / _MB:.3g} "
+                f"MB, and open, damaged or newest bags {others / _MB:.3g} MB, more than "
+                f"{self._max_bytes / _MB:.3g} MB in all; raise retention.max_total_gb",
             )
         self._over_budget = not collected.fits
 
@@ -528,6 +542,10 @@ class BackgroundHousekeeper(Housekeeper):
     def unshipped(self) -> str | None:
         """Describes the bags that were deleted before they were shipped, as they had to be."""
         return self._housekeeper.unshipped()
+
+    def usage(self) -> tuple[int, int] | None:
+        """Returns the bytes that the budget counts, and those of them that are no recording."""
+        return self._housekeeper.usage()
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""

@@ -111,6 +111,7 @@ class Supervisor:
             held_back=housekeeper.held_back,
             failing_rules=housekeeper.failing_rules,
             unshipped=housekeeper.unshipped,
+            usage=housekeeper.usage,
             expected=expected,
             reception=self._reception,
         )

@@ -56,6 +56,8 @@ class Collected:
         failed: how many bags could not be deleted.
         total_bytes: what the budget counts afterwards.
         foreign_bytes: the size of bags that the recorder did not make and no limit counts.
+        state_bytes: how much of that is no recording: `.episodic` and logs.
+        saved_bytes: how much of it saved moments take.
         fits: whether the limits are kept.
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
@@ -73,6 +75,8 @@ class Collected:
     failed: int = 0
     total_bytes: int = 0
     foreign_bytes: int = 0
+    state_bytes: int = 0
+    saved_bytes: int = 0
     fits: bool = True
     held: int = 0
     needed: int = 0
@@ -179,6 +183,8 @@ class GarbageCollector:
             stock = self._with_clocks(stock, limits, run)
             plan = plan_deletions(stock, limits)
             run.result.foreign_bytes = stock.foreign_bytes
+            run.result.state_bytes = stock.state_bytes
+            run.result.saved_bytes = sum(each.size for each in stock.saved)
             run.result.total_bytes, run.result.fits = plan.total_bytes, plan.fits
             run.result.most_free = plan.most_free
             to_delete = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]

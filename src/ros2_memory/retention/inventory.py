@@ -129,7 +129,7 @@ class Inventory:
             OSError: the list of the recorder's own recordings cannot be read.
         """
         bags: list[StoredBag] = []
-        others = self._own_bytes()
+        others = state_bytes = self._own_bytes()
         occupied: set[str] = set()
         foreign: dict[tuple[int, int], int] = {}
         named = {str(self._root / name) for name in known.named}
@@ -162,7 +162,13 @@ class Inventory:
         others += sum(self._folder(each, known.now).size for each in occupied - emptied)
         saved = self._saved(known)
         return RetentionStock(
-            bags, known.now, sidecars, others, saved=saved, foreign_bytes=sum(foreign.values())
+            bags,
+            known.now,
+            sidecars,
+            others,
+            saved=saved,
+            foreign_bytes=sum(foreign.values()),
+            state_bytes=state_bytes,
         )
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:

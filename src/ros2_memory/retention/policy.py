@@ -123,6 +123,7 @@ class RetentionStock:
             recording that is missing counts as new.
         synchronised: whether the system clock is synchronised.
         foreign_bytes: the size of bags of other programs, which no limit counts.
+        state_bytes: how much of `other_bytes` is no recording: `.episodic` and logs.
         needed: bags that rules may still need; no age deletes them.
         unshipped: bags that must be shipped, and are in no lake; no age deletes them.
     """
@@ -136,6 +137,7 @@ class RetentionStock:
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
     synchronised: bool = False
     foreign_bytes: int = 0
+    state_bytes: int = 0
     needed: frozenset[str] = frozenset()
     unshipped: frozenset[str] = frozenset()
 

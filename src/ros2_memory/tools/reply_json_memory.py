@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _MAX_LISTED: Final = 20
 _MAX_TOPICS: Final = 10
 _S_PER_DAY: Final = 86_400
+_LARGE_PARTS: Final = 10
 _SMALL_BYTES: Final = GB // 10
 """Smaller sizes are given to the kilobyte."""
 
@@ -180,12 +181,14 @@ def _newest_moments(newest: results.MomentList | None) -> JsonObject:
 def _budget(budget: results.Budget) -> JsonObject:
     """Returns gigabytes, and for how many days they last; older bags are deleted then.
 
+    `state_gb` is how much of it is no recording, if that is a large part of what may be kept.
     `foreign_gb` is the size of bags that the recorder did not make; the others exclude it.
     """
     most, per_day = budget.most, budget.per_day
     reply: JsonObject = {
         "used_gb": _gigabytes(budget.used),
         "max_gb": _gigabytes(most),
+        **({"state_gb": _gigabytes(budget.state)} if _is_large(budget) else {}),
         "foreign_gb": _gigabytes(budget.foreign),
         "growth_gb_per_day": _gigabytes(per_day),
     }
@@ -195,6 +198,10 @@ def _budget(budget: results.Budget) -> JsonObject:
         allowed = lasting if budget.max_age is None else seconds(budget.max_age) / _S_PER_DAY
         reply["keeps_days"] = round(min(lasting, allowed), 2)
     return reply
+
+
+def _is_large(budget: results.Budget) -> bool:
+    return budget.most is not None and _LARGE_PARTS * budget.state > budget.most
 
 
 def _gigabytes(size: float | None) -> float | None:

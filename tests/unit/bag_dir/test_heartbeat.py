@@ -38,6 +38,8 @@ NEWER = frozenset(
         "unshipped",
         "failing_rules",
         "process",
+        "counted_bytes",
+        "state_bytes",
     }
 )
 """Keys that older recorders did not write."""

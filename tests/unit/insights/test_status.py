@@ -253,6 +253,18 @@ def test_where_nothing_is_recorded_there_is_no_budget_and_nothing_grows(tmp_path
     assert budget["used_gb"] >= 0
 
 
+def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * S, True) for t in range(60)])
+    kept = RetentionLimits(max_total_bytes=10**6, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=kept))
+    beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=4_900_000, state_bytes=4_700_000)
+    budget = shown(memory, tmp_path)["budget"]
+    assert (budget["used_gb"], budget["state_gb"]) == (0.0049, 0.0047)
+    beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=200_000, state_bytes=50_000)
+    budget = shown(memory, tmp_path)["budget"]
+    assert (budget["used_gb"], "state_gb" in budget) == (0.0002, False)
+
+
 def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [boolean(BEGIN + t, True) for t in range(2)])
     kept = RetentionLimits(max_total_bytes=10**9, max_age_ns=7 * DAY)

@@ -347,6 +347,21 @@ class TestDeletionsThatFail:
         (reported,) = events(captured, "budget_not_held")
         assert reported["total_bytes"] == size_of(tmp_path)
 
+    def test_the_budget_names_what_takes_it_in_the_log_and_to_who_asks(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, "b", 100, splits=1)
+        (tmp_path / ".episodic").mkdir()
+        (tmp_path / ".episodic/catalogue.sqlite-wal").write_bytes(bytes(4_200_000))
+        keeper = keeper_of(tmp_path, max_bytes=1_000_000)
+        assert keeper.usage() is None
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply()
+        (reported,) = events(captured, "budget_not_held")
+        assert "(.episodic, .ros_log) take 4.2 MB, saved moments 0 MB" in reported["reason"]
+        assert keeper.usage() == (size_of(tmp_path), 4_200_000)
+        assert BackgroundHousekeeper(keeper).usage() == keeper.usage()
+
 
 @contextmanager
 def immovable(path: Path) -> Iterator[Path]:

@@ -367,6 +367,8 @@ def describe_budget(budget: dict[str, JsonValue]) -> str:
     """Returns how much of the budget the bags take, and how long it lasts."""
     growth = budget.get("growth_gb_per_day")
     text = f"{_size_text(budget.get('used_gb'))} of {_size_text(budget.get('max_gb'))}"
+    if "state_gb" in budget:
+        text += f", of which .episodic and logs take {_size_text(budget['state_gb'])}"
     if budget.get("foreign_gb"):
         foreign = _size_text(budget["foreign_gb"])
         text += f"; bags that the recorder did not make take {foreign} more"
