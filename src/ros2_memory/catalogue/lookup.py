@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TypeVar, cast
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
 from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Boxes, united
+from ros2_memory.catalogue.codec import decode_zone_map, encode_zone_map
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.model import BagState
 
@@ -113,9 +115,26 @@ class SegmentDigests:
         is_final = self.whole and not self.is_outdated
         return is_final and self.catalogue.is_current(self.as_of)
 
-    def zone_map(self, topic: str) -> ZoneMap:
-        """Returns what can be in any message of the topic in the bags with an entry."""
-        return self._cached(self._zone_map, topic, lambda: united(self.zone_maps(topic).values()))
+    def zone_map(self, topic: str, *, is_settled: bool = False) -> ZoneMap:
+        """Returns what can be in any message of the topic in the bags with an entry.
+
+        It is stored where these bags stay together (`is_settled`): decoding what is stored of each
+        takes half of a process's first search of a week.
+        """
+        return self._cached(self._zone_map, topic, lambda: self._united(topic, stores=is_settled))
+
+    def _united(self, topic: str, *, stores: bool) -> ZoneMap:
+        catalogue, failures = self.catalogue, self.catalogue.failures
+        name, entries = f"zones {topic}", [self._entries_with(topic)]
+        stored = catalogue.joined(name, entries) if entries[0] else None
+        if stored:
+            with suppress(ValueError):  # a damaged file can hold anything
+                return decode_zone_map(stored)
+        found = united(self.zone_maps(topic).values())
+        if stores and self.whole and catalogue.failures == failures and self._cache.stores:
+            # Once another program holds the file, nobody waits for each of a week's segments.
+            self._cache.stores = catalogue.store_joined(name, entries, encode_zone_map(found))
+        return found
 
     def zone_maps(self, topic: str) -> Mapping[int, ZoneMap]:
         """Returns what can be in the messages of the topic, for each entry that has the topic.
@@ -257,6 +276,7 @@ class DigestCache:
 
     Attributes:
         last_zone_maps: those that were asked for last, with their segment and topic.
+        stores: whether what is joined from a segment's zone maps is stored.
     """
 
     def __init__(
@@ -268,6 +288,7 @@ class DigestCache:
     ) -> None:
         self.catalogue = catalogue
         self.bag_dir = bag_dir
+        self.stores = True
         self._most_messages = most_messages
         self._messages = 0
         self.last_zone_maps: tuple[ref[SegmentDigests], str, Mapping[int, ZoneMap]] | None = None

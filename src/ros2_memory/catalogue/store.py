@@ -464,10 +464,11 @@ class Catalogue(CatalogueDatabase):
 
         return self.read(ask, None)
 
-    def store_joined(self, name: str, entries: Sequence[Sequence[int]], joined: bytes) -> None:
+    def store_joined(self, name: str, entries: Sequence[Sequence[int]], joined: bytes) -> bool:
         """Stores a digest joined from many entries, until the oldest of the first is deleted.
 
         Only that it is too much where it takes more than `MOST_JOINED` bytes for each of those.
+        Returns whether the database could be written.
         """
 
         def write(connection: sqlite3.Connection) -> None:
@@ -483,7 +484,7 @@ class Catalogue(CatalogueDatabase):
                     (key, min(row_ids), stored),
                 )
 
-        self.write(write)
+        return self.write(write)
 
     def _key_of_joined(self, name: str, entries: Sequence[Sequence[int]]) -> str | None:
         """Returns the key of a digest joined from entries; None if one of them was deleted.

@@ -489,7 +489,8 @@ class CandidateBags:
         known = {} if digests is None else digests.numbers
         possible: Collection[int] = ()
         if digests is not None and known:
-            possible = possible_entries(digests, topic, self.condition)
+            is_settled = self._view.snapshot.timeline.is_settled(segment)
+            possible = possible_entries(digests, topic, self.condition, is_settled=is_settled)
             if digests.whole and not possible:
                 self.ruled_out = True
                 return
@@ -503,12 +504,14 @@ class CandidateBags:
                 self.ruled_out = True
 
 
-def possible_entries(digests: SegmentDigests, topic: str, condition: Condition) -> Collection[int]:
+def possible_entries(
+    digests: SegmentDigests, topic: str, condition: Condition, *, is_settled: bool = False
+) -> Collection[int]:
     """Returns the numbers of the entries that can contain a match."""
     place = condition.place
     if place is not None:
         return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
-    if not condition.can_match(digests.zone_map(topic)):
+    if not condition.can_match(digests.zone_map(topic, is_settled=is_settled)):
         return ()
     bounds = condition.bounds
     if bounds is not None and condition.field is not None:
