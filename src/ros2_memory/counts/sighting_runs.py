@@ -144,6 +144,8 @@ def known_sightings(
     """
     if len(search.topics) != 1 or not condition.is_on_texts_alone:
         return None
+    if not _can_match(view, search.topics[0], condition, window):
+        return None
     runs = _Runs(view, search, condition, window)
     try:
         total = runs.total() if oldest_first else None
@@ -157,6 +159,19 @@ def known_sightings(
         return KnownSightings(tuple(map(_sighting, found[:limit])), total)
     except _NotKnownError:
         return None
+
+
+def _can_match(view: View, topic: str, condition: Condition, window: TimeWindow) -> bool:
+    """Returns whether some bag of the window may hold a match, by what whole segments can hold."""
+    timeline = view.snapshot.timeline
+    for segment in timeline.segments_in(window):
+        digests = view.bags.digests_of(segment)
+        if digests is None or not digests.whole:
+            return True
+        is_settled = timeline.is_settled(segment)
+        if possible_entries(digests, topic, condition, is_settled=is_settled):
+            return True
+    return False
 
 
 class _Runs:

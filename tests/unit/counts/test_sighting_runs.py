@@ -19,6 +19,7 @@ from ros2_memory.counts.sighting_runs import (
     store_shared_texts,
     topics_with_texts,
 )
+from ros2_memory.history.bag_fold import shares_of
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -28,6 +29,7 @@ from tests.support.examples import examples
 from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
+    from ros2_memory.history.bag_fold import Share
     from ros2_memory.history.context import Memory
     from ros2_memory.results import Sightings
     from tests.support.bags import Msg
@@ -142,6 +144,28 @@ def test_whole_bags_are_counted_without_reading_them(
             oldest_first=True,
         )
         assert (None if found is None else found.total) == total
+
+
+@pytest.mark.parametrize("part", [0.5, 1.0])
+def test_bags_of_which_none_can_hold_a_text_are_not_looked_at_one_by_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: float
+) -> None:
+    draw = Random(0)
+    write(tmp_path, [each for each, _ in seen(draw)], draw)
+    known = recalling(memory_of(tmp_path, limits=LATEST), tmp_path, part=part)
+    view = View(known, Call())
+    condition = parse_condition("contains", "spoon", 0.5)
+    asked_for = []
+
+    def counting(view: View, topic: str, window: TimeWindow) -> list[Share]:
+        asked_for.append(topic)
+        return shares_of(view, topic, window)
+
+    monkeypatch.setattr(sighting_runs, "shares_of", counting)
+    search = ReverseSearch(view, TOPIC, condition)
+    everything = TimeWindow.everything()
+    assert known_sightings(view, search, condition, everything, 1, oldest_first=False) is None
+    assert asked_for == ([] if part == 1.0 else [TOPIC])
 
 
 @pytest.mark.parametrize(
