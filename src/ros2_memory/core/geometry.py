@@ -17,6 +17,8 @@ from ros2_memory.core.model import Quaternion, Transform, Vector3
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Columns: TypeAlias = "tuple[Numbers, Numbers, Numbers]"
 Clock: TypeAlias = "tuple[Sequence[float], Numbers]"
@@ -40,6 +42,12 @@ _TIME_WEIGHT: Final = 0.1**2
 _ARRAY_POINTS: Final = 48
 """From here on arrays are faster than a loop: a path of 2000 vertices that are all kept takes 12 ms
 with both, and 40 ms with arrays alone."""
+
+_FEWEST_BY_LEVELS: Final = 256
+"""Points from which on all intervals of a depth are looked at together."""
+
+_SHORTEST_SQUARED: Final = 1e-300
+"""Chords whose squared length is not greater are points."""
 
 _SAME_M: Final = 1e-6
 
@@ -193,8 +201,83 @@ def simplify_to(
     Raises:
         ValueError: `at_most` is below 2: both ends are always kept.
     """
+    if _FEWEST_BY_LEVELS <= len(points) <= at_most:
+        found = _simplified_by_levels(points, tolerance_m, seconds)
+        if found is not None:
+            return found
     kept, off = simplifying(points, tolerance_m, at_most, seconds)
     return sorted(kept), off[-1]
+
+
+def _simplified_by_levels(
+    points: Sequence[Vector3], tolerance_m: float, seconds: Sequence[float] | None
+) -> tuple[list[int], float] | None:
+    """Does what `simplify_to` does without a limit on count, all intervals of a depth at once.
+
+    That takes a tenth of the time of 4,096 points. None where something is not finite, or the
+    splits stay lopsided.
+    """
+    columns = np.array(points, dtype=np.float64).T.copy()
+    clock = None if seconds is None else np.array(seconds, dtype=np.float64)
+    starts, ends = np.array([0]), np.array([len(points) - 1])
+    kept = [starts, ends]
+    error = 0.0
+    for _ in range(_SCANS_PER_POINT):
+        found = _farthest_of_each(columns, clock, starts, ends)
+        if found is None:
+            return None
+        most, where = found
+        splits = most > tolerance_m * tolerance_m
+        error = max(error, float(most[~splits].max(initial=0.0)))
+        where = where[splits]
+        kept.append(where)
+        starts, ends = np.stack([starts[splits], where], 1), np.stack([where, ends[splits]], 1)
+        inner = ends - starts > 1
+        starts, ends = starts[inner], ends[inner]
+        if not len(starts):
+            return np.sort(np.concatenate(kept)).tolist(), math.sqrt(error)
+    return None
+
+
+def _farthest_of_each(
+    columns: NDArray[np.float64],
+    clock: Numbers | None,
+    starts: NDArray[np.intp],
+    ends: NDArray[np.intp],
+) -> tuple[Numbers, NDArray[np.intp]] | None:
+    """Finds in each interval what `_farthest_in` finds in one; None where it is not finite.
+
+    Intervals are in order and have a point inside.
+    """
+    inside = ends - starts - 1
+    begins = np.cumsum(inside) - inside
+    of = np.repeat(np.arange(len(starts)), inside)
+    at = np.arange(len(of)) - begins[of] + starts[of] + 1
+    with np.errstate(all="ignore"):
+        chords = columns[:, ends] - columns[:, starts]
+        squared = (chords * chords).sum(axis=0)
+        scale = np.where(squared > _SHORTEST_SQUARED, 1 / squared, 0.0)
+        chord, here = chords[:, of], columns[:, at] - columns[:, starts][:, of]
+        along = ((here * chord).sum(axis=0) * scale[of]).clip(0.0, 1.0)
+        off = ((here - along * chord) ** 2).sum(axis=0)
+        if clock is not None:
+            # How far along the points before are, of each interval alone: those of a later
+            # interval are greater by 2 than all before.
+            back = np.maximum.accumulate(along + 2.0 * of) - 2.0 * of - along
+            np.maximum(off, back * back * squared[of] * _BACKWARDS_WEIGHT, out=off)
+            lasted = clock[ends] - clock[starts]
+            rate = np.where(lasted > 0, 1 / lasted, 0.0)[of]
+            on_time = (clock[at] - clock[starts][of]) * rate
+            late = ((here - on_time * chord) ** 2).sum(axis=0) * _TIME_WEIGHT
+            np.maximum(off, np.where(rate > 0, late, 0.0), out=off)
+    if not np.isfinite(off).all():
+        return None
+    most = np.maximum.reduceat(off, begins)
+    farthest = np.flatnonzero(off == most[of])
+    where = np.empty(len(starts), np.intp)
+    # The first of several that are as far: written last.
+    where[of[farthest[::-1]]] = at[farthest[::-1]]
+    return most, where
 
 
 def simplifying(
@@ -331,4 +414,4 @@ def _scale(dx: float, dy: float, dz: float) -> float:
     That is a point, as the chord of a closed loop.
     """
     squared = dx * dx + dy * dy + dz * dz
-    return 1 / squared if squared > 1e-300 else 0.0
+    return 1 / squared if squared > _SHORTEST_SQUARED else 0.0

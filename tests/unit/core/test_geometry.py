@@ -23,6 +23,7 @@ from ros2_memory.core.geometry import (
     rotate,
     rpy,
     simplify_to,
+    simplifying,
     slerp,
     yaw,
 )
@@ -293,6 +294,35 @@ def test_a_limit_that_does_not_bind_changes_nothing(
     kept, error_m = simplify_to(path, tolerance_m, max(len(path), 2))
     assert kept == simplify_to(path, tolerance_m, 10**6)[0]
     assert error_m <= tolerance_m
+
+
+@pytest.mark.parametrize("tolerance_m", [0.0, 0.01, 0.1, 3.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_many_points_are_simplified_as_one_interval_after_the_other_is(
+    seed: int, tolerance_m: float
+) -> None:
+    draw = np.random.default_rng(seed)
+    speed = np.repeat(draw.choice([0.0, 0.0, 0.3, -0.3], 60), 20)[:, None]
+    turn = np.cumsum(np.repeat(draw.normal(0.0, 0.05, 60), 20))
+    steps = speed * np.stack([np.cos(turn), np.sin(turn), 0.1 * np.sin(3 * turn)], 1)
+    path = [(x, y, z) for x, y, z in np.cumsum(steps, axis=0).tolist()]
+    for seconds in (None, np.cumsum(draw.exponential(0.2, len(path))).tolist()):
+        kept, off = simplifying(path, tolerance_m, len(path), seconds)
+        found, error_m = simplify_to(path, tolerance_m, len(path), seconds)
+        assert found == sorted(kept)
+        assert error_m == pytest.approx(off[-1], abs=1e-9)
+
+
+def test_a_spiral_whose_splits_stay_lopsided_is_simplified_in_bounded_time() -> None:
+    path = [(0.99**n, 0.0, float(n % 2) * 0.99**n) for n in range(3000)]
+    kept, error_m = simplify_to(path, 0.0, len(path))
+    assert kept == sorted(set(kept))
+    assert error_m == 0.0
+
+
+def test_points_too_far_off_to_be_squared_are_simplified_all_the_same() -> None:
+    path = [(float(x) * 1e200, 0.0, 0.0) for x in range(300)]
+    assert simplify_to(path, 1.0, len(path))[0][0] == 0
 
 
 def test_a_corner_is_kept_and_a_straight_line_is_not_sampled() -> None:

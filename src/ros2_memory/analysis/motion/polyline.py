@@ -13,7 +13,7 @@ import math
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.geometry import distance, simplifying
+from ros2_memory.core.geometry import distance, simplify_to, simplifying
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -187,17 +187,18 @@ def _fewest(off: Sequence[float], tolerance_m: float) -> int | None:
 def _thinned(
     vertices: list[Vertex], tolerance_m: float, at_most: int
 ) -> tuple[list[Vertex], float]:
-    kept, off = _thinning(vertices, tolerance_m, max(at_most, 2))
-    return [vertices[index] for index in sorted(kept)], off[-1]
+    points = [vertex[1] for vertex in vertices]
+    kept, error = simplify_to(points, tolerance_m, max(at_most, 2), _seconds(vertices))
+    return [vertices[index] for index in kept], error
 
 
 def _thinning(
     vertices: list[Vertex], tolerance_m: float, at_most: int
 ) -> tuple[list[int], list[float]]:
+    points = [vertex[1] for vertex in vertices]
+    return simplifying(points, tolerance_m, at_most, _seconds(vertices))
+
+
+def _seconds(vertices: Sequence[Vertex]) -> list[float]:
     since = vertices[0][0] if vertices else 0
-    return simplifying(
-        [vertex[1] for vertex in vertices],
-        tolerance_m,
-        at_most,
-        [unix_from_ns(vertex[0] - since) for vertex in vertices],
-    )
+    return [unix_from_ns(vertex[0] - since) for vertex in vertices]
