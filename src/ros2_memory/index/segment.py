@@ -14,7 +14,7 @@ import numpy as np
 
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagState
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import bags_with_holes, between, pauses_between
 from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
@@ -213,16 +213,22 @@ class Segment:
         column = _columns(self).of(topic)
         if column is None:
             return {}
-        folders = [_folder_of(self.bags[row]) for row in column.bags.tolist()]
-        if folders.count(folders[0]) == len(folders):
-            return {self.bags[column.bags[0]].recording: self.spans[topic]}
-        spans: dict[str, Span] = {}
-        rows = zip(folders, column.firsts.tolist(), column.lasts.tolist(), strict=True)
-        for folder, first, last in rows:
-            spans[folder] = wider(spans.get(folder), (first, last))
+        recordings, numbers = self._recordings
+        of = numbers[column.bags]
+        firsts, lasts = np.full(len(recordings), MAX_NS), np.full(len(recordings), MIN_NS)
+        np.minimum.at(firsts, of, column.firsts)
+        np.maximum.at(lasts, of, column.lasts)
+        spans = [*zip(firsts.tolist(), lasts.tolist(), strict=True)]
+        return {recordings[number]: spans[number] for number in dict.fromkeys(of.tolist())}
+
+    @cached_property
+    def _recordings(self) -> tuple[list[Path], NDArray[np.uint16]]:
+        """The recordings of the bags, and the number of each bag's among them."""
+        known: dict[str, int] = {}
+        numbers = [known.setdefault(_folder_of(bag), len(known)) for bag in self.bags]
+        first = [numbers.index(number) for number in range(len(known))]
         # A path for each bag of a week would take longer than all else.
-        paths = dict(zip(folders, column.bags.tolist(), strict=True))
-        return {self.bags[paths[folder]].recording: span for folder, span in spans.items()}
+        return [self.bags[row].recording for row in first], np.array(numbers, np.uint16)
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""
