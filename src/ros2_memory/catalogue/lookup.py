@@ -7,10 +7,12 @@ looked up again.
 
 from __future__ import annotations
 
+import json
+import math
 import threading
 from collections import OrderedDict
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
 from weakref import WeakKeyDictionary, ref
 
 import numpy as np
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
+Span: TypeAlias = "tuple[float, float]"
+Codec: TypeAlias = "tuple[Callable[[T], bytes], Callable[[bytes], T]]"
 
 _MOST_MESSAGES: Final = 65_536
 """24 MB: those of a week of 10 s splits that each repeat one, or of a log's nine hours."""
@@ -46,6 +50,14 @@ _UNKNOWN_STATE: Final = -1
 """The state of a catalogue that could not be read."""
 
 
+def _decode_span(packed: bytes) -> Span:
+    low, high = json.loads(packed)
+    return float(low), float(high)
+
+
+_SPAN: Final[Codec[Span]] = (lambda span: json.dumps(span).encode(), _decode_span)
+
+
 class FieldBounds:
     """Between which bounds the numbers of a field are, in each of some entries."""
 
@@ -57,6 +69,13 @@ class FieldBounds:
         order = np.argsort(self._numbers)
         at = order[np.searchsorted(self._numbers, column.numbers, sorter=order)]
         self._low[at], self._high[at] = column.low, column.high
+
+    @property
+    def span(self) -> Span:
+        """The least and the greatest number in all entries; NaN is none."""
+        if not len(self._numbers):
+            return math.inf, -math.inf
+        return float(np.fmin.reduce(self._low)), float(np.fmax.reduce(self._high))
 
     def between(self, least: float, most: float) -> set[int]:
         """Returns the entries that may have a number between two, inclusive."""
@@ -121,19 +140,47 @@ class SegmentDigests:
         It is stored where these bags stay together (`is_settled`): decoding what is stored of each
         takes half of a process's first search of a week.
         """
-        return self._cached(self._zone_map, topic, lambda: self._united(topic, stores=is_settled))
 
-    def _united(self, topic: str, *, stores: bool) -> ZoneMap:
+        def compute() -> ZoneMap:
+            return united(self.zone_maps(topic).values())
+
+        name = f"zones {topic}"
+        codec = encode_zone_map, decode_zone_map
+        return self._cached(
+            self._zone_map,
+            topic,
+            lambda: self._stored(name, topic, compute, codec, stores=is_settled),
+        )
+
+    def field_span(self, topic: str, field: str, *, is_settled: bool = False) -> Span:
+        """Returns the least and the greatest number of a field in all entries with the topic.
+
+        Stored as `zone_map` is.
+        """
+        name = f"span {topic} {field}"
+
+        def compute() -> Span:
+            return self.field_bounds(topic, field).span
+
+        return self.derived(
+            name, lambda: self._stored(name, topic, compute, _SPAN, stores=is_settled)
+        )
+
+    def _stored(
+        self, name: str, topic: str, compute: Callable[[], T], codec: Codec[T], *, stores: bool
+    ) -> T:
+        """Returns what follows from all entries with a topic, computed where it is not stored."""
         catalogue, failures = self.catalogue, self.catalogue.failures
-        name, entries = f"zones {topic}", [self._entries_with(topic)]
+        encode, decode = codec
+        entries = [self._entries_with(topic)]
         stored = catalogue.joined(name, entries) if entries[0] else None
         if stored:
-            with suppress(ValueError):  # a damaged file can hold anything
-                return decode_zone_map(stored)
-        found = united(self.zone_maps(topic).values())
+            with suppress(ValueError, TypeError):  # a damaged file can hold anything
+                return decode(stored)
+        found = compute()
         if stores and self.whole and catalogue.failures == failures and self._cache.stores:
             # Once another program holds the file, nobody waits for each of a week's segments.
-            self._cache.stores = catalogue.store_joined(name, entries, encode_zone_map(found))
+            self._cache.stores = catalogue.store_joined(name, entries, encode(found))
         return found
 
     def zone_maps(self, topic: str) -> Mapping[int, ZoneMap]:

@@ -515,7 +515,11 @@ def possible_entries(
         return ()
     bounds = condition.bounds
     if bounds is not None and condition.field is not None:
-        return digests.field_bounds(topic, field_named(condition.field)).between(*bounds)
+        field, (least, most) = field_named(condition.field), bounds
+        low, high = digests.field_span(topic, field, is_settled=is_settled)
+        if low > most or high < least:
+            return ()
+        return digests.field_bounds(topic, field).between(least, most)
 
     def possible() -> set[int]:
         maps = digests.zone_maps(topic)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
-from ros2_memory.core.model import BagFile
 from ros2_memory.index.file_state import Classification, FileNotes, FileState
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.file_state import ScanContext
     from ros2_memory.storage.base import BagReader
@@ -72,8 +72,7 @@ class UnchangedBags:
                 and schema.topics
                 and not (compressed and other_form(path) in compressed)
             ):
-                taken[path] = BagFile(path, *file[1:])
-                inodes[path] = inode
+                taken[file.file], inodes[file.file] = file, inode
         rest = {path: stamp for path, stamp in stamps.items() if path not in taken}
         stamps.clear()
         stamps.update(rest)
