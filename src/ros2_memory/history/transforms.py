@@ -350,15 +350,20 @@ def _cuts(bags: Sequence[BagSpan], begin: int) -> Iterator[int]:
 
 
 def _once_decoded(view: View, messages: Iterable[StoredMessage]) -> list[StampedTransform]:
-    """Returns the transforms of messages; what has the same bytes is decoded once."""
+    """Returns the transforms of messages but for repetitions; the same bytes are decoded once."""
     decoded: dict[tuple[Schema, str, bytes], tuple[StampedTransform, ...]] = {}
+    latest: dict[str, StampedTransform] = {}
     found: list[StampedTransform] = []
     for message in messages:
         channel = message.record.channel
         key = (channel.schema, channel.encoding, message.record.payload)
         if key not in decoded:
             decoded[key] = _decoded(view, message)
-        found += [replace(each, log_time=message.time) for each in decoded[key]]
+        for each in decoded[key]:
+            child = each.child.lstrip("/")
+            if latest.get(child) is not each:
+                latest[child] = each
+                found.append(replace(each, log_time=message.time))
     return found
 
 
