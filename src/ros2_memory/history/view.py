@@ -24,6 +24,7 @@ from ros2_memory.core.timebase import (
     START_SLACK_NS,
     Ns,
     ns_from_unix,
+    unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.bag_fold import counted_once
@@ -261,6 +262,12 @@ class TimeRange:
     last_s: float | None = None
     around_s: float | None = None
     before_s: float = 10.0
+
+    @classmethod
+    def over(cls, window: TimeWindow) -> TimeRange:
+        """Returns the range that holds what a window holds; it has some length, as recaps want."""
+        start_s = unix_from_ns(window.start)
+        return cls(start_s, max(unix_from_ns(window.stop - 1), start_s + 0.001))
 
 
 def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, Ns | None]:

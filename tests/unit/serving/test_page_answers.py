@@ -20,6 +20,7 @@ from ros2_memory.bag_dir.moment_file import (
     make_moment_folder,
     write_saved_moment,
 )
+from ros2_memory.cli.plot.scene import opened, recap_in
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -123,6 +124,23 @@ def test_a_span_has_its_own_part_of_the_path_up_to_its_ends(memory: Memory) -> N
     assert found["path"]["continues"]
     assert (found["start"], found["end"]) == (BEGIN_S + 2, BEGIN_S + 7)
     assert found["robot"]["x"] == 30.0
+
+
+def test_a_span_asked_for_again_keeps_its_ends_and_what_it_holds(tmp_path: Path) -> None:
+    """Totals are those of `recap` and of pictures: the first pose, inside a millisecond, counts."""
+    at = BEGIN + 700_400
+    poses = [odom(at + n * S // 10, n / 2, 0.0, vx=5.0) for n in range(8)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*poses, detections(at, ["cup"])])
+    memory = memory_of(tmp_path)
+    first = shown(memory, "last=1000")
+    again = shown(memory, f"start={first['start']:.3f}&end={first['end']:.3f}")
+    picture = recap_in(opened(memory, TimeWindow.everything()))
+    assert picture is not None
+    for each in (first, again):
+        assert each["distance_m"] == picture.distance_m == 3.5
+        assert [*each["counts"].items()] == [*picture.counts]
+        assert each["path"]["x"][0] == 0.0
+        assert (each["start"], each["end"]) == (first["start"], first["end"])
 
 
 def test_what_is_new_since_a_look_joins_what_was_shown(memory: Memory) -> None:

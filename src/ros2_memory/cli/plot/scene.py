@@ -108,9 +108,8 @@ class Scene:
 
     @property
     def range(self) -> TimeRange:
-        """The window as queries take it; they want some length."""
-        start, end = self.span
-        return TimeRange(start, max(end, start + 0.001))
+        """The window as queries take it."""
+        return TimeRange.over(self.window)
 
     @property
     def title(self) -> str:

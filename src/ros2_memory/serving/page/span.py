@@ -22,7 +22,15 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Polygon, Rectangle
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    NS_PER_MS,
+    NS_PER_S,
+    START_SLACK_NS,
+    Ns,
+    ns_from_unix,
+    unix_from_ns,
+)
 from ros2_memory.history.no_data import GIVE_TOPIC, resolve_pose_topic
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
@@ -159,7 +167,7 @@ def span_shown(
         bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
         begins = min((each.start for each in bags), default=since)
         fresh = TimeWindow(max(begins, window.start), window.stop)
-    shown |= {"start": _s(window.start), "end": _s(window.stop - 1), "since": _s(fresh.start)}
+    shown |= {"start": _start_s(window), "end": _end_s(window), "since": _start_s(fresh)}
     notes: list[str] = []
     parts: dict[str, Callable[[Call], Shown]] = {
         "path": lambda call: _path(memory, call, fresh, latest),
@@ -226,6 +234,15 @@ def _question(kept: KeptQuestion) -> JsonObject:
 def _s(at: Ns) -> float:
     """Returns Unix seconds to the millisecond: a pixel of the page is more."""
     return round(unix_from_ns(at), 3)
+
+
+def _start_s(window: TimeWindow) -> float:
+    """Returns the begin to the millisecond: asked from there, a span holds all that it did."""
+    return (window.start + START_SLACK_NS) // NS_PER_MS / 1000
+
+
+def _end_s(window: TimeWindow) -> float:
+    return -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
 
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
@@ -409,8 +426,7 @@ def _place(place: Place) -> JsonObject:
 
 
 def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
-    span = TimeRange(_s(window.start), _s(window.stop - 1) + 0.001)
-    found = recap(memory, call, span, most_events=MOST_EVENTS, with_changes=False)
+    found = recap(memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False)
     shown: JsonObject = {
         "events": [event_shown(each) for each in found.events],
         "throughout": [*found.throughout],
@@ -459,8 +475,8 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
         found = find_things(
             memory,
             call,
-            start_s=_s(window.start),
-            end_s=_s(window.stop),
+            start_s=unix_from_ns(window.start),
+            end_s=unix_from_ns(window.stop - 1),
             limit=MOST_THINGS,
         )
     except (NoDataError, InvalidArgumentsError) as error:
