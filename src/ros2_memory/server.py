@@ -27,7 +27,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.serving.listen import CannotListenError, resolved
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from starlette.routing import Route
 
@@ -158,11 +158,12 @@ def _parts_of_one(
 
     backfill = build_backfill(settings, memory)
     server = build_server(settings, memory, telemetry, backfill.progress)
-    page = None
+    page, warm_page = None, None
     if settings.server.transport != "stdio":
-        from ros2_memory.serving.page.routes import page_routes
+        from ros2_memory.serving.page.routes import page_routes, warm_up
 
         page = page_routes(server.dispatcher, backfill.progress)
+        warm_page = partial(warm_up, memory, server.dispatcher)
     return _Parts(
         server,
         Health(memory, package_version(), backfill),
@@ -172,7 +173,7 @@ def _parts_of_one(
             backfill,
             settings.reader.index_refresh_s,
             overrides,
-            has_page=page is not None,
+            warm_page,
         ),
         page,
     )
@@ -256,8 +257,7 @@ async def _in_background(
     backfill: Backfill,
     every_s: float,
     overrides: Sequence[str],
-    *,
-    has_page: bool,
+    warm_page: Callable[[], bool] | None,
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
     import anyio
@@ -266,10 +266,10 @@ async def _in_background(
     from ros2_memory.serving.health import keep_fresh, read_listings
 
     async with anyio.create_task_group() as tasks:
-        if has_page:
+        if warm_page is not None:
             tasks.start_soon(read_listings, memory)
         tasks.start_soon(keep_fresh, memory, every_s)
-        tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s)
+        tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s, warm_page)
 
 
 async def _fleet_in_background(

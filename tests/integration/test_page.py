@@ -541,6 +541,9 @@ def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> 
         assert path["x"][0] == 0
         assert path["x"][-1] == 30
         assert path["begins"] == [0]
+        # Totals follow, as often as a hundredth of the time allows.
+        label = "return document.getElementById('map').getAttribute('aria-label')"
+        chromium.awaits(f"{label}.includes('30.0 m driven')")
 
 
 def test_what_is_answerable_is_shown_by_the_next_poll(chromium: Browser, scratch: Path) -> None:

@@ -361,12 +361,18 @@ def _not_joined(view: View) -> list[TimeWindow]:
     ]
 
 
-async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: float) -> None:
+async def keep_backfilled(
+    backfill: Backfill,
+    helper: Sequence[str],
+    every_s: float,
+    warm_up: Callable[[], bool] | None = None,
+) -> None:
     """Digests closed bags every `every_s` seconds, until it is cancelled.
 
     `helper` is the command line of the program that digests a backlog (`ros2-memory index`).
+    `warm_up` is called once the catalogue is full, until it returns that it is done.
     """
-    filler = Filler(backfill, helper)
+    filler = Filler(backfill, helper, warm_up)
     while True:
         await filler.fill()
         await anyio.sleep(every_s)
@@ -392,9 +398,15 @@ async def keep_all_backfilled(fillers: Sequence[tuple[Memory, Filler]], every_s:
 class Filler:
     """Fills one catalogue, a round at a time; see `keep_backfilled`."""
 
-    def __init__(self, backfill: Backfill, helper: Sequence[str]) -> None:
+    def __init__(
+        self,
+        backfill: Backfill,
+        helper: Sequence[str],
+        warm_up: Callable[[], bool] | None = None,
+    ) -> None:
         self._backfill = backfill
         self._helper = helper
+        self._warm_up = warm_up
         self._pruned_s = -math.inf
         self._is_precomputed = False
 
@@ -421,6 +433,8 @@ class Filler:
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
             await _in_thread(backfill.precompute)
             self._is_precomputed = True
+        if self._warm_up and len(waiting) <= BACKLOG and await _in_thread(self._warm_up):
+            self._warm_up = None
         if due:
             await _in_thread(backfill.prune)
             self._pruned_s = time.monotonic()

@@ -54,6 +54,9 @@ Those that may take long have threads of their own, so that a quick one never wa
 _QUERY_MARGIN_S: Final = 0.5
 """How much before the call its query times out, so that the client receives the query's error."""
 
+_IDLE_S: Final = 1.0
+"""How long nobody must have asked until work in advance begins."""
+_LONGEST_IN_ADVANCE_S: Final = 120.0
 _REPORTED_WAIT_S: Final = 0.5
 _LOGGED_CHARS: Final = 300
 _LONGEST_NAME: Final = 64
@@ -100,6 +103,8 @@ class Dispatcher:
         self.quick = FairQueue("quick", QUICK_AT_ONCE)
         self.blocking = FairQueue("blocking", BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
+        self._begun = self._ended = 0  # calls and looks
+        self._ended_s = -math.inf
 
     def stop(self) -> None:
         """Makes running queries time out, and begins no others, so that the program can end."""
@@ -131,6 +136,7 @@ class Dispatcher:
         over = threading.Event()
         call = self._call(over)
         call.robots = robots
+        self._begun += 1
         outcome, text = "cancelled", ""
         correlation_id = uuid.uuid4().hex[:12]
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
@@ -144,7 +150,7 @@ class Dispatcher:
                     outcome, reply = self._internal()
                 text = reply.text
             finally:
-                over.set()
+                self._end(over)
                 done = Answered(
                     name if name in tools else UNKNOWN_TOOL,
                     outcome,
@@ -168,6 +174,7 @@ class Dispatcher:
         """
         over = threading.Event()
         call, wait = self._call(over), _Wait()
+        self._begun += 1
 
         def made() -> tuple[str, Reply]:
             return self._asked(lambda: Reply(to_json_text(work(self._memory, call))), wait)
@@ -180,7 +187,27 @@ class Dispatcher:
             except EpisodicError as error:
                 return self._replies.error(error)
             finally:
-                over.set()
+                self._end(over)
+
+    def idle_call(self) -> Call | None:
+        """Returns a call for work in advance, which times out as soon as anybody asks.
+
+        None where somebody does, or did lately. May be called from any thread.
+        """
+        begun = self._begun
+        if begun != self._ended or time.monotonic() - self._ended_s < _IDLE_S:
+            return None
+
+        def monotonic() -> float:
+            return math.inf if self._stopping.is_set() or self._begun != begun else time.monotonic()
+
+        return Call(Deadline.after(_LONGEST_IN_ADVANCE_S, monotonic))
+
+    def _end(self, over: threading.Event) -> None:
+        """Ends a call or a look, and what its query may still do."""
+        over.set()
+        self._ended += 1
+        self._ended_s = time.monotonic()
 
     def _call(self, over: threading.Event) -> Call:
         """Returns a call whose query ends a little before the time of a call does."""

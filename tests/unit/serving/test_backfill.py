@@ -301,6 +301,29 @@ async def test_in_the_background_what_closes_is_digested(tmp_path: Path) -> None
             tasks.cancel_scope.cancel()
 
 
+async def test_a_warm_up_begins_with_a_full_catalogue_and_ends_when_it_is_done(
+    tmp_path: Path,
+) -> None:
+    bag(tmp_path, 0)
+    backfill = backfill_of(recalling(tmp_path), tmp_path)
+    begun: list[int] = []
+
+    def warm_up() -> bool:
+        begun.append(backfill.progress().waiting)
+        return len(begun) == 2
+
+    with anyio.fail_after(30):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_backfilled, backfill, ["/no/such/program"], 0.001, warm_up)
+            while len(begun) < 2:
+                await anyio.lowlevel.checkpoint()
+            bag(tmp_path, 1)
+            while backfill.progress() != Progress(2, 0, 0):
+                await anyio.lowlevel.checkpoint()
+            tasks.cancel_scope.cancel()
+    assert begun == [0, 0]
+
+
 @pytest.mark.parametrize("helper", [["/no/such/program"], [sys.executable, "-c", "exit(3)"]])
 async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
     tmp_path: Path, helper: list[str]

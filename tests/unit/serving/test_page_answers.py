@@ -20,6 +20,8 @@ from ros2_memory.bag_dir.moment_file import (
     make_moment_folder,
     write_saved_moment,
 )
+from ros2_memory.catalogue.lookup import DigestCache
+from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.cli.plot.scene import opened, recap_in
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -32,7 +34,7 @@ from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.page import span
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
-from ros2_memory.serving.page.routes import moment_request, page_routes, span_request
+from ros2_memory.serving.page.routes import moment_request, page_routes, span_request, warm_up
 from ros2_memory.serving.page.span import (
     MOST_POINTS,
     cut,
@@ -156,6 +158,18 @@ def test_what_is_new_since_a_look_joins_what_was_shown(memory: Memory) -> None:
     assert more["path"]["continues"]
     later = [each for each in whole["path"]["t"] if each > since]
     assert more["path"]["t"][1:] == later
+    assert more["events_since"] == since
+    assert "whole_ms" not in more
+
+
+def test_totals_and_events_of_the_whole_span_come_with_things(memory: Memory) -> None:
+    """A page that stays open would else show the length of path of its first look for ever."""
+    whole = shown(memory, "last=1000")
+    more = shown(memory, f"last=1000&since={BEGIN_S + 25}&status=0")
+    assert more["events_since"] == more["start"] < more["since"] == BEGIN_S + 20
+    for key in ("distance_m", "counts", "max_speed", "stood_s", "events"):
+        assert more[key] == whole[key]
+    assert more["whole_ms"] >= 0
 
 
 def test_nothing_is_looked_up_where_nothing_is_new(memory: Memory) -> None:
@@ -451,6 +465,34 @@ def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None
 
     assert sorted(labels(memory)) == ["of robin", "of wren"]
     assert labels(Recordings().alone(memory, "wren")) == ["of wren"]
+
+
+def test_a_look_after_a_warm_up_reads_nothing_that_is_stored(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = recalling(memory_of(bag_dir), bag_dir)
+    dispatcher = Dispatcher(memory, [], Replies(bag_dir, 9_000), call_timeout_s=5)
+    expected = shown(memory, "last=1000")
+    assert memory.recall is not None
+    fresh = replace(memory, recall=DigestCache(memory.recall.catalogue, bag_dir))
+    assert warm_up(fresh, dispatcher)
+    for name in ("maps", "sights", "standstills", "poses", "topic_events"):
+        monkeypatch.setattr(Catalogue, name, lambda *_given, **_more: pytest.fail("was read"))
+    found = shown(fresh, "last=1000")
+    for key in ("path", "events", "things", "distance_m"):
+        assert found[key] == expected[key]
+
+
+async def test_a_warm_up_gives_way_to_a_question_and_goes_on_later(memory: Memory) -> None:
+    dispatcher = Dispatcher(memory, [], Replies(memory.index.bag_dir, 9_000), call_timeout_s=5)
+    call = dispatcher.idle_call()
+    assert call is not None
+    assert not call.deadline.expired()
+    await dispatcher.look(lambda _memory, _call: {})
+    assert call.deadline.expired()
+    # Somebody who asked may ask again at once.
+    assert dispatcher.idle_call() is None
+    assert not warm_up(memory, dispatcher)
 
 
 async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes_is_refused(

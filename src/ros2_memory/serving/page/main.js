@@ -6,7 +6,7 @@ const REST_MS = 200;
 const OVERLAP_S = 15;  // of the newest events, some go on
 const STATUS_MS = 60000;
 const LIVE_S = 600;  // a bag may be readable only when it is closed
-const MOST_DUTY = 100;  // things are looked up in at most a hundredth of the time
+const MOST_DUTY = 100;  // what is of the whole span is looked up in at most a hundredth of the time
 
 const state = {
   view: null,
@@ -18,7 +18,8 @@ const state = {
 };
 let asking = null;  // cancels the running look
 let isLooking = false;
-let thingsAt = 0;
+let wholeAt = 0;
+let isWholeOwed = false;
 let statusAt = 0;
 let pause = FILLING_MS;
 let lookedAt = 0;
@@ -83,12 +84,13 @@ async function look(isMore = false, isPatient = false) {
   if (isPatient) given.set("patient", "1");
   if (isMore) {
     const isOld = Date.now() - statusAt > STATUS_MS;
-    given.set("version", isOld ? "" : view.version);
+    const isDue = Date.now() - wholeAt >= MOST_DUTY * (view.whole_ms || 0);
+    given.set("version", isOld || (isDue && isWholeOwed) ? "" : view.version);
     if (!isOld) given.set("status", "0");
     const since = Math.max(Math.min(view.end, view.range.latest) - OVERLAP_S, view.start);
     given.set("since", view.owed === null ? since : Math.min(since, view.owed));
     if (view.owed !== null) given.set("patient", "1");
-    if (Date.now() - thingsAt < MOST_DUTY * (view.things_ms || 0)) given.set("things", "0");
+    if (!isDue) given.set("things", "0");
   }
   isLooking = true;
   at("summary").setAttribute("aria-busy", "true");
@@ -103,7 +105,8 @@ async function look(isMore = false, isPatient = false) {
       return;
     }
     lookedAt = Date.now();
-    if (reply.things) thingsAt = lookedAt;
+    isWholeOwed = reply.whole_ms === undefined;
+    if (!isWholeOwed) wholeAt = lookedAt;
     if (reply.status) statusAt = lookedAt;
     if (reply.recordings && !reply.mixed.length) reply.paths = [];
     if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
@@ -131,7 +134,7 @@ async function look(isMore = false, isPatient = false) {
 }
 /* What was in view all the time is no event: the timeline has it wherever something was recorded. */
 function always(reply, range) {
-  const from = Math.max(reply.since, range.earliest);
+  const from = Math.max(reply.events_since, range.earliest);
   const to = Math.min(reply.end, reply.latest);
   const gaps = range.gaps.filter(([start, end]) => end > from && start < to);
   const begins = [from, ...gaps.map(([, end]) => end)];
@@ -164,6 +167,7 @@ function continued(view, reply) {
         .map((each) => each - from),
       ...path.begins.slice(isNew ? 0 : 1).map((each) => each + older - from)])] };
   }
+  if (reply.events && reply.events_since <= reply.start) return next;
   const kept = view.events.filter((each) => each.t < since
     && (each.end === undefined ? each.t : each.end) >= reply.start);
   const more = (reply.events || []).filter((each) => {

@@ -173,8 +173,9 @@ function showState(host, status, range) {
     list.append(entry(`Rule ${each.rule}`, `fired ${counted(each.fired, "time")}${last}; `
       + counted(each.moments, "moment") + (each.refused ? `, ${each.refused} refused` : "")));
   }
-  const parts = [el("p", { class: sound ? "good" : "warn" },
-    (sound ? "\u2713 " : "! ") + status.trust), list];
+  // The files are listed below.
+  const trust = status.trust.replace(/; data_time_range (lists them|says why)/g, "");
+  const parts = [el("p", { class: sound ? "good" : "warn" }, (sound ? "\u2713 " : "! ") + trust), list];
   for (const each of status.fell_silent) {
     parts.push(el("p", { class: "warn" }, "! ", bdi(each.topic), ` fell silent ${ago(each.ago_s)}`));
   }

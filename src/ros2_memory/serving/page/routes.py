@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Final
 from starlette.responses import Response
 from starlette.routing import Route
 
-from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.serving.call_size import excess_in_json
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.reply_size import JsonObject
 
+log = get_logger(__name__)
+
 SPAN_PATH: Final = "/page/span"
 MOMENT_PATH: Final = "/page/moment"
 
@@ -43,6 +46,8 @@ _HEADERS: Final = {
     "x-content-type-options": "nosniff",
     "cross-origin-resource-policy": "same-origin",
 }
+_WEEK_S: Final = 7 * 86_400.0
+_MOST_TRIES: Final = 5
 _LONGEST_LABEL: Final = 200
 _LONGEST_NAME: Final = 1000
 _LONGEST_ARGUMENTS: Final = 10_000
@@ -90,6 +95,31 @@ def page_routes(
         return Route(path, answer, methods=["GET"])
 
     return [route(SPAN_PATH, span), route(MOMENT_PATH, moment)]
+
+
+def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
+    """Looks at the newest week while nobody asks, so that the first look of a page is a second one.
+
+    Returns whether that is done. What was joined until somebody asked stays, so that the next time
+    goes on from there.
+    """
+    call = dispatcher.idle_call()
+    if call is None:
+        return False
+    request = SpanRequest(last_s=_WEEK_S, patient=True)
+    try:
+        Recordings().shown(memory, memory, call)
+        for _ in range(_MOST_TRIES):
+            shown = span_shown(memory, call, request)
+            if shown["latest"] is None or shown.keys() >= {"path", "events", "things"}:
+                return True
+            if call.deadline.expired():
+                return False
+    except QueryTimeoutError:
+        return False
+    except Exception:
+        log.exception("page_not_warmed_up")
+    return True
 
 
 def span_request(given: QueryParams) -> SpanRequest:

@@ -70,6 +70,10 @@ _QUICK_S: Final = 0.8
 _PART_S: Final = 8.0
 """How long each part of an answer may take; of a patient one the latter. The page shows what there
 is, and asks again for the rest."""
+_OF_WHOLE: Final = ("events", "things")
+"""Parts that are of the whole span; `whole_ms` is how long they took, so that a live page knows how
+often it may ask for them."""
+_WHERE_LISTED: Final = "; list_recorded_topics lists all"
 _CELLS_ACROSS: Final = 400
 _MOST_CELLS: Final = 8_000
 _NEWEST_BAGS: Final = 3
@@ -91,10 +95,10 @@ class SpanRequest:
         start_s: Unix seconds of the begin of the span; with `end_s`, else the last `last_s`.
         end_s: of its end.
         last_s: seconds before the newest data.
-        since_s: only what is newer is returned of the path and the events, and of the bag that it
-            is in.
+        since_s: only what is newer is returned of the path and the signals, and of the bag that it
+            is in; without `things` also of the events.
         version: of the answer that the page has; nothing is looked up where it is current.
-        things: whether things are looked up.
+        things: whether things, events and totals of the whole span are looked up.
         status: whether the state of the memory is; without it only how far it reaches.
         patient: whether the answer may take long; else what takes long is left out.
         signals: numbers to be plotted.
@@ -160,37 +164,49 @@ def span_shown(
     if earliest is None or latest is None:
         return shown
     window = request.window(earliest, latest)
-    fresh = window
-    if request.since_s is not None:
-        since = min(max(ns_from_unix(request.since_s), window.start), window.stop - 1)
-        # From the begin of a bag: digests answer for whole bags, and others are read.
-        bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
-        begins = min((each.start for each in bags), default=since)
-        fresh = TimeWindow(max(begins, window.start), window.stop)
+    fresh = _fresh(snapshot, window, request.since_s)
     shown |= {"start": _start_s(window), "end": _end_s(window), "since": _start_s(fresh)}
     notes: list[str] = []
     parts: dict[str, Callable[[Call], Shown]] = {
         "path": lambda call: _path(memory, call, fresh, latest),
-        "events": lambda call: _events(memory, call, fresh),
+        "events": lambda call: _events(memory, call, window if request.things else fresh),
         "things": lambda call: _things(memory, call, window),
         "moments": lambda call: _moments(memory, call),
     }
     if not request.things:
         del parts["things"]
     budget_s = _PART_S if request.patient else _QUICK_S
+    whole_s = 0.0
     for name, part in parts.items():
+        begun = time.perf_counter()
         try:
             found = part(replace(call, deadline=call.deadline.within(budget_s)))
         except QueryTimeoutError as error:
             found = Shown({}, (f"the {name} are not known yet: {error}",))
         shown |= found.part
         notes += found.notes
+        whole_s += time.perf_counter() - begun if name in _OF_WHOLE else 0.0
+    if request.things:
+        shown["whole_ms"] = round(whole_s * 1000)
     if request.signals:
         shown["signals"] = [
             signal_in(memory, call, each, fresh, window) for each in request.signals
         ]
     shown["notes"] = [*dict.fromkeys(notes)]
     return shown
+
+
+def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
+    """Returns the part of a window that is newer than a time, from the begin of a bag.
+
+    Digests answer for whole bags, and others are read.
+    """
+    if since_s is None:
+        return window
+    since = min(max(ns_from_unix(since_s), window.start), window.stop - 1)
+    bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
+    begins = min((each.start for each in bags), default=since)
+    return TimeWindow(max(begins, window.start), window.stop)
 
 
 def _reach(memory: Memory) -> Ns | None:
@@ -279,7 +295,7 @@ def _without_poses(view: View) -> str:
     try:
         topic = resolve_pose_topic(view)
     except NoDataError as error:
-        return error.detail.replace(f", or {GIVE_TOPIC}", "")
+        return error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
     return f"{topic} has no poses"
 
 
@@ -429,6 +445,7 @@ def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
     found = recap(memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False)
     shown: JsonObject = {
         "events": [event_shown(each) for each in found.events],
+        "events_since": _start_s(window),
         "throughout": [*found.throughout],
         "distance_m": None if found.distance_m is None else rounded(found.distance_m, 1),
         "max_speed": None if found.max_speed is None else rounded(found.max_speed, 2),
@@ -469,8 +486,7 @@ def _moments(memory: Memory, call: Call) -> Shown:
 
 
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
-    """Returns the things that were seen in a window, and how long it took to find them."""
-    begun = time.perf_counter()
+    """Returns the things that were seen in a window."""
     try:
         found = find_things(
             memory,
@@ -481,12 +497,10 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
         )
     except (NoDataError, InvalidArgumentsError) as error:
         return Shown({"things": []}, (str(error),))
-    took_ms = round((time.perf_counter() - begun) * 1000)
     return Shown(
         {
             "things": [_thing(each) for each in found.things],
             "things_total": found.total,
-            "things_ms": took_ms,
         },
         found.notes,
     )
