@@ -84,6 +84,12 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However busy the machine is, no part is left out for later."""
+    monkeypatch.setattr(span, "_QUICK_S", 60.0)
+
+
 @pytest.fixture(params=["plain", "catalogue"])
 def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
     found = memory_of(bag_dir)
