@@ -268,6 +268,12 @@ def test_no_name_on_the_map_covers_another_or_a_thing(page: Browser) -> None:
             assert x >= left + wide or left >= x + w or y >= top + high or top >= y + h
 
 
+def test_of_more_stops_than_are_drawn_the_key_has_the_number(page: Browser) -> None:
+    assert " of " not in page.text("#map-key")
+    page.run("state.view.counts.stops = 9; showKey()")
+    assert "stops, 2 of 9" in page.text("#map-key")
+
+
 def test_the_skip_link_goes_to_the_timeline_and_leaves_the_span(page: Browser) -> None:
     before = page.run("return location.hash")
     page.keys(TAB + ENTER)
@@ -335,6 +341,8 @@ def test_of_bags_that_nobody_records_it_shows_neither_a_recorder_nor_a_budget(od
     state = odd.text("#state")
     assert "Recorder\nnone in this deployment" in state
     assert "Size\n" in state
+    # The files are listed below: no tool is needed.
+    assert "! 30 damaged bag files\n" in state
     assert "Budget" not in state
     assert "Growth" not in state
 

@@ -285,6 +285,7 @@ function showKey() {
   const view = state.view;
   const one = (kind, text) => el("span", {}, el("i", { class: kind }), text);
   const more = (view.things_total || 0) > view.things.length ? ` of ${view.things_total}` : "";
+  const { stops } = view.counts || {};  // the longest are among the events
   const left = view.paths_left_out;
   // Without poses there is no map: the reason is shown instead.
   const isEmpty = Boolean(view.no_path) && !(view.places || []).length;
@@ -299,7 +300,8 @@ function showKey() {
       "no path of ", bdi(each.name), `: ${each.error}`)),
     ...(left ? [el("span", { class: "warn" }, `${counted(left, "more path")} left out`)] : [])]
     : pathKey(view, one)),
-  ...(map.stops.length ? [one("stood", `stops, ${map.stops.length}`)] : []),
+  ...(map.stops.length ? [one("stood", `stops, ${map.stops.length}${stops > map.stops.length ? ` of ${stops}` : ""}`)]
+    : []),
   ...(map.things.length ? [one("seen", `things, ${map.things.length}${more}`)] : []),
   ...((view.places || []).length ? [one("place", "places")] : []),
   ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame || "without a name"))] : []),
