@@ -63,6 +63,9 @@ class DemoOptions:
     as_json: bool = False
 
 
+_CONNECTED_WITHIN_S: Final = 60.0
+
+
 def run_demo(
     options: DemoOptions, say: Callable[[str], None], questions: Sequence[Question] = QUESTIONS
 ) -> int:
@@ -78,16 +81,16 @@ def run_demo(
     """
     _check(options)
     port = free_port(options.port)
+    tell = _say_nothing if options.as_json else say
     with ExitStack() as stack:
         bag_dir = _bag_dir(options, stack)
         recorder = stack.enter_context(_recorder(bag_dir, options.duration_s))
         server = stack.enter_context(
             running_server(
-                bag_dir, port, split_duration_s=SPLIT_DURATION_S, verbose=options.verbose
+                bag_dir, port, tell, split_duration_s=SPLIT_DURATION_S, verbose=options.verbose
             )
         )
         url = f"http://{HOST}:{port}"
-        tell = _say_nothing if options.as_json else say
         tell(_heading(recorder, options, url))
         show = exchange_as_json if options.as_json else format_exchange
         wrong = _count_wrong(f"{url}/sse", recorder, lambda *each: say(show(*each)), questions)
@@ -167,7 +170,7 @@ async def _ask_all(
 ) -> int:
     """Asks every question over one connection; returns how many answers were wrong."""
     wrong = 0
-    async with Client(sse_client(url)) as client:
+    async with Client(sse_client(url, timeout=_CONNECTED_WITHIN_S)) as client:
         for number, question in enumerate(questions, start=1):
             exchange = await _ask(client, question, recorder)
             show(number, exchange)

@@ -22,14 +22,16 @@ from ros2_memory.demo.floor_plan import ROOMS
 from ros2_memory.recorder.process.child import LAUNCHER
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
 HOST: Final = "127.0.0.1"
 LOG_NAME: Final = "server.log"
 PLACES_NAME: Final = "places.yaml"
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
-_UP_WITHIN_S: Final = 30.0
+_UP_WITHIN_S: Final = 300.0
+"""As long as it may take on a machine with much else to do; one that fails ends at once."""
+_SAID_AFTER_S: Final = 5.0
 _DOWN_WITHIN_S: Final = 5.0
 _LOG_LINES_SHOWN: Final = 8
 _LONGEST_REPORT: Final = 1_000_000
@@ -79,9 +81,14 @@ def server_environment(
 
 @contextmanager
 def running_server(
-    bag_dir: Path, port: int, *, split_duration_s: float, verbose: bool = False
+    bag_dir: Path,
+    port: int,
+    say: Callable[[str], None],
+    *,
+    split_duration_s: float,
+    verbose: bool = False,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Yields a server that answers, and ends it after the block.
+    """Yields a server that answers, and ends it after the block; says what it waits for.
 
     Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
     into a folder that is removed at the end: no one else uses it. The rooms of the flat are written
@@ -113,7 +120,7 @@ def running_server(
                 process_group=0,
             )
         try:
-            _wait_until_up(process, port, log_path)
+            _wait_until_up(process, port, log_path, say)
             yield process
         finally:
             _end(process)
@@ -127,15 +134,22 @@ def _places() -> dict[str, object]:
     }
 
 
-def _wait_until_up(process: subprocess.Popen[bytes], port: int, log_path: Path) -> None:
-    give_up = time.monotonic() + _UP_WITHIN_S
+def _wait_until_up(
+    process: subprocess.Popen[bytes], port: int, log_path: Path, say: Callable[[str], None]
+) -> None:
+    begun = time.monotonic()
+    has_said = False
     while (answering := _answering(port)) != process.pid:
         if answering is not None:
             raise ConfigError(f"port {port} on {HOST} is in use by another server; {_ANOTHER_PORT}")
         code = process.poll()
         if code is not None:
             raise EpisodicError(f"the server ended with exit code {code}{_last_words(log_path)}")
-        if time.monotonic() > give_up:
+        waited_s = time.monotonic() - begun
+        if waited_s > _SAID_AFTER_S and not has_said:
+            has_said = True
+            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer on port {port}")
+        if waited_s > _UP_WITHIN_S:
             raise EpisodicError(
                 f"the server did not answer on port {port} within {_UP_WITHIN_S:g} s"
                 f"{_last_words(log_path)}"

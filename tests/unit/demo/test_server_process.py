@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.demo import server_process
 from ros2_memory.demo.run import DemoOptions, run_demo
 from ros2_memory.demo.server_process import free_port, running_server, server_environment
 
@@ -56,9 +57,20 @@ def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_pa
         port = theirs.server_port
         with (
             pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"),
-            running_server(tmp_path, port, split_duration_s=5.0),
+            running_server(tmp_path, port, print, split_duration_s=5.0),
         ):
             pass
+
+
+def test_on_a_busy_machine_it_says_what_it_waits_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_process, "_SAID_AFTER_S", 0.0)
+    said: list[str] = []
+    port = free_port(0)
+    with running_server(tmp_path, port, said.append, split_duration_s=5.0) as server:
+        assert server.poll() is None
+    assert said == [f"waiting up to 300 s for the server to answer on port {port}"]
 
 
 @pytest.mark.parametrize("port", [-1, 65536])
