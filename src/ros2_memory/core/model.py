@@ -174,7 +174,8 @@ class SetAside:
 
     `written` is when it was last written to; None where that is unknown, or goes on. `answers`: it
     is active, and its complete chunks answer all the same, up to `until` (the log time of their
-    last message, inclusive; None where none is on disk yet).
+    last message, inclusive; None where none is on disk yet). `growing`: two scans saw it grow, or a
+    live recorder names it; another active file may as well have been left open by a crash.
     """
 
     path: Path
@@ -182,6 +183,7 @@ class SetAside:
     written: Ns | None = None
     answers: bool = False
     until: Ns | None = None
+    growing: bool = False
 
 
 @dataclass(frozen=True, slots=True)

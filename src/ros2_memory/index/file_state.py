@@ -301,7 +301,8 @@ def _active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classi
     Raises:
         BagVanishedError: the file does not exist any more.
     """
-    aside = SetAside(notes.path, _ACTIVE)
+    growing = notes.was_seen_growing(context) or context.names(notes.path)
+    aside = SetAside(notes.path, _ACTIVE, growing=growing)
     if not context.include_active or notes.kind != ".mcap":
         return Classification(FileState.ACTIVE, aside=aside)
     summary = _summary_so_far(notes, reader)
@@ -314,9 +315,8 @@ def _active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classi
         # The first note is on the early end of the file, which goes on.
         summary = summary.replaced(notes=summary.notes[1:])
     bag = _bag(notes, BagState.ACTIVE, summary)
-    return Classification(
-        FileState.ACTIVE, bag, SetAside(notes.path, _ANSWERS, answers=True, until=bag.end)
-    )
+    answering = replace(aside, reason=_ANSWERS, answers=True, until=bag.end)
+    return Classification(FileState.ACTIVE, bag, answering)
 
 
 def _summary_so_far(notes: FileNotes, reader: BagReader) -> BagSummary | None:

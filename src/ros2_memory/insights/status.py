@@ -165,6 +165,13 @@ def missing_data(view: View) -> Iterator[str]:
     snapshot = view.snapshot
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
+    undecided = [each for each in snapshot.active if not each.growing and each.reason != HELD_BACK]
+    if undecided:
+        files = counted(len(undecided), "file without an end", "files without an end")
+        verb = "is" if len(undecided) == 1 else "are"
+        yield (
+            f"{files} {verb} young and not known to grow: being written, or left open by a crash"
+        )
     if left_open := snapshot.timeline.disk_use[1]:
         bags = counted(left_open, "bag was", "bags were")
         yield f"{bags} left open by a crash: unwritten messages are lost"

@@ -343,6 +343,27 @@ class TestWhatIsMissingIsNamedAndCounted:
         path.write_bytes(path.read_bytes()[:-100])
         assert self.trust(tmp_path).startswith("1 bag was left open by a crash")
 
+    def test_a_file_that_may_be_being_written_or_left_by_a_crash(self, tmp_path: Path) -> None:
+        messages = [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)]
+        path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+        content = path.read_bytes()[:-100]
+        path.write_bytes(content)
+        clock = SettableClock(path.stat().st_mtime_ns + S)
+
+        def trust(memory: Memory) -> str:
+            return str(shown(memory, tmp_path)["trust"])
+
+        memory, young = memory_of(tmp_path, clock=clock), "1 file without an end is young"
+        assert young in trust(memory)
+        # Seen to grow, it is being written.
+        path.write_bytes(content + b"x")
+        assert young not in trust(memory)
+        # So is one that a live recorder names.
+        assert young in trust(memory_of(tmp_path, clock=clock))
+        named = {"updated": clock.now(), "recordings": ("rec",)}
+        beating(tmp_path, RecorderState.RECORDING, 0, **named)
+        assert young not in trust(memory_of(tmp_path, clock=clock))
+
     def test_files_that_are_not_read(self, tmp_path: Path) -> None:
         write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 0.0, 0.0)])
         for n in range(3):
