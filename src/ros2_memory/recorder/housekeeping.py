@@ -429,7 +429,8 @@ class Housekeeping(Housekeeper):
             messages=repaired.rewritten.messages,
             was_bytes=repaired.was_bytes,
             is_bytes=repaired.is_bytes,
-            lost_bytes=repaired.rewritten.lost_bytes,
+            cut_bytes=repaired.rewritten.lost_bytes,
+            reason=repaired.rewritten.describe_loss(),
             notes=list(repaired.rewritten.notes),
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )

@@ -17,7 +17,8 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -236,11 +237,23 @@ class Rewritten:
         lost_bytes: bytes of the source that made no whole record; how many messages never reached
             the disk is unknown.
         notes: sentences on what was lost.
+        last: log time of the newest message; None without one.
     """
 
     messages: int
     lost_bytes: int
     notes: tuple[str, ...] = ()
+    last: Ns | None = None
+
+    def describe_loss(self) -> str:
+        """Returns a sentence on what was lost."""
+        kept = "no message reached the disk"
+        if self.last is not None:
+            kept = (
+                f"the newest message is of {unix_from_ns(self.last):.3f}; later ones that had not "
+                "reached the disk are lost"
+            )
+        return f"{kept}, and {counted(self.lost_bytes, 'byte')} of the file made no whole message"
 
 
 class BagWriter(ABC):

@@ -224,7 +224,7 @@ class _Recovery:
         outcome.messages += rewritten.messages
         return (
             f"repaired: {counted(rewritten.messages, 'message')}, "
-            f"{counted(rewritten.lost_bytes, 'byte')} lost "
+            f"{rewritten.describe_loss()} "
             f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now)"
             f"{''.join(f'; {note}' for note in rewritten.notes)}"
         )

@@ -131,6 +131,7 @@ class ContentDigest:
         self._in_order = hashlib.blake2b()
         self._between = hashlib.blake2b()
         self.messages = 0
+        self.last: int | None = None
 
     @property
     def digests(self) -> tuple[bytes, bytes, frozenset[bytes]]:
@@ -169,4 +170,5 @@ class ContentDigest:
         self._in_order.update(channel + repr(numbers).encode())
         self._in_order.update(message.data)
         self.messages += 1
+        self.last = max(self.last or 0, message.log_time)
         return True

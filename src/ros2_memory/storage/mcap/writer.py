@@ -86,7 +86,7 @@ class McapWriter(BagWriter):
             copy.finish()
             stream.flush()
             notes = self._compare(source, target, digest)
-        return Rewritten(digest.messages, salvage.lost_bytes, notes)
+        return Rewritten(digest.messages, salvage.lost_bytes, notes, digest.last)
 
     def cut(
         self,
