@@ -560,7 +560,7 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
     for what would be below it.
     """
     if condition.field is not None:
-        if _is_unknown_below(value, condition.field):
+        if is_unknown_below(value, condition.field):
             return None
         targets = at_field(value, condition.field)
         if targets:
@@ -631,7 +631,7 @@ def _plain_text(test: Test) -> str | None:
     return needle if isinstance(needle, str) and _meaning(needle) is None else None
 
 
-def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
+def is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether some beginning of the path leads to an empty list or a null."""
     segments = dot_path.split(".")
     return any(

@@ -41,16 +41,17 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
         QueryTimeoutError: the call's time runs out before any result.
     """
     topic = resolve_pose_topic(view)
-    frame_id = map_placement(view, pose_frame(view, topic), topic, None).frame_id
-    places = places_in(view, view.memory.limits.places, frame_id)
+    placement = map_placement(view, pose_frame(view, topic), topic, None)
+    places = places_in(view, view.memory.limits.places, placement, window)
     if not places:
+        frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
-            f"by place needs named places in {frame_id}, and there is none in {PLACES_SETTING}"
+            f"by place needs named places in {frames}, and there is none in {PLACES_SETTING}"
         )
-    track = track_in(view, frame_id, window)
+    track = track_in(view, placement.frame_id, window)
     inside = [
-        [(each.start, each.stop + 1) for each in robot_inside(track, place.region, window)]
-        for place in places
+        [(each.start, each.stop + 1) for each in robot_inside(own, place.region, window)]
+        for place, own in places
     ]
     begins = np.flatnonzero(track.begins)
     ends = np.append(begins[1:], len(track.times))[: len(begins)] - 1
@@ -64,7 +65,7 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
     in_none = ~in_places.any(axis=1)
     placed = _covered(edges, known)
     member = np.column_stack((in_places, in_none & placed, in_none & ~placed))
-    names = (*(each.name for each in places), ELSEWHERE, UNKNOWN)
+    names = (*(each.name for each, _ in places), ELSEWHERE, UNKNOWN)
     return TimeBins(names, edges, member, None)
 
 

@@ -16,6 +16,7 @@ from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.visits import asked_place
+from ros2_memory.places.where import note_other_frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -61,18 +62,22 @@ def count_visits(
     note_robots(view, topic, asked)
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame
-    frame = map_placement(view, pose_frame(view, topic), topic, asked_frame).frame_id
+    placement = map_placement(view, pose_frame(view, topic), topic, asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,))
-    track = track_in(view, frame, binned.window)
+    track = track_in(view, placement.frame_id, binned.window)
     begins = np.flatnonzero(track.begins)
     ends = np.append(begins[1:], len(track.times))[: len(begins)] - 1
     known = list(zip(track.times[begins].tolist(), track.times[ends].tolist(), strict=True))
     binned.add_lengths("placed_s", "duration", known)
     if place is not None:
-        _add_visits(binned, robot_inside(track, place.region, binned.window))
+        stayed = robot_inside(track, place.region, binned.window)
+        if not stayed and asked_frame is None:
+            ask = f'ask with frame_id "{placement.pose_frame}"'
+            note_other_frame(view, place, placement, binned.window, ask)
+        _add_visits(binned, stayed)
         return binned.answer()
-    places = places_in(view, memory.limits.places, frame)
-    inside = [robot_inside(track, each.region, binned.window) for each in places]
+    places = places_in(view, memory.limits.places, placement, binned.window)
+    inside = [robot_inside(own, each.region, binned.window) for each, own in places]
     if by == "place":
         _add_each_place(binned, inside)
         return binned.answer()
@@ -81,7 +86,7 @@ def count_visits(
             f"{len(places)} places by {by} in {len(binned.bins.names)} bins are too many for one "
             "reply: name one in where, or ask about a shorter window"
         )
-    for each, stays in zip(places, inside, strict=True):
+    for (each, _), stays in zip(places, inside, strict=True):
         binned.add_counts(f"{each.name}.entries", _entries(stays))
         binned.add_lengths(f"{each.name}.minutes", "minutes", _spans(stays))
     return binned.answer()

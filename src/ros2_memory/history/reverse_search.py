@@ -10,12 +10,18 @@ from __future__ import annotations
 import heapq
 import re
 from collections import OrderedDict
-from itertools import chain
+from itertools import chain, islice
 from threading import Lock
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
-from ros2_memory.analysis.conditions import Equals, NearPosition, parse_condition, refusal_for
+from ros2_memory.analysis.conditions import (
+    Equals,
+    NearPosition,
+    is_unknown_below,
+    parse_condition,
+    refusal_for,
+)
 from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import (
@@ -59,6 +65,8 @@ _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_TEMPLATES: Final = 16
 """Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
+_MOST_EMPTY: Final = 200
+"""Messages that are looked at for one with elements in its lists."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
 _MOST_TRUTHS: Final = 65_536
@@ -334,20 +342,32 @@ class ReverseSearch:
         raise InvalidArgumentsError(f"{self.topics[0]}: {refusals[0]}")
 
     def _refusal(self, topic: str) -> str | None:
+        """Returns why no message of a topic can match, by the newest one that shows its fields."""
         found = self._view.stream.newest(topic, TimeWindow.everything())
-        message = None if found is None else self._view.bags.decode(found)
-        if found is None or message is None:
+        value = None if found is None else self._value(found)
+        field = self.condition.field
+        if found is None or value is None:
             return None
+        if field is not None and is_unknown_below(value, field):
+            # An empty list does not show what its elements have.
+            older = self._view.stream.messages(
+                [topic], TimeWindow(MIN_NS, found.time), newest_first=True
+            )
+            values = map(self._value, islice(older, _MOST_EMPTY))
+            value = next((each for each in values if not is_unknown_below(each, field)), value)
         schema = found.record.channel.schema
-        refusal = refusal_for(
-            self.condition, self._view.memory.extractor.exact(message, schema.name)
-        )
+        refusal = refusal_for(self.condition, value)
         test = self.condition.test
         if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
             return refusal
         field = (self.condition.field or "").rpartition(".")[2]
         constants = _constants_named(schema, field, str(test.value))
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
+
+    def _value(self, found: StoredMessage) -> JsonValue:
+        message = self._view.bags.decode(found)
+        type_name = found.record.channel.schema.name
+        return None if message is None else self._view.memory.extractor.exact(message, type_name)
 
     def _messages(self, part: SearchWindow) -> Iterator[StoredMessage]:
         """Returns the messages of a part, newest first.

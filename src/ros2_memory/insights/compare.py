@@ -242,7 +242,7 @@ def _places(
     found: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            visited = place_visits(view, places, placement.frame_id, window)
+            visited = place_visits(view, places, placement, window)
             durations = {each.place: each.duration for each in visited}
         else:
             inside = times_inside(view, where, placement.frame_id, window)

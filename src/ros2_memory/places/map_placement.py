@@ -89,6 +89,11 @@ class MapPlacement:
         return self.frame_id == self.view.memory.limits.map_frame
 
     @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames that positions are known in."""
+        return tuple(dict.fromkeys((self.frame_id, self.pose_frame)))
+
+    @property
     def moves(self) -> bool:
         """Whether the frame of the poses may move in that of the places."""
         frames = self.frame_id, self.pose_frame

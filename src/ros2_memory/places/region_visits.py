@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.history.view import View
+    from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.places.where import Where
 
@@ -111,31 +112,42 @@ def _closest(track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]
     return float(min(off[where], circle.radius_m)), at
 
 
-def places_in(view: View, places: Sequence[Place], frame_id: str) -> list[Place]:
-    """Returns the places of a frame; notes name the others."""
-    found: list[Place] = []
+def places_in(
+    view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
+) -> list[tuple[Place, RobotTrack]]:
+    """Returns the places of the map and of the poses' own frame, each with the track in its frame.
+
+    Notes name the others.
+
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    found: list[tuple[Place, RobotTrack]] = []
+    tracks: dict[str, RobotTrack] = {}
     for place in places:
-        if place.frame_id == frame_id:
-            found.append(place)
-        else:
+        frame = place.frame_id
+        if frame not in placement.frames:
             view.notes.add(
-                f"{place.name} is left out: it is in {place.frame_id}, and these places are in "
-                f"{frame_id}"
+                f"{place.name} is left out: it is in {frame}, and where the robot was is known in "
+                f"{' and '.join(placement.frames)}"
             )
+            continue
+        if frame not in tracks:
+            tracks[frame] = track_in(view, frame, window)
+        found.append((place, tracks[frame]))
     return found
 
 
 def place_visits(
-    view: View, places: Sequence[Place], frame_id: str, window: TimeWindow
+    view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
 ) -> tuple[PlaceVisits, ...]:
-    """Returns how often, and for how long, the robot was in each named place of a frame.
+    """Returns how often, and for how long, the robot was in each named place.
 
     Those in which it was longest come first.
     """
-    track = track_in(view, frame_id, window)
     elapsed = elapsed_in(view, window)
     found: list[PlaceVisits] = []
-    for place in places_in(view, places, frame_id):
+    for place, track in places_in(view, places, placement, window):
         inside = robot_inside(track, place.region, window)
         entries = [each.start for each in inside if each.entered]
         exits = [each.stop for each in inside if each.left]

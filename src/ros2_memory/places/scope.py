@@ -13,7 +13,7 @@ from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.where import parse_where, times_inside
+from ros2_memory.places.where import note_other_frame, parse_where, times_inside
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -106,7 +106,11 @@ def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside
     """
     topic = resolve_pose_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
-    return times_inside(view, where, placement.frame_id, window)
+    found = times_inside(view, where, placement.frame_id, window)
+    if not found:
+        ask = f'ask it with frame_id "{placement.frame_id}"'
+        note_other_frame(view, where, placement, window, ask)
+    return found
 
 
 class _States:

@@ -44,7 +44,7 @@ from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, region_visits, visit_of
-from ros2_memory.places.where import PLACES_SETTING, Where, parse_where
+from ros2_memory.places.where import PLACES_SETTING, Where, note_other_frame, parse_where
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def visits(
     placement = map_placement(view, own_frame, topic, asked)
     now = memory.now(wall, view.snapshot.latest)
     if place is None:
-        found = place_visits(view, memory.limits.places, placement.frame_id, window)
+        found = place_visits(view, memory.limits.places, placement, window)
         note_unread(view, window, nothing=not any(each.duration for each in found))
         return Visits(
             frame_id=placement.frame_id,
@@ -130,6 +130,8 @@ def visits(
         known = _by_poses(view, search, now, limit)
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
+    if not known.total and asked is None:
+        note_other_frame(view, place, placement, window, f'ask with frame_id "{own_frame}"')
     _note_doubts(view, known, window)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.regions import Circle, Rectangle
 from ros2_memory.core.text import abbreviate
 from ros2_memory.places.region_visits import track_in
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.history.view import View
+    from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.robot_tracks import Inside
 
 PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
@@ -126,3 +128,21 @@ def times_inside(view: View, where: Where, frame_id: str, window: TimeWindow) ->
     """
     track = track_in(view, where.frame_id or frame_id, window)
     return robot_inside(track, where.region, window)
+
+
+def note_other_frame(
+    view: View, where: Where, placement: MapPlacement, window: TimeWindow, ask: str
+) -> None:
+    """Notes that coordinates without a frame, where nothing is in the map, are those of poses.
+
+    As replies of get_position_* give them. `ask` says how to ask for what is there.
+    """
+    own = placement.pose_frame
+    if where.name is not None or own == placement.frame_id:
+        return
+    with suppress(QueryTimeoutError):
+        if times_inside(view, replace(where, frame_id=own), own, window):
+            view.notes.add(
+                f"x and y were taken in {placement.frame_id}; the robot was at those in {own}, "
+                f"the frame of get_position_*: {ask}"
+            )

@@ -18,7 +18,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
 from tests.support.examples import examples
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
 
@@ -81,6 +81,22 @@ def test_without_a_place_all_named_ones_are_told_at_once(tmp_path: Path) -> None
         assert by_name[name].first == arrivals[-1]
     assert by_name["garden"].entries == 0
     assert any("yard is left out" in note for note in found.notes)
+
+
+def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(tmp_path: Path) -> None:
+    write_moving_map(tmp_path, 1, seconds=300)
+    own = Place("dock", "odom", Rectangle(-0.6, 0.6, -0.6, 0.6))
+    memory = memory_of(tmp_path)
+    memory = replace(memory, limits=replace(memory.limits, places=(*PLACES, own)))
+    found = visits(memory, Call())
+    assert found.places is not None
+    [dock] = [each for each in found.places if each.place == "dock"]
+    alone = visits(memory, Call(), where="dock", limit=100)
+    assert alone.duration > 0
+    assert (dock.entries, dock.duration) == (alone.entries, alone.duration)
+    window = {"start": BEGIN / S, "end": BEGIN / S + 300}
+    assert "dock" in str(asked(memory, tmp_path, "visits", by="place", **window))
+    assert "dock" in str(asked(memory, tmp_path, "visits", by="day", **window))
 
 
 def test_a_window_cuts_visits(tmp_path: Path) -> None:

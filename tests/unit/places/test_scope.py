@@ -21,7 +21,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.scope import WhileCondition
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import position
-from tests.support.bags import Msg, boolean, odom, text, write_mcap
+from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
@@ -181,3 +181,22 @@ def test_scopes_are_the_same_whatever_the_catalogue_knows(
             except EpisodicError as error:
                 one = str(error)
             assert one == asked(known, bag_dir, "find_matches", **arguments)
+
+
+@pytest.mark.parametrize("tool", ["find_matches", "find_last_match"])
+def test_a_misspelt_field_inside_a_list_that_is_empty_now_is_refused(
+    tmp_path: Path, tool: str
+) -> None:
+    seen = [detections(BEGIN + nth * S, ["cup"]) for nth in range(5)]
+    empty = [detections(BEGIN + nth * S, []) for nth in range(5, 9)]
+    write_mcap(tmp_path / "rec_0.mcap", [*seen, *empty])
+    question: dict[str, Any] = {
+        "topic": seen[0].topic,
+        "condition_type": "contains",
+        "value": "scissors",
+    }
+    refused = asked(memory_of(tmp_path), tmp_path, tool, field="detections.name", **question)
+    assert refused["error"] == "invalid_arguments"
+    assert "detections.label" in refused["detail"]
+    known = asked(memory_of(tmp_path), tmp_path, tool, field="detections.label", **question)
+    assert not (known or {}).get("error")

@@ -247,6 +247,36 @@ def test_a_place_may_be_named_in_the_frame_of_the_poses(tmp_path: Path) -> None:
         visits(memory, Call(), 0.0, 0.0, frame_id="laser")
 
 
+def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_path: Path) -> None:
+    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (50.0, 1.0, 0.0)), topic="/tf_static")
+    memory = remembering(tmp_path, [fixed, *line((10, 0.0), (20, 0.5))])
+    pasted: dict[str, Any] = {"x": 0.0, "y": 0.0, "radius_m": 1.0}
+    found = visits(memory, Call(), **pasted)
+    [hint] = [each for each in found.notes if "x and y were taken in map" in each]
+    assert hint.endswith('get_position_*: ask with frame_id "odom"')
+    replies = [
+        asked(memory, tmp_path, "visits", by="hour", **pasted),
+        asked(memory, tmp_path, "recap", last_s=30, where=pasted),
+        asked(
+            memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 9, where=pasted
+        ),
+        asked(
+            memory,
+            tmp_path,
+            "find_matches",
+            topic="/odom",
+            condition_type="above",
+            value=-1,
+            field="position.x",
+            where=pasted,
+        ),
+    ]
+    assert [str(each).count("x and y were taken in map") for each in replies] == [1] * 4, replies
+    for other in ({"frame_id": "odom"}, {"frame_id": "map", "x": 900.0}, {"x": 50.0, "y": 1.0}):
+        found = visits(memory, Call(), **pasted | other)
+        assert not any("were taken in" in note for note in found.notes)
+
+
 @each_way
 def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bool) -> None:
     """The robot drives on in odometry, which slips back as fast: it stands in the map."""
