@@ -23,7 +23,7 @@ from ros2_memory.counts.bins import BinnedWindow
 from ros2_memory.counts.segment_fold import SegmentFold
 from ros2_memory.history.driven_path import POSES, add_poses
 from ros2_memory.history.no_data import no_data_between, resolve_pose_topic, undecodable, with_notes
-from ros2_memory.history.robots import note_robots
+from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def count_path(
     totals = metres @ binned.bins.member
     binned.add("metres", "metres", totals.tolist(), float(metres.sum()))
     binned.note_since(folded.since)
-    note_robots(view, name, asked)
+    require_one_robot(view, name, asked)
     return binned.answer()
 
 

@@ -38,7 +38,7 @@ from ros2_memory.history.bag_fold import Fold
 from ros2_memory.history.bag_groups import DigestKind, store_shared
 from ros2_memory.history.driven_path import add_poses, driven_path
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.robots import note_robots
+from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 from ros2_memory.insights.silences import unrecorded_length
 
@@ -109,8 +109,8 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     elapsed = elapsed_in(view, window)
     try:
         topic = resolve_pose_topic(view)
+        require_one_robot(view, topic, window)
         path = driven_path(view, topic, window, _NO_WAYPOINTS)
-        note_robots(view, topic, window)
         standstills, drops = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")

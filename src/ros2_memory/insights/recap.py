@@ -199,7 +199,7 @@ def recap(
     if there is None or region is None:
         answer = _with_way(view, answer, drive)
     else:
-        answer = _with_way_there(view, answer, window, there)
+        answer = _with_way_there(view, answer, drive, window, there)
         answer = replace(answer, where=region.shown)
         if stood is not None:
             answer = replace(answer, stood=there.length_of(drive.standstills))
@@ -270,9 +270,13 @@ def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
     )
 
 
-def _with_way_there(view: View, answer: Recap, window: TimeWindow, there: _There) -> Recap:
+def _with_way_there(
+    view: View, answer: Recap, drive: Drive, window: TimeWindow, there: _There
+) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    way = driven_way(view, resolve_pose_topic(view), window)
+    way = None
+    if drive.path is not None:
+        way = driven_way(view, resolve_pose_topic(view), window)
     driven = None if way is None else way.totals(there.spans)
     return replace(
         answer,

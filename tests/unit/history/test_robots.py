@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
@@ -73,6 +75,35 @@ def test_answers_from_messages_of_both_robots_say_so(
         asks = {**condition, "value": 5, **asks}
     answer = asked(memory_of(tmp_path), tmp_path, name, **asks)
     assert [each for each in answer["notes"] if "as from several robots" in each]
+
+
+@pytest.mark.parametrize(
+    "asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}], ids=["all", "where"]
+)
+def test_a_way_over_both_robots_is_not_known(tmp_path: Path, asks: dict[str, object]) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
+    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    window = {"start": begin, "end": begin + 60, **asks}
+    told = asked(memory, tmp_path, "recap", **window)
+    assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
+    assert not [each for each in told["events"] if each["kind"] in {"stop", "drop"}]
+    assert any("the path is unknown: 2 recordings" in note for note in told["notes"])
+    compared = asked(memory, tmp_path, "compare", **window, with_start=begin, with_end=begin + 30)
+    assert any("the path is unknown: 2 recordings" in note for note in compared["notes"])
+    assert "distance_m" not in compared.get("way", {})
+
+
+@pytest.mark.parametrize("by", ["hour", "place"])
+def test_metres_of_both_robots_are_not_counted(tmp_path: Path, by: str) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
+    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    memory = replace(
+        memory, limits=replace(memory.limits, places=(Place("a", "odom", Circle(0, 0, 1)),))
+    )
+    told = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 60, by=by)
+    assert told["reason"] == "mixed"
 
 
 def test_two_recorders_of_one_robot_are_not(tmp_path: Path) -> None:
