@@ -166,7 +166,7 @@ def recap(
         events = [each for each in events if there.has(each)]
     note_unread(view, window)
     note_edges(view, window)
-    _note_foxglove_logs(view)
+    _note_foxglove_logs(view, window)
     counts = Counter(each.kind for each in events)
     if things:
         counts["thing"] = things
@@ -206,14 +206,25 @@ def recap(
     return replace(answer, notes=view.notes.sentences())
 
 
-def _note_foxglove_logs(view: View) -> None:
+def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
     """Notes the logs whose errors are no events: those that ROS writes alone are read for them."""
     timeline = view.snapshot.timeline
     for topic in timeline.topics():
-        if foxglove := FOXGLOVE_LOGS.intersection(timeline.types_of(topic)):
+        types = timeline.types_of(topic)
+        if FOXGLOVE_LOGS.isdisjoint(types):
+            continue
+        here = FOXGLOVE_LOGS & {
+            held.type
+            for each in timeline.extents(topic, window)
+            for held in each.bag.summary.of(topic)
+        }
+        if here:
+            # Where the topic has two types, its levels have no names; no log of ROS has a 4.
+            asks = '"above", field "level", value "WARN"'
+            asks = asks if len(types) == 1 else '"equals", field "level", value 4'
             view.notes.add(
-                f"errors in {topic} are not among the events, since it is of {min(foxglove)}: "
-                'find_matches with condition_type "above", field "level", value "WARN" lists them'
+                f"errors in {topic} are not among the events, since it is of {min(here)}: "
+                f"find_matches with condition_type {asks} lists them"
             )
 
 

@@ -595,6 +595,20 @@ def test_levels_of_a_foxglove_log_have_names_and_a_recap_says_that_its_errors_ar
     [note] = [each for each in recap["notes"] if "foxglove.Log" in each]
     assert "errors in /rosout are not among the events" in note
     assert "find_matches" in note
+    # Under one name with a log of ROS, of another hour.
+    write_mcap(
+        tmp_path / "ros" / "ros_0.mcap",
+        [log_entry(BEGIN + (3600 + n) * S, 10 + 10 * n, "node", f"entry {n}") for n in range(5)],
+    )
+    memory = memory_of(tmp_path)
+    recap = asked(memory, tmp_path, "recap", start=BEGIN // S, end=BEGIN // S + 4)
+    [note] = [each for each in recap["notes"] if "foxglove.Log" in each]
+    assert 'condition_type "equals", field "level", value 4 lists them' in note
+    asks |= {"condition_type": "equals"}
+    found = asked(memory, tmp_path, "find_matches", **asks, value=4, fields=["level"])
+    assert {each["value"]["level"] for each in found["sightings"]} == {4}
+    recap = asked(memory, tmp_path, "recap", start=BEGIN // S + 3600, end=BEGIN // S + 3604)
+    assert not [each for each in recap.get("notes", ()) if "foxglove.Log" in each]
 
 
 @pytest.mark.parametrize("name", ["find_matches", "find_last_match", "get_value_when", "by"])
