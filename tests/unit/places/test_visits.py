@@ -256,7 +256,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     assert hint.endswith('get_position_*: ask with frame_id "odom"')
     replies = [
         asked(memory, tmp_path, "visits", by="hour", **pasted),
-        asked(memory, tmp_path, "recap", last_s=30, where=pasted),
+        asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 9, where=pasted),
         asked(
             memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 9, where=pasted
         ),
