@@ -534,6 +534,7 @@ def query_settings_of(settings: Settings) -> QuerySettings:
         min_score=data.min_score,
         labels=load_labels(settings),
         places=places_of(settings),
+        places_file=str(data.places_file),
     )
 
 

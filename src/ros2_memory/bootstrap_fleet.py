@@ -99,7 +99,7 @@ def _source_of(
         lake,
         name,
         WallClock(),
-        limits if _has_places(settings, own) else replace(limits, places=()),
+        limits if _has_places(settings, own) else replace(limits, places=(), places_file=""),
         shared.extractor,
         refresh_s=LAKE_REFRESH_S,
     )
@@ -132,7 +132,7 @@ def _memory_of(own: Settings, shared: SharedParts, *, has_places: bool) -> Memor
     if has_places:
         return memory
     # `data.places_file` is about some other map.
-    return replace(memory, limits=replace(memory.limits, places=()))
+    return replace(memory, limits=replace(memory.limits, places=(), places_file=""))
 
 
 def _require_only_reading(settings: Settings) -> None:

@@ -76,6 +76,7 @@ class Heartbeat:
         failing_rules: why rules of `recording.exclude_when` cannot be evaluated, a sentence each.
         unshipped: which bags were deleted before they were shipped, where `retention` requires
             that, since the recorder started, as a sentence; else None.
+        listed: what its list of topics has, entries and then exclusions; empty where not known.
         waiting_for: what a recorder in the state `waiting` waits for, as a sentence; else None.
         counted_bytes: what the budget counts, by the last pass of retention; None before.
         state_bytes: how much of that is no recording: `.episodic` and logs.
@@ -102,6 +103,7 @@ class Heartbeat:
     held_back: str | None = None
     failing_rules: tuple[str, ...] = ()
     unshipped: str | None = None
+    listed: tuple[str, ...] = ()
     process: str | None = None
     counted_bytes: Count | None = None
     state_bytes: Count = 0

@@ -9,11 +9,12 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from difflib import get_close_matches
 from importlib.util import find_spec
+from itertools import filterfalse
 from pathlib import Path
 from typing import Final
 
@@ -51,6 +52,7 @@ from ros2_memory.core.model import JsonValue, SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
+from ros2_memory.history.coverage import is_whole
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
@@ -71,6 +73,8 @@ _COMMANDS_OF_EXTRAS: Final = (
     ("plot", "matplotlib", "plot"),
 )
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
+_COPY_AGAIN: Final = "answers use the readable part; copy the bags again for the rest"
+_NOTHING_MISSING: Final = "nothing is missing: what it states of itself is wrong, not its messages"
 _NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
 _NOT_REPAIRED: Final = "copy them again from their source, or delete them"
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
@@ -301,11 +305,7 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         files = counted(len(covered.unread), "file is", "files are")
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
         yield _warning("bags", f"{files} not read: {names}", do)
-    if odd := bags_with_remarks(snapshot):
-        bags = counted(len(odd), "bag is not whole", "bags are not whole")
-        names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
-        do = "answers use the readable part; copy the bags again for the rest"
-        yield _warning("bags", f"{bags}: {names}", do)
+    yield from _check_remarks(snapshot)
     for sentence in describe_absent(memory.absent_splits(snapshot)):
         yield _warning("bags", sentence, "copy the missing data from its source")
     # The reason names the key where a configured folder would help.
@@ -318,6 +318,23 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
             yield _warning(
                 "bags", f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do
             )
+
+
+def _check_remarks(snapshot: Snapshot) -> Iterator[Finding]:
+    """Checks that bags are whole, and state of themselves what they hold."""
+    odd = bags_with_remarks(snapshot)
+    for one, many, some, do in (
+        ("bag is not whole", "bags are not whole", [*filterfalse(is_whole, odd)], _COPY_AGAIN),
+        (
+            "bag contradicts itself",
+            "bags contradict themselves",
+            [*filter(is_whole, odd)],
+            _NOTHING_MISSING,
+        ),
+    ):
+        if some:
+            names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in some])
+            yield _warning("bags", f"{counted(len(some), one, many)}: {names}", do)
 
 
 def _how_to_repair(broken: Sequence[SetAside], reader: BagReader, settings: Settings) -> str:
@@ -466,9 +483,13 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
     except EpisodicError as error:
         yield _error("topics", str(error), "correct recording.topics_file")
         return
-    missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching)
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
     live = heartbeat if heartbeat and heartbeat.is_live(now) else None
+    heard = {*live.subscribed} - {*live.silent} if live else set[str]()
+    missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching, heard)
+    if live and live.listed and {*live.listed} != {*selection.listed}:
+        yield _changed_list(file, selection, live)
+        return
     unoffered = live.missing if live else ()
     others = _of_another_list(selection, live) if live else []
     if others:
@@ -498,6 +519,24 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
             yield _warning("topics", f"{entry} is in {file}; {_UNOFFERED}", do)
 
 
+def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding:
+    """Returns the finding on a list that is not the one that the running recorder read."""
+    added = sorted({*selection.listed} - {*live.listed})
+    dropped = sorted({*live.listed} - {*selection.listed})
+    what = [
+        f"{file} {how} {listed(each)}"
+        for how, each in (("adds", added), ("lacks", dropped))
+        if each
+    ]
+    do = (
+        "restart the recorder, which reads the list when it starts (sudo systemctl restart "
+        "ros2-memory-recorder); if it has another list, give this command its settings"
+    )
+    return _warning(
+        "topics", f"the running recorder started with another list: {'; '.join(what)}", do
+    )
+
+
 def _of_another_list(selection: TopicSelection, heartbeat: Heartbeat) -> list[str]:
     """Returns what a running recorder records, or waits for, that the list does not have."""
     waited = [each for each in heartbeat.missing if each not in selection.entries]
@@ -506,13 +545,16 @@ def _of_another_list(selection: TopicSelection, heartbeat: Heartbeat) -> list[st
 
 
 def _unheard_entries(
-    selection: TopicSelection, snapshot: Snapshot, latching: Latching
+    selection: TopicSelection, snapshot: Snapshot, latching: Latching, received: Collection[str]
 ) -> Mapping[str, list[str]]:
-    """Returns the entries without a recent message, with similar names among recorded topics."""
+    """Returns the entries without a recent message, with similar names among recorded topics.
+
+    `received`: of those the recorder has messages, in a split that may not be closed yet.
+    """
     if not snapshot.bags:
         return {}
     latest = snapshot.dating.latest
-    heard = []
+    heard = [*received]
     for topic in snapshot.timeline.topics():
         last = max(each.last for each in snapshot.timeline.totals(topic).values())
         # Nobody expects a latched topic or a log to have a message in every hour.

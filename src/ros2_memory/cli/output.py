@@ -46,6 +46,8 @@ _COMMANDS: Final = {
     "list_recorded_topics": "`ros2-memory topics`",
 }
 """What a person runs in place of a tool that a sentence names."""
+_LISTS_TOOLS: Final = "the tools are: "
+"""In a sentence that lists the tools, each by its name."""
 _WITH_TOOLS: Final = frozenset({"problems", "trust"})
 """Keys of sentences that may name tools."""
 _TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
@@ -97,6 +99,8 @@ def with_local_times(sentence: str) -> str:
 
 def with_commands(sentence: str) -> str:
     """Returns a sentence with commands for the tools that it names, where there is one."""
+    if _LISTS_TOOLS in sentence:
+        return sentence
     return _TOOL_IN_NOTE.sub(lambda found: _COMMANDS[found[0]], sentence)
 
 
@@ -153,7 +157,7 @@ def _format_for_key(key: str, value: JsonValue) -> str:
     A time of a clock that was never set gets its unit.
     """
     if key in _KEYS_OF_TIMES and isinstance(value, int | float) and not _is_time(value):
-        return f"{format_value(value)} s after 1970"
+        return f"{format_value(round(value, 3))} s after 1970"
     if (
         isinstance(value, int | float)
         and key.endswith("_s")

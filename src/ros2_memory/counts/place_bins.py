@@ -17,7 +17,7 @@ from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
-from ros2_memory.places.where import PLACES_SETTING
+from ros2_memory.places.where import places_setting
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +46,8 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
     if not places:
         frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
-            f"by place needs named places in {frames}, and there is none in {PLACES_SETTING}"
+            f"by place needs named places in {frames}, and there is none in "
+            f"{places_setting(view.memory.limits)}"
         )
     track = track_in(view, placement.frame_id, window)
     inside = [

@@ -44,7 +44,8 @@ class QuerySettings:
     Units are the last word of each name. `kept` is how much the recorder keeps; None where nothing
     is recorded, and nothing deleted. `labels` has other spellings by the name that is to be shown.
     `screened`: no split answers before it was searched for what is to be excluded. `recording`: the
-    name of the recording that alone answers; empty where all do.
+    name of the recording that alone answers; empty where all do. `places_file`: where the places
+    were read.
     """
 
     position_tolerance_m: float = 0.5
@@ -65,6 +66,7 @@ class QuerySettings:
     min_score: float = 0.0
     labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
     places: tuple[Place, ...] = ()
+    places_file: str = ""
 
     @property
     def closed_after_s(self) -> float:

@@ -64,12 +64,12 @@ _EDGE_NS: Final = 20 * NS_PER_S
 
 
 def note_unread(
-    view: View, window: TimeWindow, *, nothing: bool = False, search: bool = False
+    view: View, window: TimeWindow, *, nothing: bool = False, search: bool = False, of: str = ""
 ) -> None:
     """Adds notes on data of a window that could not be read.
 
     With `nothing` the answer is that there is nothing. Then, and after a `search`, splits that are
-    listed and missing count too.
+    listed and missing count too. `of` says which window it is, for sentences without a time.
     """
     if window.empty:
         return
@@ -85,7 +85,7 @@ def note_unread(
         for sentence in (
             *describe_deleted(view.snapshot, bag_dir, window),
             *describe_interrupted(view.snapshot, bag_dir, window),
-            *describe_lost(bag_dir, window),
+            *(f"{of}{each}" for each in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         ):
             view.notes.add(sentence)
@@ -245,7 +245,7 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    whole = all(map(_is_whole, view.snapshot.timeline.faulty(window)))
+    whole = all(map(is_whole, view.snapshot.timeline.faulty(window)))
     excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
     forgotten = any(was_forgotten(view.memory.index.bag_dir, each, window) for each in topics)
     forgotten |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
@@ -259,7 +259,7 @@ def _absent(view: View) -> Sequence[SetAside]:
     return absent_files(view.memory.absent_splits(view.snapshot))
 
 
-def _is_whole(bag: BagFile) -> bool:
+def is_whole(bag: BagFile) -> bool:
     """Whether all messages of an odd bag could be read."""
     return bag.state is not BagState.INCOMPLETE and all(
         not note.endswith(MESSAGES_MISSING)

@@ -70,7 +70,7 @@ def compare(
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    region = None if where is None else parse_where(memory.limits.places, where)
+    region = None if where is None else parse_where(memory.limits, where)
     asked, other = TimeWindow.from_unix(start_s, end_s), _other(with_start_s, with_end_s)
     reach = min(max(asked.stop, other.stop), memory.clock.now())
     view = open_view(memory, call, reach)
@@ -85,8 +85,8 @@ def compare(
     places = _places(view, placement, windows, region, elapsed)
     apart = _paths_apart(view, placement, drives, windows, region)
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
-    for each in windows:
-        note_unread(view, each)
+    note_unread(view, windows[0], of="from start to end: ")
+    note_unread(view, windows[1], of="from with_start to with_end: ")
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
     _note_lengths(view, recorded)
     return Comparison(

@@ -142,7 +142,7 @@ def recap(
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    region = None if where is None else parse_where(memory.limits.places, where)
+    region = None if where is None else parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     note_unrecorded(view, window)
     start, end = window.asked()

@@ -81,7 +81,7 @@ def driven_inside(
         NoDataError: there are no poses in the window.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    region = parse_where(memory.limits.places, where)
+    region = parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)
     way = driven_way(view, name, window)

@@ -55,7 +55,7 @@ class Scope:
         self.window = window
         self._inside: list[tuple[Ns, Ns]] | None = None
         if where is not None:
-            region = parse_where(view.memory.limits.places, where)
+            region = parse_where(view.memory.limits, where)
             inside = times_in_region(view, region, window)
             self._inside = [(each.start, each.stop) for each in inside]
         self._states = None if during is None else _States(view, during)

@@ -44,7 +44,7 @@ from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, region_visits, visit_of
-from ros2_memory.places.where import PLACES_SETTING, Where, note_other_frame, parse_where
+from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
@@ -180,14 +180,14 @@ def asked_place(
     if where is not None:
         if x is not None or y is not None:
             raise InvalidArgumentsError("give either where or x and y")
-        return parse_where(limits.places, where, radius)
+        return parse_where(limits, where, radius)
     if x is not None and y is not None:
         return Where(Circle(x, y, radius))
     if x is not None or y is not None:
         raise InvalidArgumentsError("x and y must both be given, or neither")
     if not limits.places:
         raise InvalidArgumentsError(
-            f"no place is named in {PLACES_SETTING}: give x and y, or where"
+            f"no place is named in {places_setting(limits)}: give x and y, or where"
         )
     return None
 

@@ -14,10 +14,9 @@ from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import robot_inside
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from ros2_memory.core.model import JsonValue, TimeWindow
-    from ros2_memory.core.regions import Place, Region
+    from ros2_memory.core.regions import Region
+    from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
     from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.robot_tracks import Inside
@@ -57,12 +56,12 @@ class Where:
 
 
 def parse_where(
-    places: Sequence[Place], value: JsonValue, default_radius_m: float | None = None
+    limits: QuerySettings, value: JsonValue, default_radius_m: float | None = None
 ) -> Where:
     """Returns what a value of the argument `where` means.
 
     Args:
-        places: the named ones.
+        limits: have the named places.
         value: as the client gave it.
         default_radius_m: of a circle without a radius; None where it must have one.
 
@@ -70,7 +69,7 @@ def parse_where(
         InvalidArgumentsError: it is no region, or no place has that name.
     """
     if isinstance(value, str):
-        return _named(places, value)
+        return _named(limits, value)
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"where was {abbreviate(value)}; {_EXPECTED}")
     unknown = value.keys() - {"x", "y", "radius_m"}
@@ -89,13 +88,19 @@ def parse_where(
     return Where(Circle(at_x, at_y, size))
 
 
-def _named(places: Sequence[Place], name: str) -> Where:
+def places_setting(limits: QuerySettings) -> str:
+    """Returns where places are named, with the file that was read."""
+    return f"{PLACES_SETTING}, here {limits.places_file}" if limits.places_file else PLACES_SETTING
+
+
+def _named(limits: QuerySettings, name: str) -> Where:
     asked = " ".join(name.split()).casefold()
-    for place in places:
+    for place in limits.places:
         if " ".join(place.name.split()).casefold() == asked:
             return Where(place.region, place.frame_id, place.name)
-    known = ", ".join(sorted(each.name for each in places))
-    listed = f"there are: {known}" if known else f"none are named in {PLACES_SETTING}; {_EXPECTED}"
+    known = ", ".join(sorted(each.name for each in limits.places))
+    none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
+    listed = f"there are: {known}" if known else none
     raise InvalidArgumentsError(f"where: no place is named {abbreviate(name)}; {listed}")
 
 

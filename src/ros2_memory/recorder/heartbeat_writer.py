@@ -35,6 +35,7 @@ class HeartbeatWriter:
         usage: gives what the budget counts, see `Housekeeper`.
         expected: gives the topics that are to be recorded by name.
         reception: knows what was lost.
+        listed: gives what the list of topics has.
 
     Attributes:
         offered: the topics that some publisher has offered since the start.
@@ -54,11 +55,13 @@ class HeartbeatWriter:
         held_back: Callable[[], str | None] = lambda: None,
         failing_rules: Callable[[], tuple[str, ...]] = tuple,
         unshipped: Callable[[], str | None] = lambda: None,
+        listed: Callable[[], tuple[str, ...]] = tuple,
         usage: Callable[[], tuple[int, int] | None] = lambda: None,
     ) -> None:
         self._held_back = held_back
         self._failing_rules = failing_rules
         self._unshipped = unshipped
+        self._listed = listed
         self._usage = usage
         self._bag_dir = bag_dir
         self._interval_s = interval_s
@@ -120,6 +123,7 @@ class HeartbeatWriter:
             held_back=self._held_back(),
             failing_rules=self._failing_rules(),
             unshipped=self._unshipped(),
+            listed=self._listed(),
             process=process_of(os.getpid()),
             counted_bytes=None if usage is None else usage[0],
             state_bytes=0 if usage is None else usage[1],

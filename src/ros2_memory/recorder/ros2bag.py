@@ -127,6 +127,7 @@ class Ros2BagRecorder(Recorder):
             housekeeper or Housekeeper(),
             WallClock(),
             expected=lambda: self._topics.exact,
+            listed=lambda: self._topics.listed,
             own=self._own,
             reception=self._reception,
         )

@@ -71,6 +71,7 @@ class Supervisor:
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
         expected: gives the topics that are to be recorded by name.
+        listed: gives what the list of topics has.
         own: the list of recordings that were made here.
         reception: plans how topics are subscribed.
 
@@ -90,6 +91,7 @@ class Supervisor:
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
         expected: Callable[[], Sequence[str]] = tuple,
+        listed: Callable[[], tuple[str, ...]] = tuple,
         own: OwnRecordings | None = None,
         reception: Reception | None = None,
     ) -> None:
@@ -114,6 +116,7 @@ class Supervisor:
             usage=housekeeper.usage,
             expected=expected,
             reception=self._reception,
+            listed=listed,
         )
         self._sessions = RecordingSessions(
             orders,

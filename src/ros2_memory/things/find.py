@@ -66,7 +66,7 @@ def find_things(
         QueryTimeoutError: the call's time runs out before any result.
     """
     limits = memory.limits
-    region = None if where is None else parse_where(limits.places, where)
+    region = None if where is None else parse_where(limits, where)
     span = TimeRange(start_s, end_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))

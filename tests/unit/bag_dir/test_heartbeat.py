@@ -37,6 +37,7 @@ NEWER = frozenset(
         "held_back",
         "unshipped",
         "failing_rules",
+        "listed",
         "process",
         "counted_bytes",
         "state_bytes",

@@ -446,3 +446,26 @@ def test_a_recorder_with_another_list_of_topics_is_reported_instead_of_the_topic
         in finding["seen"]
     )
     assert "settings" in finding["do"]
+
+
+def test_a_list_of_topics_that_was_changed_since_the_recorder_started_asks_for_a_restart(
+    robot: Path, capsys: Capture
+) -> None:
+    beat(robot, listed=("/odom", "/gone"))
+    (robot.parent / "topics.yaml").write_text("topics: [/odom, /said]\n")
+    code, wrong = examined(capsys)
+    [finding] = wrong["topics"]
+    assert code == 1
+    assert "adds /said" in finding["seen"]
+    assert "lacks /gone" in finding["seen"]
+    assert finding["do"].startswith("restart the recorder")
+
+
+def test_what_the_recorder_receives_by_now_is_not_missed_in_closed_bags(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot.parent / "topics.yaml").write_text("topics: [/odom, /said]\n")
+    beat(robot, listed=("/odom", "/said"), subscribed=("/odom", "/said"), silent=("/said",))
+    assert any("/said" in each["seen"] for each in examined(capsys)[1]["topics"])
+    beat(robot, listed=("/odom", "/said"), subscribed=("/odom", "/said"))
+    assert "topics" not in examined(capsys)[1]

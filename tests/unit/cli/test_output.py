@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from rich.console import Console
 
-from ros2_memory.cli.output import format_time, format_value, print_reply
+from ros2_memory.cli.output import format_time, format_value, print_reply, with_commands
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -81,7 +81,14 @@ def test_the_rows_of_a_table_have_the_names_of_its_columns() -> None:
 
 def test_a_time_of_a_clock_that_was_never_set_has_its_unit() -> None:
     assert shown({"earliest": 0.0}).split() == ["earliest", "0", "s", "after", "1970"]
-    assert "2e-09 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
+    assert "0 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
+
+
+def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None:
+    assert with_commands("the tools are: list_recorded_topics, visits").endswith(
+        "list_recorded_topics, visits"
+    )
+    assert with_commands("list_recorded_topics lists all") == "`ros2-memory topics` lists all"
 
 
 def test_counts_by_day_are_a_table_whose_last_row_is_of_all() -> None:

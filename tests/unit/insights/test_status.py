@@ -21,7 +21,7 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import memory_of
+from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -131,6 +131,24 @@ def test_an_answer_notes_what_was_lost_in_its_window_alone(
     notes = [note for note in found.notes if "lost" in note]
     assert [note[: note.find(" by")] for note in notes] == ["4 messages missing"][: bool(lost)]
     assert all(note.endswith(": /odom (4)") for note in notes)
+
+
+def test_a_comparison_says_in_which_window_messages_are_missing(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    append_losses(
+        tmp_path,
+        [
+            Loss("/odom", BEGIN + 10 * S, BEGIN + 11 * S, 1, "counter"),
+            Loss("/odom", BEGIN + 30 * S, BEGIN + 31 * S, 6, "counter"),
+        ],
+    )
+    begin = BEGIN / S
+    asks = {"start": begin, "end": begin + 20, "with_start": begin + 21, "with_end": begin + 45}
+    notes = asked(memory, tmp_path, "compare", **asks)["notes"]
+    assert "from start to end: 1 message lost before it was recorded: /odom (1)" in notes
+    assert (
+        "from with_start to with_end: 6 messages lost before they were recorded: /odom (6)" in notes
+    )
 
 
 def test_a_recorder_that_waits_says_for_what(tmp_path: Path) -> None:

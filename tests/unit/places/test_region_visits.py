@@ -135,8 +135,13 @@ def test_what_is_no_place_is_refused(tmp_path: Path, given: dict[str, Any], reas
 
 def test_without_named_places_a_place_must_be_given(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 2, seconds=10)
+    memory = memory_of(tmp_path)
     with pytest.raises(InvalidArgumentsError, match="no place is named"):
-        visits(memory_of(tmp_path), Call())
+        visits(memory, Call())
+    memory = replace(memory, limits=replace(memory.limits, places_file="/home/me/places.yaml"))
+    for unknown in (None, "attic"):
+        with pytest.raises(InvalidArgumentsError, match=r"here /home/me/places\.yaml"):
+            visits(memory, Call(), where=unknown)
 
 
 def test_a_place_of_the_poses_own_frame_is_known_in_a_moving_map_too(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.config import Settings
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.history.view import View
@@ -52,6 +52,7 @@ _MOST_ROWS: Final = 5
 _MOST_SILENT: Final = 30
 _OWN_LISTS: Final = re.compile(r"data_time_range (?:lists them|says why|has the details)")
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
+_SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
@@ -130,7 +131,7 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
 
     None for a latched topic, for a log, whose lines come when something happens, and if no bag has
-    two messages of it.
+    two messages of it, or all came at once.
     """
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
@@ -144,7 +145,9 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     for part in chain.from_iterable(bag.summary.of(topic) for bag in bags):
         intervals += part.count - 1
         duration += part.last - part.first
-    return round(intervals / unix_from_ns(duration), 2) if intervals and duration else None
+    if not intervals or duration < _SHORTEST_RATED_NS:
+        return None
+    return round(intervals / unix_from_ns(duration), 2)
 
 
 def info(

@@ -224,7 +224,7 @@ class _Taking:
         if where is not None:
             with spinner(f"looking when the robot was in {where}"):
                 view = open_view(self._memory, Call(), None)
-                place = parse_where(self._memory.limits.places, where)
+                place = parse_where(self._memory.limits, where)
                 times = times_in_region(view, place, window)
             around = [
                 TimeWindow(each.start - PLACE_MARGIN_NS, each.stop + PLACE_MARGIN_NS + 1)

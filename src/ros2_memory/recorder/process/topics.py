@@ -58,6 +58,11 @@ class TopicSelection:
         return any("/_" in entry for entry in self.entries)
 
     @property
+    def listed(self) -> tuple[str, ...]:
+        """All that the file lists: entries, and then exclusions."""
+        return (*self.entries, *(f"not {each}" for each in self.excluded))
+
+    @property
     def services(self) -> tuple[str, ...]:
         """The entries that are events of services."""
         return tuple(entry for entry in self.entries if entry.endswith(SERVICE_EVENT))
