@@ -158,6 +158,14 @@ def deleted_between(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Sp
 
     Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
     """
+    return [
+        (max(start, window.start), min(stop, window.stop))
+        for start, stop in _deleted_near(snapshot, bag_dir, window)
+    ]
+
+
+def _deleted_near(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Spans:
+    """Returns the same, as far as it reaches out of the window."""
     gone = deleted_spans(bag_dir)
     if not gone:
         return []
@@ -169,7 +177,7 @@ def deleted_between(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Sp
             found += without([gap], _unrecorded(snapshot, gap, gone))
     first, last = window.asked()
     return [
-        (max(start, window.start), min(stop, window.stop))
+        (start, stop)
         for start, stop in found
         if stop - start > snapshot.shortest_gap and start < last and first < stop
     ]
@@ -182,8 +190,8 @@ def deleted_length(view: View, window: TimeWindow) -> Ns:
 
 
 def describe_deleted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on the parts of a window that retention deleted, if it did."""
-    spans = [_span_text(*each) for each in deleted_between(snapshot, bag_dir, window)]
+    """Yields a sentence on what retention deleted of a window, if it did, and around that."""
+    spans = [_span_text(*each) for each in _deleted_near(snapshot, bag_dir, window)]
     if spans:
         named = listed(spans[-MAX_NAMED:], len(spans))
         yield f"recorded, and deleted by retention since: {named}"
