@@ -514,6 +514,8 @@ class Visit:
             nearer between two messages. None where the place is no circle.
         closest_at: log time of that pose; None likewise.
         restarts: how often odometry was reset since.
+        already_inside: it was not seen to enter: `arrived` is when the window, or its poses, begin.
+        still_inside: it was not seen to leave: `departed` is when the window, or its poses, end.
     """
 
     arrived: Ns | None
@@ -522,6 +524,8 @@ class Visit:
     closest_m: float | None
     closest_at: Ns | None
     restarts: int
+    already_inside: bool = False
+    still_inside: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,13 +81,16 @@ def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) 
     distance_m, at = None, None
     if isinstance(where.region, Circle):
         distance_m, at = _closest(found.track, one, where.region)
+    departed = None if there_still and not one.left else one.stop
     return Visit(
         arrived=one.start,
-        departed=None if there_still and not one.left else one.stop,
+        departed=departed,
         duration=found.elapsed.between(one.start, one.stop),
         closest_m=distance_m,
         closest_at=at,
         restarts=0,
+        already_inside=not one.entered,
+        still_inside=not one.left and departed is not None,
     )
 
 

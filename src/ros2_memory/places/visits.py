@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.dwell import Approach, DwellBuilder, Unread
+from ros2_memory.analysis.motion.dwell import FLICKER_NS, Approach, DwellBuilder, Unread
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -64,6 +64,8 @@ _COUNTING_S: Final = 5.0
 """How long visits are counted that are not shown."""
 _ROUNDING_M: Final = 1e-6
 """What rounding of doubles may take off a distance."""
+_FLICKERS: Final = -(-SILENCE_NS // FLICKER_NS)
+"""So many visits may be in the margin of a window: poses just outside decide what is one visit."""
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
 
@@ -120,14 +122,15 @@ def visits(
             places=found,
             notes=view.notes.sentences(),
         )
-    search = _VisitSearch(view, topic, placement, place.region)
-    by_track = where is not None or start_s is not None or end_s is not None
-    by_track = by_track or placement.moves or not isinstance(place.region, Circle)
+    search = _VisitSearch(view, topic, placement, place.region, window)
+    # Named places as the table of all of them has them; a circle in any window by its poses.
+    by_track = placement.moves or place.name is not None or not isinstance(place.region, Circle)
     # In the poses' own frame as in the map: by the track, where that map moves.
     if by_track or (asked == own_frame and map_placement(view, own_frame, topic).moves):
         known = _by_track(view, search, placement.frame_id, place, (window, now, limit))
     else:
-        known = _by_poses(view, search, now, limit)
+        known = _by_poses(view, search, window, now, limit)
+    known = known._replace(shown=tuple(_within_asked(each, window) for each in known.shown))
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
     if not known.total and asked is None:
@@ -158,8 +161,8 @@ class _Known(NamedTuple):
     total: int
     duration: Ns
     newest: Ns | None
-    entries: int | None = None
-    exits: int | None = None
+    entries: int
+    exits: int
 
 
 def asked_place(
@@ -209,25 +212,51 @@ def _by_track(
     return _Known(shown, len(found.all), found.duration, newest, entries, exits)
 
 
-def _by_poses(view: View, search: _VisitSearch, now: Ns, limit: int) -> _Known:
+def _by_poses(view: View, search: _VisitSearch, window: TimeWindow, now: Ns, limit: int) -> _Known:
     """Returns the visits pose by pose."""
     newest = search.newest_time
     known = _is_current(view, newest, now)
-    found, every = search.newest(limit)
-    elapsed = elapsed_in(view, TimeWindow.everything())
-    shown = tuple(
-        Visit(
-            arrived=dwell.arrived if dwell.begun else None,
-            departed=None if known and dwell.departed == newest else dwell.departed,
-            duration=elapsed.between(dwell.arrived, dwell.departed),
-            closest_m=closest.distance_m,
-            closest_at=closest.time,
-            restarts=0,
+    every = search.all(limit)
+    left = [search.has_left(each) for each in every]
+    elapsed = elapsed_in(view, window)
+    lasted = [
+        elapsed.between(max(each.arrived, window.start), min(each.departed, window.stop - 1))
+        for each in every
+    ]
+    shown: list[Visit] = []
+    for dwell, is_left, duration in list(zip(every, left, lasted, strict=True))[:limit]:
+        closest = search.closest(dwell)
+        is_there = known and dwell.departed == newest
+        shown.append(
+            Visit(
+                arrived=max(dwell.arrived, window.start) if dwell.begun else None,
+                departed=None if is_there else min(dwell.departed, window.stop - 1),
+                duration=duration,
+                closest_m=None if closest is None else closest.distance_m,
+                closest_at=None if closest is None else closest.time,
+                restarts=0,
+                already_inside=dwell.begun and not _entered(dwell, window),
+                still_inside=not is_there and (is_left is False or dwell.departed >= window.stop),
+            )
         )
-        for dwell, closest in found
+    entries = sum(_entered(each, window) for each in every)
+    exits = sum(
+        bool(is_left) and each.departed < window.stop
+        for each, is_left in zip(every, left, strict=True)
     )
-    duration = sum(elapsed.between(each.arrived, each.departed) for each in every)
-    return _Known(shown, len(every), duration, newest)
+    return _Known(tuple(shown), len(every), sum(lasted), newest, entries, exits)
+
+
+def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
+    """Returns a visit that is cut at the bounds that were given, not at their tolerance."""
+    start, end = window.asked()
+    if visit.arrived == window.start:
+        visit = replace(visit, arrived=start)
+    return replace(visit, departed=end) if visit.departed == window.stop - 1 else visit
+
+
+def _entered(dwell: Dwell, window: TimeWindow) -> bool:
+    return dwell.entered and dwell.arrived >= window.start
 
 
 def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
@@ -284,13 +313,18 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
 class _VisitSearch:
     """Searches the poses of a topic, newest first, without bags that are ruled out."""
 
-    def __init__(self, view: View, topic: str, placement: MapPlacement, region: Region) -> None:
+    def __init__(
+        self, view: View, topic: str, placement: MapPlacement, region: Region, window: TimeWindow
+    ) -> None:
+        self._window = window
+        # What is one visit, and was entered or left, is decided by poses just outside, too.
+        self._within = window.widened(SILENCE_NS)
         self._view = view
         self._topic = topic
         self._placement = placement
         circle = region if isinstance(region, Circle) else Circle(0.0, 0.0, 0.0)
         self._x, self._y, self._radius = circle.x, circle.y, circle.radius_m
-        self._digests = StoredDigests(view, topic, POSES, TimeWindow.everything())
+        self._digests = StoredDigests(view, topic, POSES, window)
         self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
 
@@ -299,13 +333,13 @@ class _VisitSearch:
         """The log time of the newest pose; None without one."""
         return next((found.time for found, _ in self._positions(TimeWindow.everything())), None)
 
-    def newest(self, limit: int) -> tuple[list[tuple[Dwell, Approach]], list[Dwell]]:
-        """Returns the newest visits, each with its closest approach, and all that there are.
+    def all(self, limit: int) -> list[Dwell]:
+        """Returns the visits, newest first; if the time runs out before all, at least some.
 
-        If the time runs out first, a note says how far back they were counted.
+        A note then says how far back they were counted.
         """
-        visits = DwellBuilder(limit)
-        before = MAX_NS
+        visits = DwellBuilder(limit + _FLICKERS)
+        before = self._within.stop
         try:
             for part in self._parts():
                 self._pass_over(visits, TimeWindow(part.stop, max(before, part.stop)))
@@ -314,6 +348,7 @@ class _VisitSearch:
                 if visits.enough and self._counting is None:
                     self._counting = self._view.call.partial_after(_COUNTING_S)
                 self._check_counting()
+            self._pass_over(visits, TimeWindow(self._within.start, before))
             visits.end()
         except QueryTimeoutError:
             if not visits.all:
@@ -324,7 +359,18 @@ class _VisitSearch:
             self._view.notes.add(
                 f"total counts the visits back to {unix_text(before)}: there may be more"
             )
-        return [(visit, self._closest(visit)) for visit in visits.all[:limit]], visits.all
+        return [each for each in visits.all if self._window.overlaps(each.arrived, each.departed)]
+
+    def has_left(self, visit: Dwell) -> bool | None:
+        """Whether the robot was seen elsewhere just after a visit; None without time to know."""
+        if visit.left is None:
+            after = TimeWindow(visit.departed + 1, visit.departed + SILENCE_NS + 1)
+            try:
+                messages = self._view.stream.messages([self._topic], after)
+                visit.left = any(True for _ in positions_of(self._view, self._decoder, messages))
+            except QueryTimeoutError:
+                self._view.notes.complete = False
+        return visit.left
 
     def _check_counting(self) -> None:
         """Checks that there is time left to count visits that are not shown.
@@ -335,8 +381,8 @@ class _VisitSearch:
         if self._counting is not None and self._counting.expired():
             raise QueryTimeoutError("counting takes too long")
 
-    def _closest(self, visit: Dwell) -> Approach:
-        """Returns the closest pose of a visit, the earliest of equals.
+    def closest(self, visit: Dwell) -> Approach | None:
+        """Returns the closest pose of a visit, the earliest of equals; None where it has none.
 
         Whole bags within the radius are read only where one of their poses may be closer.
         """
@@ -356,7 +402,8 @@ class _VisitSearch:
                 return min(approaches, default=bound)
             closest = min(approaches, default=None)
         # Bags that were deleted meanwhile leave their bounds.
-        return closest or min(each.bound for each in visit.unread)
+        closest = closest or min(each.bound for each in visit.unread)
+        return closest if math.isfinite(closest.distance_m) else None
 
     def _add_approaches(
         self, approaches: list[Approach], window: TimeWindow, target: tuple[float, float]
@@ -369,12 +416,23 @@ class _VisitSearch:
         add_poses(self._view, add, self._decoder, messages, [])
 
     def _parts(self) -> Iterator[TimeWindow]:
-        """Yields the times in which the robot may have been near, newest first."""
+        """Yields the times in which the robot may have been near, newest first.
+
+        Each is in the window as a whole, or beyond it.
+        """
+        start, stop = self._window.start, self._window.stop
+        newer, older = TimeWindow(stop, self._within.stop), TimeWindow(self._within.start, start)
+        for part in self._near():
+            for each in map(part.intersect, (newer, self._window, older)):
+                if not each.empty:
+                    yield each
+
+    def _near(self) -> Iterator[TimeWindow]:
         if self._view.stream.may_be_relatched([self._topic]):
             # A visit may be ended by the duplicate of a pose in a bag that is ruled out.
-            yield TimeWindow.everything()
+            yield self._within
             return
-        bags = self._view.stream.overlapping_bags([self._topic], TimeWindow.everything())
+        bags = self._view.stream.overlapping_bags([self._topic], self._within)
         target = (
             self._target_in(bags[0]) if self._placement.is_fixed(self._topic) and bags else None
         )
@@ -382,7 +440,9 @@ class _VisitSearch:
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:
             near = Condition(NearPosition(*target, None, self._radius))
-        for part in CandidateBags(self._view, (self._topic,), near, MAX_NS).windows():
+        for part in CandidateBags(self._view, (self._topic,), near, self._within.stop).windows():
+            if part.window.stop <= self._within.start:
+                return
             yield part.window
 
     def _pass_over(self, visits: DwellBuilder, gap: TimeWindow) -> None:
@@ -397,6 +457,7 @@ class _VisitSearch:
         """Adds the poses of a part: by their digest where that is enough, else one by one."""
         groups = groups_of(self._view.stream, self._topic, part)
         alone = len(groups) == 1 and groups[0].is_whole and not self._may_have_duplicates(part)
+        alone = alone and self._window.covers(part.start, part.stop - 1)
         target = self._target_in(groups[0].bags[0]) if alone else None
         if target is not None:
             known = self._digests.of(groups[0])
@@ -407,7 +468,8 @@ class _VisitSearch:
             self._check_counting()
             distance = self._distance(found, position)
             if distance is not None and distance <= self._radius:
-                visits.near(Approach(distance, found.time))
+                counts = self._window.contains(found.time)
+                visits.near(Approach(distance if counts else math.inf, found.time))
             else:
                 visits.away(found.time)
 
@@ -427,7 +489,7 @@ class _VisitSearch:
         error_m = digest.error_m + _ROUNDING_M
         bound_m = _off_path(path, target) - error_m
         if bound_m > self._radius:
-            visits.away(first)
+            visits.away(first, last)
             return True
         near = all(_away(position, target) + error_m <= self._radius for position in path)
         if not near or not self._unbroken(group, digest, span):

@@ -225,6 +225,9 @@ def _visit(visit: results.Visit, now: Ns, local: LocalTimes) -> JsonObject:
         **({} if visit.closest_m is None else _closest(visit)),
         "ago_s": 0.0 if visit.departed is None else seconds(now - visit.departed),
     }
+    for name in ("already_inside", "still_inside"):
+        if getattr(visit, name):
+            reply[name] = True
     if visit.restarts:
         reply["restarts_since"] = visit.restarts
     return reply

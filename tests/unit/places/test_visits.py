@@ -362,6 +362,66 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
         assert visits(recalling(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
 
 
+@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5.0, 12.0, 60.0]))
+def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> None:
+    """The same times with and without bounds; a visit under way at one of them is marked."""
+    draw = random.Random(seed)
+    poses, x, y, at = [], 0.0, 0.0, BEGIN
+    for _ in range(300):
+        x, y = x + draw.uniform(-0.3, 0.3), y + draw.uniform(-0.3, 0.3)
+        poses.append((at, x, y))
+        at += draw.choice([S // 5] * 24 + [2 * S] * 6 + [12 * S])
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        plain = remembering(bag_dir, [odom(t, x, y, 0.0) for t, x, y in poses], split_s=split_s)
+        known = recalling(plain, bag_dir)
+        place: dict[str, Any] = {"radius_m": 1.0, "limit": 100}
+        every = visits(plain, Call(), 0.0, 0.0, **place).visits
+        start, end = sorted(draw.sample(range(BEGIN // S, at // S), 2))
+        bounds: dict[str, Any] = {"start_s": float(start), "end_s": float(end)}
+        told = visits(plain, Call(), 0.0, 0.0, **place, **bounds)
+        assert visits(known, Call(), 0.0, 0.0, **place, **bounds) == told
+        circle: dict[str, Any] = {"x": 0.0, "y": 0.0, "radius_m": 1.0}
+        assert visits(plain, Call(), where=circle, limit=100, **bounds) == told
+        inside = [
+            (each.arrived or 0, poses[-1][0] if each.departed is None else each.departed)
+            for each in every
+        ]
+        # Bounds in float seconds have a tolerance of a microsecond or two.
+        cut = [
+            (max(a, start * S), min(b, end * S))
+            for a, b in inside
+            if a <= end * S and b >= start * S
+        ]
+        found = [(each.arrived or 0, each.departed or poses[-1][0]) for each in told.visits]
+        assert found == cut
+        assert told.total == len(told.visits)
+        assert told.entries == sum(not each.already_inside for each in told.visits)
+        cuts = [a < start * S for a, b in inside if a <= end * S and b >= start * S]
+        assert all(
+            each.already_inside for each, is_cut in zip(told.visits, cuts, strict=True) if is_cut
+        )
+
+
+def test_a_visit_that_was_under_way_says_so(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((20, 0.5), (20, -0.5), (20, 0.5)))
+    whole = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0)
+    begin = BEGIN / S
+    [again, first] = whole["visits"]
+    assert first["already_inside"]
+    assert first["arrived"] == begin
+    assert not {"already_inside", "still_inside"} & again.keys()
+    assert (whole["total"], whole["entries"], whole["exits"]) == (2, 1, 2)
+    window = {"start": begin + 1, "end": begin + 40}
+    cut = asked(memory, tmp_path, "visits", x=0.0, y=0.0, radius_m=1.0, **window)
+    [last, first] = cut["visits"]
+    assert (first["already_inside"], first["arrived"]) == (True, begin + 1)
+    assert (last["still_inside"], last["departed"]) == (True, begin + 40)
+    assert last["arrived"] == again["arrived"]
+    assert (cut["total"], cut["entries"], cut["exits"]) == (2, 1, 1)
+
+
 @each_way
 def test_total_counts_the_visits_that_are_not_shown_too(tmp_path: Path, recalls: bool) -> None:
     there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]

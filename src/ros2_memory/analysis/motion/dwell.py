@@ -38,15 +38,19 @@ class Dwell:
     """A visit, which is read from its end backwards.
 
     `closest` is the closest of the poses read one by one; `unread` are the times of the others.
-    `left`: before it, as far as is known, the robot was elsewhere; `begun`: its begin is known.
+    `outside`: before it, as far as is known, the robot was elsewhere; `begun`: its begin is known.
+    `entered`: the last pose before it was elsewhere. `left`: the first one after it was; None where
+    that pose was not taken.
     """
 
     departed: Ns
     arrived: Ns
     closest: Approach | None = None
     unread: list[Unread] = field(default_factory=list)
-    left: bool = False
+    outside: bool = False
     begun: bool = False
+    entered: bool = False
+    left: bool | None = None
 
 
 class DwellBuilder:
@@ -60,6 +64,7 @@ class DwellBuilder:
         self._limit = limit
         self.all: list[Dwell] = []
         self._open: Dwell | None = None
+        self._away_from: Ns | None = None
 
     def near(self, approach: Approach, last: Ns | None = None) -> None:
         """Takes a pose within the radius; with `last`, all until then are at that place."""
@@ -74,21 +79,30 @@ class DwellBuilder:
         """Returns the dwell that goes on from `first` to `last`."""
         dwell = self._open
         if dwell is not None:
-            allowed = FLICKER_NS if dwell.left else SILENCE_NS
+            allowed = FLICKER_NS if dwell.outside else SILENCE_NS
             if dwell.arrived - last > allowed:
                 self.end()
                 dwell = None
         if dwell is None:
-            self._open = dwell = Dwell(last, first)
+            is_left = self._away_from is not None and self._away_from - last <= SILENCE_NS
+            self._open = dwell = Dwell(last, first, left=is_left or None)
             self.all.append(dwell)
         dwell.arrived = first
-        dwell.left = False
+        dwell.outside = dwell.entered = False
+        self._away_from = None
         return dwell
 
-    def away(self, at: Ns) -> bool:
-        """Takes a pose that is elsewhere; returns whether a dwell may still go on further back."""
+    def away(self, at: Ns, last: Ns | None = None) -> bool:
+        """Takes a pose that is elsewhere; returns whether a dwell may still go on further back.
+
+        With `last`, all poses until then are elsewhere.
+        """
+        self._away_from = at
         if self._open is not None:
-            self._open.left = True
+            if not self._open.outside:
+                after = self._open.arrived - (at if last is None else last)
+                self._open.entered = after <= SILENCE_NS
+            self._open.outside = True
             if self._open.arrived - at > FLICKER_NS:
                 self.end()
         return self._open is not None
