@@ -685,7 +685,10 @@ class ComparedMover:
 
 @dataclass(frozen=True, slots=True)
 class ComparedThings:
-    """The things that differ between two windows; `same` counts those that do not."""
+    """The things that differ between two windows; `same` counts those that do not.
+
+    `not_comparable`: seen in both, in the coordinates of different runs of odometry.
+    """
 
     moved: tuple[ComparedThing, ...]
     appeared: tuple[ComparedThing, ...]
@@ -693,6 +696,7 @@ class ComparedThings:
     not_looked_at: tuple[ComparedThing, ...]
     same: int
     movers: tuple[ComparedMover, ...] = ()
+    not_comparable: tuple[ComparedThing, ...] = ()
 
 
 class Pair(NamedTuple):

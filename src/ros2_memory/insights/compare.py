@@ -130,7 +130,7 @@ def _things(
     if len(runs) > 1 and not known.has_map and not _is_one_session(view, windows):
         view.notes.add(
             "things are not recognised from one run of odometry to another, which has its own "
-            "coordinates: one that stayed where it was is in not_looked_at for each run"
+            "coordinates: one whose label was seen in both windows is in not_comparable"
         )
     return frame, ThingsBetween(known, (first, second), where, limits.places).compared()
 

@@ -3,13 +3,17 @@
 A thing that was seen in both is compared by where it was seen last in each. One that was seen in
 the later alone *appeared* only where its place was looked at in the earlier one, from where it is
 seen, so often that missing it by chance is below 1 %. One that was seen in the earlier alone is
-reported as not seen where expected by the same rule, and else as not looked at. What moves by
-itself has no place: it is compared by whether it was seen, how many at once, and where last.
+reported as not seen where expected by the same rule, and else as not looked at. One of each kind,
+with one label, in odometry that began again between them may be one thing: it was seen in both, and
+its places cannot be compared. What moves by itself has no place: it is compared by whether it was
+seen, how many at once, and where last.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -62,6 +66,7 @@ class ThingsBetween:
     def compared(self) -> ComparedThings:
         """Returns what differs, each list with those seen last first."""
         lists: dict[str, list[ComparedThing]] = {}
+        unknown: list[tuple[Instance, ComparedThing]] = []
         same = 0
         for instance in self._known.estimate.instances:
             found = self._compared(instance)
@@ -70,8 +75,11 @@ class ThingsBetween:
             kind, thing = found
             if thing is None:
                 same += 1
+            elif kind == "unknown":
+                unknown.append((instance, thing))
             else:
                 lists.setdefault(kind, []).append(thing)
+        lists["unknown"], lists["both"] = _in_both(unknown)
         for each in lists.values():
             each.sort(key=_by_time)
         return ComparedThings(
@@ -81,10 +89,12 @@ class ThingsBetween:
             not_looked_at=tuple(lists.get("unknown", ())),
             same=same,
             movers=tuple(sorted(self._movers(), key=_mover_order)),
+            not_comparable=tuple(lists["both"]),
         )
 
     def _movers(self) -> Iterator[ComparedMover]:
         """Yields what moves by itself and was not seen alike in both windows."""
+        alone: dict[str, list[ComparedMover]] = {}
         for mover in self._known.estimate.movers:
             before = self._mover_in(mover, self._earlier, self._later.start)
             after = self._mover_in(mover, self._later)
@@ -94,7 +104,17 @@ class ThingsBetween:
                 away = math.dist(before.place[:2], after.place[:2])
                 if before.at_once == after.at_once and away <= _SAME_MOVER_M:
                     continue
-            yield ComparedMover(self._known.estimate.names[mover.key], before, after)
+            found = ComparedMover(self._known.estimate.names[mover.key], before, after)
+            if before is None or after is None:
+                alone.setdefault(found.label, []).append(found)
+            else:
+                yield found
+        for label, some in alone.items():
+            # In each run of odometry it is another mover: one of each window is one row.
+            before_ = [each.before for each in some if each.before is not None]
+            after_ = [each.after for each in some if each.after is not None]
+            for was, seen in zip_longest(before_, after_):
+                yield ComparedMover(label, was, seen)
 
     def _mover_in(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
         estimate, frame = self._known.estimate, self._known.frames[mover.epoch]
@@ -210,6 +230,33 @@ class ThingsBetween:
             count=int(np.sum(estimate.counts[seen.spots])),
             inside=places_at(self._places, frame, stay.x / _MM, stay.y / _MM),
         )
+
+
+def _in_both(
+    unknown: Sequence[tuple[Instance, ComparedThing]],
+) -> tuple[list[ComparedThing], list[ComparedThing]]:
+    """Returns the things that were seen in one window alone, and those that were seen in both.
+
+    A thing of the earlier window and one of the later with its label, in another odometry, are
+    taken as one.
+    """
+    waiting: dict[str, list[tuple[Instance, ComparedThing]]] = {}
+    for instance, thing in unknown:
+        if thing.before is None:
+            waiting.setdefault(instance.key, []).append((instance, thing))
+    alone: list[ComparedThing] = []
+    both: list[ComparedThing] = []
+    for instance, thing in unknown:
+        if thing.before is None:
+            continue
+        others = waiting.get(instance.key, [])
+        match = next((each for each in others if each[0].epoch != instance.epoch), None)
+        if match is None:
+            alone.append(thing)
+        else:
+            others.remove(match)
+            both.append(replace(thing, after=match[1].after))
+    return alone + [thing for some in waiting.values() for _, thing in some], both
 
 
 def _by_time(thing: ComparedThing) -> tuple[int, str]:

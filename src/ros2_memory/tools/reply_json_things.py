@@ -187,6 +187,7 @@ def _compared_things(things: results.ComparedThings, most: int) -> JsonObject:
         ("appeared", things.appeared, most),
         ("not_seen_where_expected", things.missed, most),
         ("not_looked_at", things.not_looked_at, most),
+        ("not_comparable", things.not_comparable, most),
     ):
         _list(reply, key, [_compared_thing(each) for each in found], shown)
     _list(reply, "movers", [_compared_mover(each) for each in things.movers], most)

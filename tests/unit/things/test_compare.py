@@ -229,11 +229,33 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     assert not reply.keys() & {"stood_at", "farthest_apart"}
     assert any("changes with every start" in note for note in reply["notes"])
     assert any("from one run of odometry to another" in note for note in reply["notes"])
+    # It was seen in both windows, so that one was not "not looked at".
+    [book] = reply["things"]["not_comparable"]
+    assert labels(reply) == {"not_comparable": ["book"]}
+    assert (book["was"]["last_seen"], book["is"]["first_seen"]) == (BEGIN + 29, BEGIN + 60)
     write(tmp_path / "one", [each for one in (*stood, *later) for each in one])
     reply = ask(tmp_path / "one", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2
     assert reply["frame_id"] == "odom"
     assert not any("from one run" in note for note in reply.get("notes", ()))
+
+
+def test_of_odometry_that_began_anew_only_what_one_window_saw_was_not_looked_at(
+    tmp_path: Path,
+) -> None:
+    person = ("person", 3.0, 0.5)
+    first = [scene(at, HERE, [BOOK, ("book", 3.5, 1.5), person], in_map=False) for at in range(30)]
+    second = [scene(at, HERE, [BOOK, MUG, person], in_map=False) for at in range(60, 90)]
+    for name, some in (("first", first), ("second", second)):
+        write(tmp_path, [each for one in some for each in one], name=name)
+    reply = ask(tmp_path, **EARLIER, **LATER)
+    assert labels(reply) == {
+        "not_comparable": ["book"],
+        "not_looked_at": ["mug", "book"],
+        "movers": ["person"],
+    }
+    [mover] = reply["things"]["movers"]
+    assert mover.keys() == {"label", "was", "is"}
 
 
 def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
