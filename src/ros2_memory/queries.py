@@ -43,7 +43,7 @@ from ros2_memory.history.coverage import (
     recording_gaps,
     unix_text,
 )
-from ros2_memory.history.driven_path import driven_path
+from ros2_memory.history.driven_path import body_by_transforms, driven_path, resolve_path_topic
 from ros2_memory.history.no_data import (
     decode,
     describe_lack,
@@ -54,8 +54,6 @@ from ros2_memory.history.no_data import (
     resolve_pose_topic,
     resolve_topic,
     seconds,
-    topics_that_show_poses,
-    topics_with,
     with_notes,
 )
 from ros2_memory.history.reverse_search import (
@@ -91,7 +89,7 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
-from ros2_memory.places.pose_frames import placed, placed_waypoints, robot_body, with_place
+from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -230,9 +228,7 @@ def _position_of_body(
     Raises:
         NoDataError: no transform brackets the moment.
     """
-    if topics_with(view, "position") or topics_that_show_poses(view):
-        return None
-    body = robot_body(view)
+    body = body_by_transforms(view)
     if body is None:
         return None
     parent = frame_id or body.parent
@@ -480,7 +476,7 @@ def trajectory_summary(
     Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
     """
     view, window = open_span(memory, call, span)
-    name = resolve_pose_topic(view, topic)
+    name = resolve_path_topic(view, topic)
     path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
     if path is None:
         raise no_data_between(view, (name,), window)

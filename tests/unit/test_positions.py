@@ -307,14 +307,73 @@ def test_transforms_alone_give_the_position_and_name_the_tools_for_them(
     ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", moved)
     reply = ask(tmp_path, recalls, tool, **given)
+    assert reply["notes"][0].startswith("by transforms, of base_link in odom")
+    assert reply["frame_id"] == "odom"
     if tool == "get_position_at":
-        assert (reply["x"], reply["frame_id"], reply["topic"]) == (1.0, "odom", "/tf")
-        assert reply["notes"][0].startswith("by transforms, of base_link in odom")
+        assert (reply["x"], reply["topic"]) == (1.0, "/tf")
+    elif tool == "visits":
+        [visit] = reply["visits"]
+        assert visit["arrived"] == T0_S
+        assert visit["departed"] == pytest.approx(T0_S + 0.5, abs=0.01)
     else:
-        assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
-        assert "transforms are on /tf: get_position_at answers by them" in reply["detail"]
+        assert (reply["distance_m"], reply["topic"]) == (2.0, "/tf")
+    refused = ask(tmp_path, recalls, "get_velocity_at", timestamp=T0_S + 1)["detail"]
+    assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
     asked_for = {"parent": "odom", "child": "base_link", "timestamp": T0_S + 1}
     assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
+
+
+@each_way
+def test_the_path_by_transforms_is_that_by_poses(tmp_path: Path, recalls: bool) -> None:
+    """In the map, which drifts: a drive and a standstill at 10 Hz."""
+    transforms: list[Msg] = []
+    poses: list[Msg] = []
+    for nth in range(300):
+        at, x = T0 + nth * S // 10, min(nth / 10, 10.0)
+        odometry = transform(at, "odom", "base_link", (x, 0.0, 0.0))
+        drift = transform(at, "map", "odom", (0.0, nth / 10000, 0.0))
+        transforms += [tf(at, odometry), tf(at, drift)]
+        poses.append(odom(at, x, nth / 10000, 0.0))
+    write_mcap(tmp_path / "tf" / "rec_0" / "rec_0_0.mcap", transforms)
+    write_mcap(tmp_path / "poses" / "rec_0" / "rec_0_0.mcap", poses)
+    door = Place("door", "map", Circle(10.0, 0.3, 1.0))
+    span = {"start": T0_S, "end": T0_S + 30}
+    where = {"x": 5.0, "y": 0.0, "radius_m": 1.0}
+    by: dict[str, Any] = {}
+    for each, limits in (("tf", {"places": (door,)}), ("poses", {"map_frame": "odom"})):
+        by[each] = {
+            tool: ask(tmp_path / each, recalls, tool, **given, limits=limits)
+            for tool, given in (
+                ("trajectory_summary", span),
+                ("recap", span),
+                ("visits", {"where": where, **span}),
+            )
+        }
+    for tool, keys in (
+        ("trajectory_summary", ("distance_m", "max_speed", "duration_s")),
+        ("recap", ("distance_m", "stood_s")),
+        ("visits", ("total", "entries", "exits", "minutes")),
+    ):
+        one, other = by["tf"][tool], by["poses"][tool]
+        assert [one[key] for key in keys] == pytest.approx([other[key] for key in keys], abs=0.11)
+        assert one["notes"][0].startswith("by transforms, of base_link in map"), tool
+    [stop] = [each for each in by["tf"]["recap"]["events"] if each["text"].startswith("stood")]
+    assert stop["in"] == "door"
+    there = ask(tmp_path / "tf", recalls, "visits", limits={"places": (door,)})["places"]
+    assert (there[0]["place"], there[0]["entries"]) == ("door", 1)
+
+
+def test_a_path_by_transforms_has_a_bound(tmp_path: Path) -> None:
+    for nth in range(130):
+        at = T0 + nth * 10 * S
+        moved = [
+            tf(at + n * S, transform(at + n * S, "odom", "base_link", (0, 0, 0))) for n in range(2)
+        ]
+        write_mcap(tmp_path / "rec_0" / f"rec_0_{nth}.mcap", moved)
+    refused = ask(tmp_path, False, "visits", x=0.0, y=0.0)
+    assert refused["error"] == "invalid_arguments"
+    assert "read from 128 bags at most: these are 130; ask about a shorter" in refused["detail"]
+    assert ask(tmp_path, False, "visits", x=0.0, y=0.0, start=T0_S, end=T0_S + 99)["total"] == 1
 
 
 def test_the_body_is_placed_in_the_map_and_in_a_named_place(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ class FrameGraph:
     """
 
     def __init__(self, transforms: Iterable[StampedTransform], clock: TfClock = "stamp") -> None:
-        self._clock: TfClock = clock
+        self.clock: TfClock = clock
         self._histories = self._histories_of(transforms)
         self._neighbours: defaultdict[str, set[str]] = defaultdict(set)
         for history in self._histories.values():
@@ -199,7 +199,7 @@ class FrameGraph:
                 if child not in static or static[child][0] <= entry.log_time:
                     static[child] = (entry.log_time, edge)
             else:
-                time = entry.stamp if self._clock == "stamp" else entry.log_time
+                time = entry.stamp if self.clock == "stamp" else entry.log_time
                 dynamic[child].append((time, entry.log_time, order, edge))
         histories = {child: _History(child, static=edge) for child, (_, edge) in static.items()}
         for child, entries in dynamic.items():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.motion.odometry import is_place
@@ -15,21 +17,38 @@ from ros2_memory.analysis.motion.trajectory import (
     joined_poses,
 )
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
-from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.bag_fold import Fold
 from ros2_memory.history.bag_groups import DigestKind, store_shared
-from ros2_memory.history.no_data import describe_lack, undecodable, with_notes
+from ros2_memory.history.no_data import (
+    describe_lack,
+    resolve_pose_topic,
+    topics_that_show_poses,
+    topics_with,
+    undecodable,
+    with_notes,
+)
+from ros2_memory.history.transforms import (
+    edges,
+    graph_of,
+    moving_in,
+    sessions_of,
+    static_at,
+    static_changes,
+    static_transforms,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from ros2_memory.analysis.bulk_decode import MotionDecoder
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import Pose, Vector3
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.analysis.transform_tree import FrameGraph
+    from ros2_memory.core.model import Vector3
     from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -39,6 +58,12 @@ _MOST_AT_ONCE: Final = 1024
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _MOST_BYTES_AT_ONCE: Final = 1 << 20
+_BODIES: Final = ("base_footprint", "base_link")
+_NO_POSES: Final = "no topic has the robot's poses"
+_MOST_BAGS_OF_BODY: Final = 128
+"""Bags of which transforms are read for a path, as no digest has them."""
+_STEP_NS: Final[Ns] = NS_PER_S // 20
+"""Poses by transforms are no closer than this."""
 
 
 AddPose: TypeAlias = "Callable[[Ns, Pose, float | None], None]"
@@ -78,6 +103,12 @@ def driven_path(
     fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(fastest, max_waypoints)
+    if topic in view.memory.limits.tf_topics:
+        poses = poses_of_body(view, window)
+        for time, pose in poses:
+            builder.add(time, pose, None)
+        ends = (poses[0][0], poses[-1][0]) if poses else None
+        return None if ends is None else DrivenPath(builder.result(), builder.frames, *ends)
     decoder = motion_decoder(view.memory.reader, view.memory.extractor)
 
     def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest, Span | None]:
@@ -232,6 +263,9 @@ def pose_frame(view: View, topic: str) -> str:
         InvalidArgumentsError: the topic's messages carry no position.
         UndecodableError: none of the newest ones can be decoded.
     """
+    body = body_by_transforms(view) if topic in view.memory.limits.tf_topics else None
+    if body is not None:
+        return body.parent
     failure: UndecodableError | None = None
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
     for found in islice(newest, _MOST_TRIED):
@@ -249,3 +283,120 @@ def pose_frame(view: View, topic: str) -> str:
     if failure is not None:
         raise failure
     return ""
+
+
+class Body(NamedTuple):
+    """The robot's body among the frames that move: `child` in `parent`, and the other frames."""
+
+    parent: str
+    child: str
+    others: tuple[str, ...]
+
+
+def robot_body(view: View) -> Body | None:
+    """Returns the robot's body by its transforms; None where none of them moves.
+
+    By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
+    in the root of its frames.
+    """
+    known = edges(view)
+    parents = {each.child: each.parent for each in known}
+    moving = [each.child for each in known if not each.static]
+    if not moving:
+        return None
+    above = {child: _above(child, parents) for child in moving}
+    body = min(moving, key=lambda each: (_rank(each), len(above[each]), each))
+    map_frame = view.memory.limits.map_frame
+    root = map_frame if map_frame in above[body] else above[body][-1]
+    return Body(root, body, tuple(sorted({each for each in moving if each != body})))
+
+
+def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
+    """Returns the frames above a frame, the nearest first; a loop ends it."""
+    found: list[str] = []
+    while frame in parents and parents[frame] not in found:
+        frame = parents[frame]
+        found.append(frame)
+    return found
+
+
+def _rank(frame: str) -> int:
+    name = frame.rpartition("/")[2]
+    return _BODIES.index(name) if name in _BODIES else len(_BODIES)
+
+
+def body_by_transforms(view: View) -> Body | None:
+    """Returns the robot's body where transforms alone show it; None where a topic has its poses.
+
+    None for a lake, too, which has no transforms of any moment.
+    """
+    if view.memory.stated is not None:
+        return None
+    if topics_with(view, "position") or topics_that_show_poses(view):
+        return None
+    return robot_body(view)
+
+
+def resolve_path_topic(view: View, name: str | None = None) -> str:
+    """Returns the topic of the robot's path: that of its poses, else with a note of transforms.
+
+    Raises:
+        NoDataError: as for `resolve_pose_topic`.
+    """
+    topics = view.memory.limits.tf_topics
+    body = body_by_transforms(view) if name is None or name in topics else None
+    if body is None:
+        return resolve_pose_topic(view, name)
+    view.notes.add(f"by transforms, of {body.child} in {body.parent}: {_NO_POSES}")
+    return next(each for each in topics if each in view.snapshot.timeline.topics())
+
+
+def poses_of_body(
+    view: View, window: TimeWindow, frame_id: str | None = None
+) -> list[tuple[Ns, Pose]]:
+    """Returns the poses of the robot's body by transforms, in order; none without such a body.
+
+    In the map or the root of its frames, or in `frame_id`. At most twenty a second, as digests hold
+    none of them: all are looked up for each question.
+
+    Raises:
+        InvalidArgumentsError: there are too many bags for that.
+        QueryTimeoutError: the call's time runs out.
+    """
+    body = body_by_transforms(view)
+    if body is None:
+        return []
+    recorded = view.snapshot.timeline.topics()
+    topics = [each for each in view.memory.limits.tf_topics if each in recorded]
+    bags = view.stream.overlapping_bags(topics, window)
+    if len(bags) > _MOST_BAGS_OF_BODY:
+        raise InvalidArgumentsError(
+            f"{_NO_POSES}, and by transforms a path is read from {_MOST_BAGS_OF_BODY} bags at "
+            f"most: these are {len(bags)}; ask about a shorter window"
+        )
+    poses: dict[Ns, Pose] = {}
+    sessions = sessions_of(view)
+    for session in dict.fromkeys(sessions.of(each.bag.recording) for each in bags):
+        moving = moving_in(view, window, session)
+        static = static_transforms(view, session)
+        changes = static_changes(static)
+        graphs: dict[int, FrameGraph] = {}
+        last = MIN_NS
+        for each in moving:
+            at = each.log_time
+            is_due = window.contains(at) and at - last >= _STEP_NS
+            if not is_due or each.child.lstrip("/") != body.child:
+                continue
+            number = bisect_right(changes, at)
+            if number not in graphs:
+                valid_then = static_at(static, changes[number - 1] if number else MIN_NS)
+                graphs[number] = graph_of(view, valid_then, moving)
+            graph = graphs[number]
+            parent = frame_id or body.parent
+            moment = each.stamp if graph.clock == "stamp" else at
+            with suppress(NoDataError):  # before the first transform of the map, or in its gap
+                found = graph.lookup(parent, body.child, moment)
+                poses[at] = Pose(found.translation, found.rotation, parent)
+                last = at
+        view.bags.check_deadline()
+    return sorted(poses.items())

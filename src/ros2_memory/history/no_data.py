@@ -164,8 +164,8 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
     if moving := _transform_topics(view):
         return (
             f", nor another with {those}; transforms are on {listed(moving)}: get_position_at "
-            "answers by them, get_transform_at returns the pose of one frame in another, and "
-            "list_frames lists the frames"
+            "and trajectory_summary answer by them, get_transform_at returns the pose of one frame "
+            "in another, and list_frames lists the frames"
         )
     if what == "velocity" and topics_with(view, "geodetic"):
         return ", nor another with velocities"

@@ -36,8 +36,12 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.bag_fold import Fold
 from ros2_memory.history.bag_groups import DigestKind, store_shared
-from ros2_memory.history.driven_path import add_poses, driven_path
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import (
+    add_poses,
+    driven_path,
+    poses_of_body,
+    resolve_path_topic,
+)
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 from ros2_memory.insights.silences import unrecorded_length
@@ -108,7 +112,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     """Returns how the robot moved; nothing, with a note, if that is unknown."""
     elapsed = elapsed_in(view, window)
     try:
-        topic = resolve_pose_topic(view)
+        topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
         path = driven_path(view, topic, window, _NO_WAYPOINTS)
         standstills, drops = _standstills_in(view, topic, window)
@@ -216,7 +220,7 @@ def _standstills_in(
         span = _add_places(view, collector, decoder, messages, failures)
         return collector.digest(), span
 
-    Fold(
+    fold = Fold(
         _STANDSTILLS,
         add=lambda messages: _add_places(view, builder, decoder, messages, failures),
         collect=collect,
@@ -225,7 +229,12 @@ def _standstills_in(
         encode=_encoded,
         decode=decode_standstill_run,
         failures=failures,
-    ).over(view, topic, _whole_bags(view, topic, window.widened(CONTEXT_NS)))
+    )
+    if topic in view.memory.limits.tf_topics:
+        for time, pose in poses_of_body(view, window.widened(CONTEXT_NS)):
+            builder.add(time, pose.position, pose.orientation)
+    else:
+        fold.over(view, topic, _whole_bags(view, topic, window.widened(CONTEXT_NS)))
     found = builder.standstills()
     begins = [each.start for each in found]
     standstills = tuple(

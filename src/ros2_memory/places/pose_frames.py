@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING
 
 from ros2_memory.analysis.bag_frames import HOLD_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
@@ -17,18 +17,16 @@ from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import abbreviate, counted
-from ros2_memory.history.transforms import connects, edges, transform_at
+from ros2_memory.history.transforms import connects, transform_at
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import BagSpan
     from ros2_memory.history.view import View
-
-_BODIES: Final = ("base_footprint", "base_link")
 
 
 def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
@@ -60,46 +58,6 @@ def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | No
     if found is None and frame_id is not None:
         raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
     return pose if found is None else found
-
-
-class Body(NamedTuple):
-    """The robot's body among the frames that move: `child` in `parent`, and the other frames."""
-
-    parent: str
-    child: str
-    others: tuple[str, ...]
-
-
-def robot_body(view: View) -> Body | None:
-    """Returns the robot's body by its transforms; None where none of them moves.
-
-    By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
-    in the root of its frames.
-    """
-    known = edges(view)
-    parents = {each.child: each.parent for each in known}
-    moving = [each.child for each in known if not each.static]
-    if not moving:
-        return None
-    above = {child: _above(child, parents) for child in moving}
-    body = min(moving, key=lambda each: (_rank(each), len(above[each]), each))
-    map_frame = view.memory.limits.map_frame
-    root = map_frame if map_frame in above[body] else above[body][-1]
-    return Body(root, body, tuple(sorted({each for each in moving if each != body})))
-
-
-def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
-    """Returns the frames above a frame, the nearest first; a loop ends it."""
-    found: list[str] = []
-    while frame in parents and parents[frame] not in found:
-        frame = parents[frame]
-        found.append(frame)
-    return found
-
-
-def _rank(frame: str) -> int:
-    name = frame.rpartition("/")[2]
-    return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
 
 def placed_waypoints(

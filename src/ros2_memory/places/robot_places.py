@@ -20,8 +20,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.regions import places_at
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.driven_path import pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks
 
@@ -87,7 +86,7 @@ def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) ->
         InvalidArgumentsError: no position is given in `frame_id`.
     """
     try:
-        topic = resolve_pose_topic(view)
+        topic = resolve_path_topic(view)
         own = pose_frame(view, topic)
     except (InvalidArgumentsError, NoDataError, UndecodableError):
         return None

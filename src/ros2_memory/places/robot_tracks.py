@@ -6,16 +6,19 @@ a week costs milliseconds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, track_of
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.geometry import yaw
 from ros2_memory.core.regions import Steps, parts_inside
 from ros2_memory.history.context import READING_S
+from ros2_memory.history.driven_path import body_by_transforms, poses_of_body
 from ros2_memory.places.map_digests import MapDigests
 
 if TYPE_CHECKING:
@@ -74,6 +77,8 @@ class RobotTracks:
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
         """
+        if body_by_transforms(self._view) is not None:
+            return JoinedTrack(_track_of_body(self._view, self._frame_id, window))
         parts: list[RobotTrack] = []
         since: Ns | None = None
         left_out = 0
@@ -151,6 +156,18 @@ class RobotTracks:
         elsewhere = sum(len(each.track.times) for each in found if each.frame_id != self._frame_id)
         track = _joined([each.track for each in here])
         return track, sum(each.left_out for each in here) + elsewhere
+
+
+def _track_of_body(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
+    """Returns the track by transforms, where no topic has the robot's poses."""
+    poses = poses_of_body(view, window.widened(SILENCE_NS), frame_id)
+    turns = [None if each.orientation is None else yaw(each.orientation) for _, each in poses]
+    return track_of(
+        np.array([time for time, _ in poses], np.int64),
+        np.array([each.position[0] for _, each in poses], np.float64),
+        np.array([each.position[1] for _, each in poses], np.float64),
+        np.array([math.nan if each is None else each for each in turns], np.float64),
+    )
 
 
 class _PartlyReadError(Exception):

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, Ns
-from ros2_memory.history.driven_path import pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.where import note_other_frame, parse_where, times_inside
@@ -104,7 +103,7 @@ def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside
         NoDataError: no pose is recorded.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    topic = resolve_pose_topic(view)
+    topic = resolve_path_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
     found = times_inside(view, where, placement.frame_id, window)
     if not found:

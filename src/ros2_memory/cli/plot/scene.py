@@ -18,6 +18,7 @@ from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import recording_gaps
+from ros2_memory.history.driven_path import body_by_transforms
 from ros2_memory.history.no_data import GIVE_TOPIC, require_bags
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
@@ -158,8 +159,11 @@ def path_in(
         InvalidArgumentsError: the topic has no poses, or nothing places them in the frame.
         NoDataError: there is none in this time.
     """
-    if topic is not None and (other := path_without_poses(asked.view, asked.window, topic, frame)):
-        return other
+    by_transforms = topic is None and body_by_transforms(asked.view) is not None
+    if topic is not None or by_transforms:
+        other = path_without_poses(asked.view, asked.window, topic, frame)
+        if other is not None:
+            return other
     map_frame = asked.memory.limits.map_frame
     for each in (frame,) if frame is not None else (map_frame, None):
         try:

@@ -12,9 +12,9 @@ import numpy as np
 from ros2_memory.cli.output import format_duration
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.driven_path import Body, robot_body
 from ros2_memory.history.no_data import topics_that_show_poses, topics_with
 from ros2_memory.history.transforms import transform_at
-from ros2_memory.places.pose_frames import Body, robot_body
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
