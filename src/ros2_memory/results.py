@@ -8,7 +8,7 @@ only. `now` is what ages count from.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -344,7 +344,8 @@ class Before(AnswerWithNotes):
         length: how long before it changes count.
         changes: nearest first.
         more: how many others there are.
-        recorded: the topics that would show a change and were recorded at the time.
+        looked_at: the topics that would show a change and were recorded at the time.
+        recorded: how many topics were recorded then in all.
         robot: where the robot was; None where that is not known.
         speed_mps: from its pose topic.
         state: booleans, statuses that are not ok and the goal of each action, at that time.
@@ -355,7 +356,8 @@ class Before(AnswerWithNotes):
     length: Ns
     changes: tuple[PastChange, ...]
     more: int
-    recorded: tuple[str, ...]
+    looked_at: tuple[str, ...]
+    recorded: int
     robot: Pose | None
     speed_mps: float | None
     state: tuple[tuple[str, bool | str], ...]
@@ -454,6 +456,10 @@ class Budget:
     state: int = 0
 
 
+ANOTHER: Final = "another program"
+"""The recorder of a status where this program has none, and files are being written."""
+
+
 @dataclass(frozen=True, slots=True)
 class Status(AnswerWithNotes):
     """How complete and how recent the recorded data is.
@@ -550,7 +556,8 @@ class Visits(AnswerWithNotes):
     Attributes:
         where: the name of the place, where it has one.
         x: of a circle, with y and radius_m; None of another region.
-        total: how many were found; a note says so where there may be more.
+        total: how many were found.
+        all_counted: whether these are all; a note says how far back they were counted.
         duration: of all of these.
         entries: in how many of them the robot was seen to enter; None where that is not known.
         exits: likewise, to leave.
@@ -568,6 +575,7 @@ class Visits(AnswerWithNotes):
     duration: Ns = 0
     entries: int | None = None
     exits: int | None = None
+    all_counted: bool = True
     where: str | None = None
     places: tuple[PlaceVisits, ...] | None = None
 
@@ -644,6 +652,7 @@ class Things(AnswerWithNotes):
     total: int
     labels: tuple[tuple[str, int], ...]
     now: Ns
+    all_counted: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -220,7 +220,12 @@ def _from_json(text: str, otherwise: str | None) -> JsonValue:
 def _takes_text(schema: Mapping[str, object], key: str) -> bool:
     properties = schema.get("properties")
     known = properties.get(key) if isinstance(properties, dict) else None
-    return isinstance(known, dict) and known.get("type") == "string"
+    if not isinstance(known, dict):
+        return False
+    several = known.get("anyOf")
+    kinds = [dict(each).get("type") for each in several] if isinstance(several, list) else ()
+    # A list in place of one text is read from its JSON by the argument itself.
+    return known.get("type") == "string" or kinds == ["string", "array"]
 
 
 def _without_waypoints(answer: JsonValue) -> JsonValue:

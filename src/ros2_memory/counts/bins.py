@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
@@ -28,6 +29,8 @@ By: TypeAlias = Literal["day", "hour", "weekday", "place"]
 Values: TypeAlias = "Sequence[float | None]"
 
 
+_MOST_SPANS: Final = 6
+"""Times without a row that are named."""
 MOST_CELLS: Final = 124
 """Fields, or places, of all bins together that one reply has room for."""
 
@@ -190,21 +193,36 @@ class BinnedWindow:
         """Returns the answer, with notes on what could not be read."""
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
-        rows = zip(*self._values, strict=True)
+        columns = zip(*self._values, strict=True)
+        rows = [*zip(self.bins.names, columns, strict=True)]
+        empty = [not any(values) for _, values in rows]
+        if self._by != "place":
+            self._note_empty(empty)
+            rows = [row for row, is_empty in zip(rows, empty, strict=True) if not is_empty]
         return Bins(
             by=self._by,
             about=self._topics,
             start=self.window.start,
             end=self.window.stop,
             columns=tuple(self._columns),
-            rows=tuple(
-                (name, tuple(values)) for name, values in zip(self.bins.names, rows, strict=True)
-            ),
+            rows=tuple(rows),
             all=tuple(self._all),
             usual=self.usual,
             usual_exit=self.usual_exit,
             notes=self.view.notes.sentences(),
         )
+
+    def _note_empty(self, empty: Sequence[bool]) -> None:
+        """Notes the bins in which nothing was recorded: several in a row by the first and last."""
+        spans: list[str] = []
+        for is_empty, some in groupby(zip(empty, self.bins.names, strict=True), lambda e: e[0]):
+            names = [name for _, name in some]
+            if is_empty:
+                spans.append(names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}")
+        if spans:
+            more = len(spans) - _MOST_SPANS
+            shown = ", ".join(spans[:_MOST_SPANS]) + (f" and {more} more" if more > 0 else "")
+            self.view.notes.add(f"no rows for times in which nothing was recorded: {shown}")
 
 
 def _split_ns(view: View) -> Ns:

@@ -78,6 +78,9 @@ class MergedRows:
     marks_more: bool = False
 
 
+_TOTAL: Final = "total"
+AT_LEAST: Final = "at_least"
+"""How many there are in a reply that did not count all, in place of the total."""
 MATCHES: Final = "matches"
 TOPICS: Final = "topics"
 MERGED_ROWS: Final[Mapping[str, MergedRows]] = {
@@ -220,9 +223,8 @@ def _rest(
             ]
             best = min if key in rule.earliest else max
             reply[key] = best(numbers, default=None)
-        elif key in rule.added:
-            total = sum(number for number in each.values() if isinstance(number, int | float))
-            reply[key] = round(total, 2)
+        elif key in rule.added or key == AT_LEAST:
+            reply |= _summed(key, each.values(), values)
             _add(by_robot, key, each)
         elif len(each) == len(replies) and len({to_json_text(one) for one in each.values()}) == 1:
             reply[key] = next(iter(each.values()))
@@ -236,6 +238,15 @@ def _rest(
 def _dated(replies: Sequence[RobotReply]) -> list[RobotReply]:
     """Returns the replies whose times can be compared; all of them where none can."""
     return [each for each in replies if not each.is_ahead] or [*replies]
+
+
+def _summed(key: str, own: Iterable[JsonValue], values: Sequence[JsonObject]) -> JsonObject:
+    """Returns a key with its sum; no total where a robot has not counted all, but at least."""
+    if key == _TOTAL and any(AT_LEAST in value for value in values):
+        return {}
+    others = (value.get(_TOTAL) for value in values) if key == AT_LEAST else ()
+    numbers = [each for each in (*own, *others) if isinstance(each, int | float)]
+    return {key: round(sum(numbers), 2)}
 
 
 def _add(by_robot: dict[str, JsonValue], key: str, values: Mapping[str, JsonValue]) -> None:

@@ -42,7 +42,9 @@ _TRIED: Final = 3
 _MAX_PAIRS: Final = 20
 """Pairs of recordings of which messages are compared."""
 _MAX_TOPICS: Final = 3
-"""Topics of a pair that are compared; robots share the rest (`/clock`, a map), if anything."""
+"""Topics of a question that are compared."""
+_MAX_COMPARED: Final = 8
+"""Topics of a pair that are compared; robots may share some (`/clock`, a map)."""
 _MAX_TREES: Final = 32
 """Recordings of which static transforms are compared, the newest."""
 _MAX_STATIC: Final = 50
@@ -189,7 +191,7 @@ def _differing_topic(
     shared = _topics_of(one) & _topics_of(other) - view.snapshot.timeline.transient_local
     limits = view.memory.limits
     first = [each for each in (view.pose_topic, *limits.tf_topics) if each in shared]
-    for topic in islice([*first, *sorted(shared.difference(first))], _MAX_TOPICS):
+    for topic in islice([*first, *sorted(shared.difference(first))], _MAX_COMPARED):
         if _differ_in(view, topic, (_spans(one, topic), _spans(other, topic)), both):
             return topic
     return None

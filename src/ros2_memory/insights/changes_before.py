@@ -83,7 +83,7 @@ class ChangesBefore:
     """What changed in a window and shortly before it, on all topics.
 
     Attributes:
-        recorded: the topics on which a change would show.
+        looked_at: the topics on which a change would show.
         state: booleans, statuses that are not ok, and the goal of each action, at the end.
         left_out: by topic, how many changes were too many to be stored.
     """
@@ -91,13 +91,13 @@ class ChangesBefore:
     def __init__(
         self,
         changes: Iterable[_Change],
-        recorded: tuple[str, ...] = (),
+        looked_at: tuple[str, ...] = (),
         state: tuple[tuple[str, bool | str], ...] = (),
         left_out: Mapping[str, int] | None = None,
     ) -> None:
         self._changes = sorted(changes)
         self._longest = max((each.last - each.first for each in self._changes), default=0)
-        self.recorded = recorded
+        self.looked_at = looked_at
         self.state = state
         self.left_out = left_out or {}
 
@@ -156,7 +156,7 @@ def changes_in(
     """
     timeline = view.snapshot.timeline
     joined: dict[str, TopicEvents] = {}
-    recorded: list[str] = []
+    looked_at: list[str] = []
     commands = _commands(view)
     for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
@@ -166,8 +166,7 @@ def changes_in(
             joined[topic] = events
         is_telling = any(each == LOG or has_levels(each) for each in types)
         if is_telling or (events is not None and events.known):
-            around = timeline.extents(topic, window.widened(_AROUND_NS))
-            recorded += [topic] if any(around) else []
+            looked_at += [topic] if _is_recorded(view, topic, window) else []
     changes: list[_Change] = []
     for topic, events in joined.items():
         if topic not in commands:
@@ -178,7 +177,7 @@ def changes_in(
             changes += _stopped_commands(topic, joined[topic], goals)
     return ChangesBefore(
         changes,
-        tuple(recorded),
+        tuple(looked_at),
         tuple(_state(joined)),
         {
             topic: events.changes.left_out
@@ -186,6 +185,11 @@ def changes_in(
             if events.changes.left_out
         },
     )
+
+
+def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
+    """Returns whether a topic was recorded around a window."""
+    return any(view.snapshot.timeline.extents(topic, window.widened(_AROUND_NS)))
 
 
 def _commands(view: View) -> set[str]:
@@ -352,10 +356,10 @@ def before(
     robot, speed_mps = _robot(view, at, frame_id)
     if not view.snapshot.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
-    elif not changes.recorded:
+    elif not changes.looked_at:
         view.notes.add("no topic that would show a change is recorded at this time")
     elif not found:
-        view.notes.add(f"nothing changed on the recorded topics in the {length_s:g} s before")
+        view.notes.add(f"nothing changed on the topics looked at in the {length_s:g} s before")
     for topic, more in changes.left_out.items():
         view.notes.add(f"{topic} changes too often to store each change: {more} more")
     note_unread(view, window)
@@ -365,7 +369,8 @@ def before(
         length,
         found[:_MOST_CHANGES],
         len(found[_MOST_CHANGES:]),
-        changes.recorded,
+        changes.looked_at,
+        sum(_is_recorded(view, each, window) for each in view.snapshot.timeline.topics()),
         robot,
         speed_mps,
         (*changes.state, *_charges(view, at)),

@@ -23,7 +23,7 @@ from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.saved_moments import newest_moments, unlisted
 from ros2_memory.insights.silences import silences_of
 from ros2_memory.recorder.policies import OWN_TOPICS
-from ros2_memory.results import Budget, SilentTopic, Status, Undecodable
+from ros2_memory.results import ANOTHER, Budget, SilentTopic, Status, Undecodable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -61,6 +61,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
     heard = _heard(snapshot) if live else latest
+    mixed = describe_mixed(memory, call)
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)
@@ -71,7 +72,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         earliest=snapshot.dating.earliest,
         latest=latest,
         heard=heard,
-        recorder=None if heartbeat is None else state_of(heartbeat, live=live),
+        recorder=_recorder(snapshot, heartbeat, live=live),
         live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
@@ -89,13 +90,14 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *problems_of(snapshot, heartbeat, wall),
             *_describe_unheard(heard, latest),
             *missing_data(view),
+            *(("robots are mixed (see notes)",) if mixed else ()),
             *describe_interrupted(snapshot, memory.index.bag_dir, TimeWindow.everything()),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
         notes=(
             *view.notes.sentences(),
             *filter(None, notes),
-            *describe_mixed(memory, call),
+            *mixed,
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
         ),
     )
@@ -121,6 +123,13 @@ def _heard(snapshot: Snapshot) -> Ns | None:
     ]
     latest = snapshot.dating.latest
     return latest if latest is None or not times else min(max(times), latest)
+
+
+def _recorder(snapshot: Snapshot, heartbeat: Heartbeat | None, *, live: bool) -> str | None:
+    """Returns the recorder's state; without one, whether another program records here."""
+    if heartbeat is not None:
+        return state_of(heartbeat, live=live)
+    return ANOTHER if any(each.reason != HELD_BACK for each in snapshot.active) else None
 
 
 def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:

@@ -26,19 +26,21 @@ if TYPE_CHECKING:
     from ros2_memory.core.regions import Place
     from ros2_memory.history.view import View
     from ros2_memory.places.map_placement import MapPlacement
-    from ros2_memory.places.robot_tracks import Inside
+    from ros2_memory.places.robot_tracks import Inside, JoinedTrack
     from ros2_memory.places.where import Where
 
 
 class RegionVisits(NamedTuple):
     """All visits to a region in a window, newest first, and the track that they are of.
 
-    `elapsed`: how much time passed between moments of the window.
+    `elapsed`: how much time passed between moments of the window. `is_all`: whether the track
+    reaches back to its begin.
     """
 
     track: RobotTrack
     all: list[Inside]
     elapsed: Elapsed
+    is_all: bool
 
     @property
     def duration(self) -> Ns:
@@ -52,6 +54,10 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
+    return _joined_in(view, frame_id, window).track
+
+
+def _joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     joined = RobotTracks(view, frame_id).over(window)
     if joined.since is not None:
         view.notes.complete = False
@@ -61,7 +67,7 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
         )
     if joined.left_out:
         view.notes.add(f"poses that no transform places in {frame_id} are left out")
-    return joined.track
+    return joined
 
 
 def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -> RegionVisits:
@@ -70,9 +76,10 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    track = track_in(view, frame_id, window)
-    inside = robot_inside(track, where.region, window)
-    return RegionVisits(track, inside[::-1], elapsed_in(view, window))
+    joined = _joined_in(view, frame_id, window)
+    inside = robot_inside(joined.track, where.region, window)
+    elapsed = elapsed_in(view, window)
+    return RegionVisits(joined.track, inside[::-1], elapsed, joined.since is None)
 
 
 def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:

@@ -35,9 +35,10 @@ from ros2_memory.history.driven_path import (
     driven_path,
     pose_frame,
     positions_of,
+    resolve_path_topic,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import require_recorded, resolve_pose_topic
+from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
@@ -100,7 +101,7 @@ def visits(
     window = search_window(TimeRange(start_s, end_s), wall)
     view = open_view(memory, call, min(window.stop, wall))
     require_recorded(view, window)
-    topic = resolve_pose_topic(view)
+    topic = resolve_path_topic(view)
     note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
@@ -123,13 +124,17 @@ def visits(
             notes=view.notes.sentences(),
         )
     search = _VisitSearch(view, topic, placement, place.region, window)
-    # Named places as the table of all of them has them; a circle in any window by its poses.
-    by_track = placement.moves or place.name is not None or not isinstance(place.region, Circle)
+    by_track = where is not None or placement.moves or topic in memory.limits.tf_topics
+    # A lake has the track alone, of which few poses are vertices.
+    by_track = by_track or memory.stated is not None
     # In the poses' own frame as in the map: by the track, where that map moves.
-    if by_track or (asked == own_frame and map_placement(view, own_frame, topic).moves):
+    by_track = by_track or (asked == own_frame and map_placement(view, own_frame, topic).moves)
+    if by_track:
         known = _by_track(view, search, placement.frame_id, place, (window, now, limit))
     else:
         known = _by_poses(view, search, window, now, limit)
+    # Its rows say which visit was under way, which only the ends of recordings cut.
+    is_unbounded = not by_track and start_s is None and end_s is None
     known = known._replace(shown=tuple(_within_asked(each, window) for each in known.shown))
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
@@ -147,8 +152,9 @@ def visits(
         total=known.total,
         now=now,
         duration=known.duration,
-        entries=known.entries,
-        exits=known.exits,
+        entries=None if is_unbounded else known.entries,
+        exits=None if is_unbounded else known.exits,
+        all_counted=known.is_all,
         where=place.name,
         notes=view.notes.sentences(),
     )
@@ -163,6 +169,7 @@ class _Known(NamedTuple):
     newest: Ns | None
     entries: int
     exits: int
+    is_all: bool
 
 
 def asked_place(
@@ -209,7 +216,9 @@ def _by_track(
     current = newest if _is_current(view, newest, now) else None
     shown = tuple(visit_of(found, each, place, current) for each in found.all[:limit])
     entries, exits = sum(each.entered for each in found.all), sum(each.left for each in found.all)
-    return _Known(shown, len(found.all), found.duration, newest, entries, exits)
+    return _Known(
+        shown, len(found.all), found.duration, newest, entries, exits, is_all=found.is_all
+    )
 
 
 def _by_poses(view: View, search: _VisitSearch, window: TimeWindow, now: Ns, limit: int) -> _Known:
@@ -244,7 +253,8 @@ def _by_poses(view: View, search: _VisitSearch, window: TimeWindow, now: Ns, lim
         bool(is_left) and each.departed < window.stop
         for each, is_left in zip(every, left, strict=True)
     )
-    return _Known(tuple(shown), len(every), sum(lasted), newest, entries, exits)
+    is_all = search.is_all
+    return _Known(tuple(shown), len(every), sum(lasted), newest, entries, exits, is_all=is_all)
 
 
 def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
@@ -311,7 +321,11 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
 
 
 class _VisitSearch:
-    """Searches the poses of a topic, newest first, without bags that are ruled out."""
+    """Searches the poses of a topic, newest first, without bags that are ruled out.
+
+    Attributes:
+        is_all: whether the time was enough to find all visits.
+    """
 
     def __init__(
         self, view: View, topic: str, placement: MapPlacement, region: Region, window: TimeWindow
@@ -327,10 +341,14 @@ class _VisitSearch:
         self._digests = StoredDigests(view, topic, POSES, window)
         self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
+        self.is_all = True
 
     @property
     def newest_time(self) -> Ns | None:
         """The log time of the newest pose; None without one."""
+        if self._topic in self._view.memory.limits.tf_topics:
+            newest = self._view.stream.newest(self._topic, TimeWindow.everything())
+            return None if newest is None else newest.time
         return next((found.time for found, _ in self._positions(TimeWindow.everything())), None)
 
     def all(self, limit: int) -> list[Dwell]:
@@ -353,6 +371,7 @@ class _VisitSearch:
         except QueryTimeoutError:
             if not visits.all:
                 raise
+            self.is_all = False
             self._view.notes.complete = False
             if self._counting is None:
                 self._view.notes.add(f"the search ran out of time at {unix_text(before)}")

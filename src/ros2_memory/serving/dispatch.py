@@ -32,6 +32,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
 from ros2_memory.serving.question_log import QuestionLog
+from ros2_memory.tools.extra_tools import DECLARATIONS
 from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.reply_size import to_json_text
 
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.history.context import Memory
-    from ros2_memory.tools.declaration import Question, Tool
+    from ros2_memory.tools.declaration import Question, Tool, ToolDeclaration
     from ros2_memory.tools.replies import Replies
     from ros2_memory.tools.reply_size import JsonObject
 
@@ -322,9 +323,21 @@ def _of_part(question: Question, part: Callable[[Memory], Memory]) -> Question:
 def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     if name in tools:
         return tools[name]
+    for each in DECLARATIONS:
+        if name in {variant.name for variant in each.names}:
+            raise InvalidArgumentsError(f"{name} is not offered here: {_why_not(each)}")
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
     hint = f"do you mean {' or '.join(near)}?" if near else f"the tools are: {', '.join(tools)}"
     raise InvalidArgumentsError(f"unknown tool {abbreviate(name)}; {hint}")
+
+
+def _why_not(declaration: ToolDeclaration) -> str:
+    if declaration.writes:
+        return (
+            "it needs a recorder, which alone saves and deletes bags, and server.write_tools=true; "
+            "with recorder=none nothing is deleted"
+        )
+    return "server.tools is spec"
 
 
 class _Wait:

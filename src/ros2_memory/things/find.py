@@ -26,7 +26,7 @@ from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
@@ -46,7 +46,7 @@ _MM: Final = 1000.0
 def find_things(
     memory: Memory,
     call: Call,
-    label: str | None = None,
+    labels: Sequence[str] = (),
     *,
     where: JsonValue = None,
     start_s: float | None = None,
@@ -54,7 +54,7 @@ def find_things(
     min_score: float | None = None,
     limit: int = LIMIT,
 ) -> Things:
-    """Returns the things of a label, or all, that were seen in a window, those seen last first.
+    """Returns the things of some labels, or all, that were seen in a window, those seen last first.
 
     A thing counts where it was at the window's end. `where` takes those that are in a region then;
     of what moves by itself, what was seen in it. Bags count as a whole.
@@ -81,7 +81,7 @@ def find_things(
         )
     note_robots(view, limits.pose_topic, window)
     known = known_things(view, lowest, limits.labels)
-    asked = None if label is None else known.labels.key(label)
+    asked = {known.labels.key(each): each for each in labels}
     finder = _Finder(known, window, region, limits.places)
     found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
     totals: dict[str, int] = {}
@@ -94,13 +94,18 @@ def find_things(
     is_bounded = start_s is not None or end_s is not None
     bounds = [*["window"] * is_bounded, *([] if region is None else ["region"])]
     inside = f" in this {' and '.join(bounds)}" if bounds else ""
-    notes += _notes(known, label, asked, window, inside, found=bool(found))
+    notes += _notes(known)
+    keys_found = {known.labels.key(each.label) for each in found}
+    for key, label in asked.items():
+        of_label = _label_notes(known, label, key, window, inside, found=key in keys_found)
+        notes += [note if len(asked) == 1 else f"{abbreviate(label)}: {note}" for note in of_label]
     return Things(
         frame_id=_frame_of(known, found),
         things=tuple(found[:limit]),
         total=sum(totals.values()),
         labels=tuple(sorted(totals.items())),
         now=now,
+        all_counted=known.since is None,
         notes=tuple(notes),
     )
 
@@ -141,16 +146,16 @@ class _Finder:
     where: Where | None
     places: tuple[Place, ...]
 
-    def find(self, key: str | None) -> Iterator[Thing]:
-        """Yields the things of a key, or all."""
+    def find(self, keys: Collection[str]) -> Iterator[Thing]:
+        """Yields the things of these keys, or all where there are none."""
         result = self.known.estimate
         for instance in result.instances:
-            if key in {None, instance.key}:
+            if not keys or instance.key in keys:
                 thing = self._instance(instance)
                 if thing is not None:
                     yield thing
         for mover in result.movers:
-            if key in {None, mover.key}:
+            if not keys or mover.key in keys:
                 thing = self._mover(mover)
                 if thing is not None:
                     yield thing
@@ -346,16 +351,8 @@ def _by_place(
     return groups
 
 
-def _notes(
-    known: KnownThings,
-    label: str | None,
-    asked: str | None,
-    window: TimeWindow,
-    inside: str,
-    *,
-    found: bool,
-) -> Iterator[str]:
-    """Yields notes on a label, and on resets of odometry; `inside` says how it was asked about."""
+def _notes(known: KnownThings) -> Iterator[str]:
+    """Yields notes on resets of odometry, and on missing detectors."""
     sights = known.estimate.sights
     if len(known.frames) > 1 + bool(known.frames[0]):
         yield (
@@ -367,8 +364,13 @@ def _notes(
             "no things are known: there is no message of a detector "
             "(a type such as vision_msgs/msg/Detection3DArray); find_matches searches text"
         )
-    if label is None or asked is None:
-        return
+
+
+def _label_notes(
+    known: KnownThings, label: str, asked: str, window: TimeWindow, inside: str, *, found: bool
+) -> Iterator[str]:
+    """Yields notes on a label; `inside` says how it was asked about."""
+    sights = known.estimate.sights
     mine = np.array([known.labels.key(each) == asked for each in sights.labels], bool)
     unplaced = sights.unplaced[mine[sights.unplaced[:, Unplaced.LABEL]], Unplaced.N].sum()
     if unplaced:

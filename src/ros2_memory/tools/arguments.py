@@ -216,6 +216,16 @@ _Fields: TypeAlias = Annotated[
     BeforeValidator(_as_list),
     Field(description='Only these, e.g. ["position.x"].'),
 ]
+_Labels: TypeAlias = Annotated[
+    tuple[_Name, ...],
+    BeforeValidator(_as_list),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
+            "examples": ["mug"],
+        }
+    ),
+]
 _Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
 ]
@@ -527,7 +537,7 @@ class MatchesArguments(ConditionArguments):
 class ThingsArguments(Arguments):
     """Which things, where, and when."""
 
-    label: Annotated[_Name, Field(description="Whole label.", examples=["mug"])] | None = None
+    labels: _Labels = Field(default=(), alias="label", description="Whole labels.")
     where: _Where | None = None
     start_s: _Time | None = Field(default=None, alias="start")
     end_s: _Time | None = Field(default=None, alias="end")

@@ -46,23 +46,23 @@ _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
     "What happened {when}: path, stops, speed drops, things in view, toggled booleans, goals, "
     "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
-    "duration_s, text, in, score, before: what changed in the 10 s before}}], counts}}. With "
-    "around: {{before: [{{text, s_before}}], after (5 s), nearest first, recorded, robot, state}}.",
+    "duration_s, text, in, score, before: changes in the 10 s before}}], counts}}. With "
+    "around: {{before: [{{text, s_before}}], after (5 s), looked_at, robot, state}}.",
     RecapArguments,
     recap_or_before,
     blocking=True,
 )
 _STATUS = ToolDeclaration(
     (ToolName("memory_status", "State of the memory"),),
-    "Whether the recorder runs, how old the newest data is, topics that fell silent, "
-    "damaged files, how many days of data the disk budget holds, and the newest saved moments.",
+    "Whether the recorder runs, the age of the newest data, topics that fell silent, "
+    "damaged files, how many days the disk budget holds, newest saved moments.",
     NoArguments,
     memory_status,
 )
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
-    "{map_frame} if transforms lead there, else in the frame of {pose_topic}; without a place, "
+    "{map_frame} if transforms lead there, else that of {pose_topic}; without a place, "
     "for every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
     "closest_m, ago_s}}], total, minutes}} or {{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,
@@ -73,7 +73,7 @@ _VISITS = ToolDeclaration(
 _THINGS = ToolDeclaration(
     (ToolName("find_things", "Things"),),
     "Which things there are and where: how many chairs, what is in a place, where X is, since "
-    "when, where it was before; as of end. Reply: {{things: [{{label, place, in, first_seen, "
+    "when, where before; as of end. Reply: {{things: [{{label, place, in, first_seen, "
     "last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "
     "times}}]}}], total, labels}}.",
     ThingsArguments,
@@ -82,9 +82,9 @@ _THINGS = ToolDeclaration(
 )
 _COMPARE = ToolDeclaration(
     (ToolName("compare", "Differences"),),
-    "Differences between two time windows: things that moved, appeared, or were not seen again; "
+    "Differences between two windows: things that moved, appeared, or were not seen again; "
     "path, standstills, minutes in places, errors, silences. Things go from the earlier "
-    "window to the later. Values within a tenth count as equal. Reply: "
+    "to the later. Within a tenth counts as equal. Reply: "
     "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "
     "movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
     "farthest_apart, minutes, errors, silent_s}}.",

@@ -79,6 +79,11 @@ class LocalTimes:
         return {} if text is None else {"local": text}
 
 
+def total(number: int | None, at_least: int) -> JsonObject:
+    """Returns how many there are; under another name where not all of them were counted."""
+    return {"at_least": at_least} if number is None else {"total": number}
+
+
 def metres(vector: Vector3) -> JsonObject:
     """Returns a point or vector by its axes."""
     return {name: rounded(part, 4) for name, part in zip("xyz", vector, strict=True)}

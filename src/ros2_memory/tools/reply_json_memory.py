@@ -142,10 +142,11 @@ def _status(answer: results.Status) -> JsonObject:
         "never_heard": [*answer.never_heard],
         "missing": [*answer.missing],
     }
+    is_ours = answer.recorder != results.ANOTHER and bool(answer.recorder or answer.budget.most)
     reply: JsonObject = {
         "trust": "; ".join(_doubts(answer)) or "nothing is known to be missing",
         "recorder": answer.recorder,
-        "recorder_alive": answer.live if answer.recorder or answer.budget.most else None,
+        "recorder_alive": answer.live if is_ours else None,
         "restarts": answer.restarts,
         **({"lost_last_hour": dict(answer.lost)} if answer.lost else {}),
         "now": moment(answer.now),

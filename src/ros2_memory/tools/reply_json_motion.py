@@ -17,6 +17,7 @@ from ros2_memory.tools.reply_json import (
     render,
     rounded,
     seconds,
+    total,
     with_notes,
 )
 
@@ -187,7 +188,7 @@ def _visits(answer: results.Visits) -> JsonObject:
         **({} if answer.radius_m is None else circle),
         "there_now": any(each.departed is None for each in answer.visits),
         "visits": [_visit(each, answer.now, local) for each in answer.visits],
-        "total": answer.total,
+        **total(answer.total if answer.all_counted else None, answer.total),
         **({} if answer.entries is None else {"entries": answer.entries, "exits": answer.exits}),
         "minutes": _minutes(answer.duration),
     }

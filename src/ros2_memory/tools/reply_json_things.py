@@ -13,6 +13,7 @@ from ros2_memory.tools.reply_json import (
     render,
     rounded,
     seconds,
+    total,
     with_notes,
 )
 from ros2_memory.tools.reply_size import to_json_text
@@ -61,7 +62,7 @@ def _listed(answer: results.Things, rows: Sequence[JsonObject], *notes: str) -> 
     reply: JsonObject = {
         "frame_id": answer.frame_id or None,
         "things": [*rows],
-        "total": answer.total,
+        **total(answer.total if answer.all_counted else None, answer.total),
         "labels": dict(answer.labels),
     }
     return with_notes(reply, (*notes, *answer.notes))

@@ -18,6 +18,7 @@ from ros2_memory.tools.reply_json import (
     render,
     rounded,
     seconds,
+    total,
     with_notes,
 )
 from ros2_memory.tools.reply_size import to_json_text, without_constant_zeros
@@ -234,7 +235,7 @@ def _sightings(answer: results.Sightings) -> JsonObject:
     local = LocalTimes(oldest, answer.now)
     reply: JsonObject = {
         "sightings": [_sighting(each, answer.now, local) for each in answer.sightings],
-        "total": answer.total,
+        **total(answer.total, len(answer.sightings)),
         "searched_from": moment(answer.start),
         "searched_to": moment(answer.end),
         **local.of(answer.start, answer.end),
@@ -341,7 +342,8 @@ def _before(answer: results.Before) -> JsonObject:
     reply["after"] = [
         {"text": each.text, "s_after": round(seconds(-each.before), 1)} for each in answer.after
     ]
-    reply["recorded"] = [*answer.recorded]
+    reply["looked_at"] = [*answer.looked_at]
+    reply["recorded_topics"] = answer.recorded
     if answer.robot is not None:
         robot = {**planar_pose(answer.robot), "frame_id": answer.robot.frame_id or None}
         if answer.speed_mps is not None:

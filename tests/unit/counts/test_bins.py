@@ -192,6 +192,31 @@ def test_numbers_have_their_extremes_and_mean_in_each_bin(memories: list[Memory]
             )
 
 
+def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> None:
+    noon = round(datetime(2026, 3, 2, 12, 30).astimezone().timestamp())
+    for begin in (noon, noon + 5 * 3600, noon + 3 * 86_400):
+        at = begin * S
+        write_mcap(tmp_path / f"{begin}.mcap", [odom(at + n * S, n, 0.0) for n in range(20)])
+    memory = memory_of(tmp_path)
+
+    def rows(by: str) -> tuple[list[str], list[str]]:
+        span = {"start": noon, "end": noon + 3 * 86_400 + 60}
+        reply = asked(memory, tmp_path, "trajectory_summary", by=by, **span)
+        notes = [each for each in reply.get("notes", ()) if each.startswith("no rows")]
+        return [each[0] for each in reply["rows"]], notes
+
+    start = "no rows for times in which nothing was recorded: "
+    hours, notes = rows("hour")
+    assert hours == ["12:00", "17:00"]
+    assert notes == [f"{start}00:00 to 11:00, 13:00 to 16:00, 18:00 to 23:00"]
+    days, notes = rows("day")
+    assert days == ["2026-03-02", "2026-03-05"]
+    assert notes == [f"{start}2026-03-03 to 2026-03-04"]
+    weekdays, notes = rows("weekday")
+    assert weekdays == ["Monday", "Thursday"]
+    assert notes == [f"{start}Tuesday to Wednesday"]
+
+
 def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> None:
     for name, begin in (("one", 0), ("two", 20_000)):
         messages = [

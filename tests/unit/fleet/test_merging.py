@@ -79,6 +79,16 @@ def test_of_one_robot_the_rows_are_its_own_in_its_own_order(replies: list[RobotR
     assert found["sightings"] == expected
 
 
+def test_a_total_that_one_robot_did_not_count_is_not_that_of_the_others() -> None:
+    replies = [
+        RobotReply("red", {"sightings": [], "total": 7}, latest=100),
+        RobotReply("blue", {"sightings": [], "at_least": 5}, latest=100),
+    ]
+    reply = reply_of("find_matches", replies, limit=5)
+    assert reply["at_least"] == 12
+    assert "total" not in reply
+
+
 def test_oldest_first_stays_so() -> None:
     replies = [
         RobotReply("r1", {"sightings": [{"last_seen": 1.0}, {"last_seen": 5.0}], "total": 2}),

@@ -133,8 +133,8 @@ def test_a_search_for_things_names_what_is_held_back(tmp_path: Path) -> None:
     bags.step()
     memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 30 * S))
     held = f"{HELD_BACK}: {name}/{name}_1.mcap"
-    assert held in find_things(memory, Call(), "cup").notes
-    assert held not in find_things(memory, Call(), "cup", end_s=T0 // S + 5).notes
+    assert held in find_things(memory, Call(), ["cup"]).notes
+    assert held not in find_things(memory, Call(), ["cup"], end_s=T0 // S + 5).notes
 
 
 def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: Path) -> None:

@@ -141,8 +141,9 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
     write(tmp_path, calm)
     reply = before(tmp_path, 20.0, recalls=recalls)
     assert reply["before"] == []
-    assert reply["recorded"] == ["/bumper", "/diagnostics", "/rosout"]
-    assert reply["notes"] == ["nothing changed on the recorded topics in the 10 s before"]
+    assert reply["looked_at"] == ["/bumper", "/diagnostics", "/rosout"]
+    assert reply["recorded_topics"] == 4
+    assert reply["notes"] == ["nothing changed on the topics looked at in the 10 s before"]
     assert before(tmp_path, 7.123457, recalls=recalls)["around"] == at(7.123457) / 1e9
     later = before(tmp_path, 500.0, recalls=recalls)["notes"]
     assert "nothing was recorded in the 10 s before" in later
@@ -152,7 +153,8 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
 def test_that_no_such_topic_is_recorded_is_another_answer(tmp_path: Path) -> None:
     write(tmp_path, [*driving(40, 20), *(detections(at(t), ["cup"]) for t in range(40))])
     reply = before(tmp_path, 20.0)
-    assert (reply["before"], reply["recorded"]) == ([], [])
+    assert (reply["before"], reply["looked_at"]) == ([], [])
+    assert reply["recorded_topics"] == 2
     assert reply["notes"] == ["no topic that would show a change is recorded at this time"]
 
 

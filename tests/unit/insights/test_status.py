@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -83,6 +84,20 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     told = shown(memory, tmp_path)
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
     assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["trust"]
+
+
+def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> None:
+    finished = shown(remembering(tmp_path, [text(BEGIN, "x")]), tmp_path)
+    assert finished["recorder"] is None
+    bag = tmp_path / "rec" / "rec_0.mcap"
+    write_mcap(bag, [text(BEGIN + each * S, "x") for each in range(50)])
+    bag.write_bytes(bag.read_bytes()[:-300])
+    os.utime(bag, (BEGIN // S + 59, BEGIN // S + 59))
+    status = shown(memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S)), tmp_path)
+    assert (status["recorder"], status["recorder_alive"]) == ("another program", None)
+    beating(tmp_path, RecorderState.RECORDING, 59.0)
+    status = shown(memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S)), tmp_path)
+    assert status["recorder"] == "recording"
 
 
 def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole(

@@ -74,6 +74,8 @@ async def test_every_tool_has_a_title_which_marks_those_that_may_take_long(tmp_p
 async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path) -> None:
     async with Client(server(tmp_path, "server.write_tools=true")) as client:
         assert "remember_moment" not in {each.name for each in (await client.list_tools()).tools}
+        refused = await client.call_tool("remember_moment", {"label": "x"})
+        assert "remember_moment is not offered here: it needs a recorder" in str(refused.content)
 
 
 async def test_hints_say_what_a_call_changes(tmp_path: Path) -> None:

@@ -280,6 +280,17 @@ def test_detections_without_a_place_are_reported(tmp_path: Path) -> None:
     assert reply["notes"][0] == "5 detections of it could not be placed, and are left out"
 
 
+def test_several_labels_are_asked_for_at_once(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5), ("book", 3.0, -1.0), ("cup", 4.0, 2.0)))
+    reply = ask(tmp_path, label=["mug", "Book", "keys"])
+    assert sorted(each["label"] for each in reply["things"]) == ["book", "mug"]
+    assert (reply["total"], reply["labels"]) == (2, {"book": 1, "mug": 1})
+    [note] = reply["notes"]
+    assert note.startswith('"keys": no detector reported "keys"')
+    assert ask(tmp_path, label='["mug", "book"]')["total"] == 2
+    assert ask(tmp_path, label=["mug"]) == ask(tmp_path, label="mug")
+
+
 def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -> None:
     for run in range(2):
         messages = [
