@@ -26,7 +26,7 @@ from benchmarks.home.days import Scale
 from benchmarks.home.world import START_S, VISION
 from benchmarks.home_week import condition
 from benchmarks.report import machine
-from ros2_memory.bootstrap import build_dispatcher, build_memory, query_settings_of, shared_parts
+from ros2_memory.bootstrap import build_memory, build_server, query_settings_of, shared_parts
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import WallClock
@@ -173,7 +173,7 @@ async def _asked(folder: Path, names: Sequence[str]) -> int:
         WallClock(),
         shared_map=True,
     )
-    dispatcher = build_dispatcher(settings, build_memory(settings), fleet=fleet)
+    dispatcher = build_server(settings, build_memory(settings), fleet=fleet).dispatcher
     size = sum(each.stat().st_size for each in folder.rglob("*.parquet"))
     print(f"{len(names)} robots, a day each, {size / 1e6:.0f} MB of Parquet, {machine()}")
     missed = await answered(dispatcher, questions(), MOST_S)
@@ -188,21 +188,27 @@ async def answered(
     most_s: Mapping[str, float],
 ) -> bool:
     """Asks the first time and again, prints, and returns whether an aim is missed."""
-    print("\n| question | first, s | again, s | characters | |\n|---|---|---|---|---|")
+    print(
+        "\n| question | first, s | of the processor, s | again, s | characters | |"
+        "\n|---|---|---|---|---|---|"
+    )
     missed = False
     for words, (tool, arguments) in asked.items():
         passed: list[float] = []
+        busy: list[float] = []
         text = ""
         for _ in range(1 + _AGAIN):
-            begun = time.perf_counter()
+            begun, begun_busy = time.perf_counter(), time.process_time()
             text = (await dispatcher.answer(tool, dict(arguments))).text
             passed.append(time.perf_counter() - begun)
+            busy.append(time.process_time() - begun_busy)
         is_late = min(passed[1:]) > most_s.get(words, sys.float_info.max)
         trouble = text[:300] if '"error"' in text or "no answer of" in text else ""
         missed |= is_late or bool(trouble)
         verdict = f"MISSED {trouble}" if is_late or trouble else "ok"
         print(
-            f"| {words} | {passed[0]:.2f} | {min(passed[1:]):.3f} | {len(text)} | {verdict} |",
+            f"| {words} | {passed[0]:.2f} | {busy[0]:.2f} | {min(passed[1:]):.3f} | {len(text)} "
+            f"| {verdict} |",
             flush=True,
         )
     return missed

@@ -24,7 +24,7 @@ from benchmarks.digests import made_known
 from benchmarks.footprint import resident_mb
 from benchmarks.lake import answered, catalog_in, rows_of_world, settings_of
 from benchmarks.report import machine
-from ros2_memory.bootstrap import build_dispatcher, build_memory, query_settings_of, shared_parts
+from ros2_memory.bootstrap import build_memory, build_server, query_settings_of, shared_parts
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
@@ -142,7 +142,7 @@ async def _asked(folder: Path, names: Sequence[str], days: int) -> int:
             WallClock(),
             shared_map=True,
         )
-        dispatcher = build_dispatcher(settings, build_memory(settings), fleet=fleet)
+        dispatcher = build_server(settings, build_memory(settings), fleet=fleet).dispatcher
         print(f"\nlooked at together: {words}")
         missed |= await answered(dispatcher, questions(days), {})
         dispatcher.stop()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory import results
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
@@ -19,6 +19,7 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
     NoDataReason,
+    QueryTimeoutError,
 )
 from ros2_memory.core.model import Pose, Sample, TimeWindow
 from ros2_memory.core.regions import places_at
@@ -31,6 +32,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
+from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import (
     by_remark,
     deleted_length,
@@ -61,6 +63,7 @@ from ros2_memory.history.reverse_search import (
     compared_frames,
     condition_of,
     may_be_elsewhere,
+    out_of_time,
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_near, require_one_robot
@@ -92,7 +95,7 @@ from ros2_memory.insights.status import (
 from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -102,6 +105,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
+
+A = TypeVar("A", results.Match, results.ValueWhen)
 
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
@@ -305,23 +310,33 @@ def find_last_match(
     """
     now = memory.clock.now()
     until = _before(before_s)
-    view = View(memory, call, min(now, until))
-    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
-    search = ReverseSearch(view, topic, condition)
-    if before_s is not None:
-        require_recorded(view, TimeWindow(MIN_NS, until))
-    found = search.newest(until)
-    if found is None:
-        notes = _notes_on_never(view, search, until, condition, min_score)
-        return results.Match(None, notes=notes)
-    note_robots_near(view, found)
-    note_unread(view, _searched(view, found, until, now), search=True)
-    counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
-    if counted_from is not None and found.time > counted_from + FUTURE_NS:
-        after = seconds(found.time - counted_from)
-        view.notes.add(f"dated {after} after now: when it was is unknown")
-        counted_from = None
-    return results.Match(_value(view, found, fields, counted_from), notes=view.notes.sentences())
+
+    def newest(view: View) -> results.Match:
+        condition = condition_of(
+            view, topic, condition_type, value, field=field, min_score=min_score
+        )
+        search = ReverseSearch(view, topic, condition)
+        if before_s is not None:
+            require_recorded(view, TimeWindow(MIN_NS, until))
+        found = search.newest(until)
+        if found is None:
+            notes = _notes_on_never(view, search, until, condition, min_score)
+            return results.Match(None, notes=notes)
+        note_robots_near(view, found)
+        note_unread(view, _searched(view, found, until, now), search=True)
+        # What the view shows may be some days of long ago.
+        newest_known = memory.index.published or view.snapshot
+        counted_from = now if memory.limits.now == "wall" else newest_known.latest
+        if counted_from is not None and found.time > counted_from + FUTURE_NS:
+            after = seconds(found.time - counted_from)
+            view.notes.add(f"dated {after} after now: when it was is unknown")
+            counted_from = None
+        value_found = _value(view, found, fields, counted_from)
+        return results.Match(value_found, notes=view.notes.sentences())
+
+    reach = min(now, until)
+    view = View(memory, call, reach)
+    return _going_back(view, reach, newest, lambda each: each.found is not None)
 
 
 def value_when(
@@ -345,31 +360,36 @@ def value_when(
     now, until = memory.clock.now(), _before(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
-    condition = condition_of(
-        view, condition_topic, condition_type, value, field=field, min_score=min_score
-    )
-    search = ReverseSearch(view, condition_topic, condition)
-    if before_s is not None:
-        require_recorded(view, TimeWindow(MIN_NS, until))
-    found = search.newest(until)
-    if found is None:
-        notes = _notes_on_never(view, search, until, condition, min_score)
-        return results.ValueWhen(None, notes=notes)
-    note_unread(view, _searched(view, found, until, now), search=True)
-    note_robots_near(view, found)
-    matched = _value(view, found, (), None)
-    upto = TimeWindow.until(found.time)
-    held = _newest_beside(view, name, upto, found)
-    note_unread(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
-    if held is None:
-        view.notes.add(f"{name} held no message yet at {unix_text(found.time)}")
-        return results.ValueWhen(matched, notes=view.notes.sentences())
-    distance = found.time - held.time
-    latched = memory.limits.latching.holds(view.snapshot, held)
-    if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
-        view.notes.add(f"the value is {seconds(distance)} older than the match")
-    held_value = _held(view, _value(view, held, fields, None), held, found.time)
-    return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
+
+    def newest(view: View) -> results.ValueWhen:
+        condition = condition_of(
+            view, condition_topic, condition_type, value, field=field, min_score=min_score
+        )
+        search = ReverseSearch(view, condition_topic, condition)
+        if before_s is not None:
+            require_recorded(view, TimeWindow(MIN_NS, until))
+        found = search.newest(until)
+        if found is None:
+            notes = _notes_on_never(view, search, until, condition, min_score)
+            return results.ValueWhen(None, notes=notes)
+        note_unread(view, _searched(view, found, until, now), search=True)
+        note_robots_near(view, found)
+        matched = _value(view, found, (), None)
+        upto = TimeWindow.until(found.time)
+        held = _newest_beside(view, name, upto, found)
+        read = upto if held is None else replace(upto, start=held.time)
+        note_unread(view, read, nothing=not held)
+        if held is None:
+            view.notes.add(f"{name} held no message yet at {unix_text(found.time)}")
+            return results.ValueWhen(matched, notes=view.notes.sentences())
+        distance = found.time - held.time
+        latched = memory.limits.latching.holds(view.snapshot, held)
+        if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
+            view.notes.add(f"the value is {seconds(distance)} older than the match")
+        held_value = _held(view, _value(view, held, fields, None), held, found.time)
+        return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
+
+    return _going_back(view, now, newest, lambda each: each.matched is not None)
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
@@ -517,6 +537,44 @@ def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindo
     """Returns what a search went through to reach its match, as far as there can be messages."""
     stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(found.time, max(stop, found.time + 1))
+
+
+def _going_back(
+    view: View, reach: Ns, newest: Callable[[View], A], is_found: Callable[[A], bool]
+) -> A:
+    """Returns what a search finds in a view that reaches to a time, or in what is older.
+
+    An index of years shows some days at a time. Where these have nothing, those before them are
+    searched, for some seconds in all; the index reports what it has not shown.
+
+    Raises:
+        NoDataError: none of the days has anything that could be searched.
+        QueryTimeoutError: the call's time is over; reports how far back was searched.
+    """
+    reading = view.call.partial_after(READING_S)
+    missed: A | NoDataError | None = None
+    while True:
+        try:
+            found: A = newest(view)
+        except NoDataError as error:
+            missed = missed or error
+        except QueryTimeoutError as error:
+            if missed is None or error.searched_back_to is not None:
+                raise
+            raise out_of_time(view, reach + 1) from error
+        else:
+            if is_found(found):
+                return found
+            known: tuple[str, ...]
+            known = () if missed is None or isinstance(missed, NoDataError) else missed.notes
+            missed = replace(found, notes=tuple(dict.fromkeys((*known, *found.notes))))
+        older = view.snapshot.older
+        if older is None or older >= reach or reading.expired() or view.call.deadline.expired():
+            if isinstance(missed, NoDataError):
+                raise missed
+            return missed
+        reach = older
+        view = View(view.memory, view.call, reach)
 
 
 def _never(view: View, search: ReverseSearch, until: Ns) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
-from ros2_memory.core.errors import InvalidArgumentsError, NotShippedError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotShippedError
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS, Clock
 
@@ -117,8 +117,15 @@ class Robot:
         source = self._lake_source
         if source is not None and (lake or not self.is_mounted):
             try:
-                found = ask(source.memory)
-                return found, FromLake(source.latest, (*source.notes(),))
+                try:
+                    found = ask(source.memory)
+                finally:
+                    # Also of an answer that failed: they are not those of the next one.
+                    notes = (*source.notes(),)
+                return found, FromLake(source.latest, notes)
+            except NoDataError as error:
+                detail = "; ".join((error.detail, *notes))
+                raise NoDataError(error.reason, detail, error.notes) from error
             except NotShippedError:
                 if not self.is_mounted:
                     raise

@@ -243,6 +243,16 @@ class _Truths:
 _TRUTHS: Final = _Truths()
 
 
+def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
+    """Returns the error of a search that found no match back to a time when it had to end."""
+    back_to, budget_s = unix_text(searched_to), view.call.deadline.budget_s
+    return QueryTimeoutError(
+        f"no match back to {back_to}, and {budget_s:g} s are over; "
+        f"{view.bags.backfill_progress()}to continue from there, ask again with before={back_to}",
+        searched_back_to=searched_to,
+    )
+
+
 class ReverseSearch:
     """A search for one condition on the topics of a name or glob.
 
@@ -299,13 +309,7 @@ class ReverseSearch:
         except QueryTimeoutError as error:
             if searched_to is None:
                 raise
-            back_to, budget_s = unix_text(searched_to), self._view.call.deadline.budget_s
-            raise QueryTimeoutError(
-                f"no match back to {back_to}, and {budget_s:g} s are over; "
-                f"{self._view.bags.backfill_progress()}to continue from there, ask again with "
-                f"before={back_to}",
-                searched_back_to=searched_to,
-            ) from error
+            raise out_of_time(self._view, searched_to) from error
         self.close(candidates, TimeWindow(MIN_NS, until), found=False)
         return None
 

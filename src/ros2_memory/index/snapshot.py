@@ -65,6 +65,8 @@ class Snapshot:
         scanned_at: when the directory was scanned.
         problem: why the bag directory itself could not be read.
         metadata_folders: folders with a metadata.yaml.
+        older: up to which log time (inclusive) there are older bags, which are not in it: those of
+            a lake are shown some days at a time. None where all are.
     """
 
     timeline: Timeline = field(default_factory=Timeline, repr=False, compare=False)
@@ -76,6 +78,7 @@ class Snapshot:
     scanned_at: Ns = 0
     problem: str | None = None
     metadata_folders: tuple[str, ...] = ()
+    older: Ns | None = None
 
     @property
     def bags(self) -> tuple[BagFile, ...]:

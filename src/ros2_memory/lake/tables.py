@@ -20,7 +20,7 @@ New columns are added at the end, and old lakes get them when they are opened.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final, Literal
 
 import pyarrow as pa
@@ -304,6 +304,12 @@ def topic_key(topic: str) -> str:
 def day_of(time_ns: Ns) -> date:
     """Returns the day (UTC) of a time."""
     return datetime.fromtimestamp(time_ns // NS_PER_S, tz=UTC).date()
+
+
+def end_of(day: date) -> Ns:
+    """Returns the last log time of a day (UTC)."""
+    next_day = datetime(day.year, day.month, day.day, tzinfo=UTC) + timedelta(days=1)
+    return int(next_day.timestamp()) * NS_PER_S - 1
 
 
 def microseconds(time_ns: Ns) -> int:

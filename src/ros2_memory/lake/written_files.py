@@ -38,6 +38,8 @@ class RecordingFileIO(PyArrowFileIO):
         record = self.properties.get(RECORD)
         if record:
             line = json.dumps({"file": location, "at": WallClock().now()})
+            # With a REST catalogue nothing else is there before the first table.
+            Path(record).parent.mkdir(parents=True, exist_ok=True)
             append_durably(Path(record), f"{line}\n")
         return super().new_output(location)
 

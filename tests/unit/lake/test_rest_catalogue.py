@@ -12,6 +12,5 @@ from tests.support.rest_catalogue import rest_catalogue
 def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path) -> None:
     with rest_catalogue(tmp_path / "lake") as uri:
         where = replace(location(tmp_path / "lake"), catalog="rest", uri=uri)
-        where.state_dir.mkdir(parents=True)
         ship_and_ask(where, tmp_path / "hall")
         assert where.last_commit() is not None

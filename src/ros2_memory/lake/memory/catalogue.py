@@ -184,12 +184,18 @@ class LakeCatalogue(Catalogue):
             rows = self._lake.select(
                 _LABELS, ["sightings"], {"topic": topic}, robots=[self._robot], days=days
             )
-            words: dict[str, set[str]] = {}
-            pairs = zip(rows["bag_id"].to_pylist(), rows["label"].to_pylist(), strict=True)
-            for bag_id, label in pairs:
-                words.setdefault(bag_id, set()).update(words_of(label.casefold()))
+            # Labels are few, and in many bags.
+            bags, labels = (
+                rows[name].combine_chunks().dictionary_encode() for name in ("bag_id", "label")
+            )
+            words = [words_of(label.casefold()) for label in labels.dictionary.to_pylist()]
+            of_bag: list[set[str]] = [set() for _ in bags.dictionary]
+            pairs = zip(bags.indices.to_pylist(), labels.indices.to_pylist(), strict=True)
+            for bag, label in pairs:
+                of_bag[bag].update(words[label])
             return {
-                bag_id: ZoneMap(joined_words(each), texts=True) for bag_id, each in words.items()
+                bag_id: ZoneMap(joined_words(each), texts=True)
+                for bag_id, each in zip(bags.dictionary.to_pylist(), of_bag, strict=True)
             }
         asked = {"kind": kind, "topic": topic, "version": str(DIGEST_VERSION)}
         rows = self._lake.select(_PACKED, ["digests"], asked, robots=[self._robot], days=days)

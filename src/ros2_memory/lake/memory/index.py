@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from functools import partial
@@ -20,7 +21,7 @@ from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.partitions import locations
-from ros2_memory.lake.tables import day_of
+from ros2_memory.lake.tables import day_of, end_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -51,7 +52,7 @@ MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""
 _FEWEST_DAYS: Final = 2
 """Days that are looked at together where a time before the newest ones is asked about."""
-_MOST_WINDOWS: Final = 3
+_MOST_WINDOWS: Final = 6
 """Times before the newest days that stay in memory."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
@@ -79,6 +80,7 @@ class _Window:
     Attributes:
         made_of: the files of its rows.
         since: its first day, where there are older ones; None otherwise.
+        older: the end of the newest day before that, as a log time.
         timeline: its bags.
         files: these by their paths.
         detectors: topics of which all detections are rows.
@@ -87,6 +89,7 @@ class _Window:
 
     made_of: tuple[str, ...] = ()
     since: date | None = None
+    older: Ns | None = None
     timeline: Timeline = field(default_factory=Timeline)
     files: Mapping[str, BagFile] = field(default_factory=dict)
     detectors: frozenset[str] = frozenset()
@@ -160,7 +163,7 @@ class LakeIndex:
         window = self._newest
         if reach is not None and window.since is not None and day_of(reach) < window.since:
             window = self._window_before(day_of(reach))
-            known = replace(known, timeline=window.timeline)
+            known = replace(known, timeline=window.timeline, older=window.older)
         self._note(window)
         return known
 
@@ -171,7 +174,9 @@ class LakeIndex:
             days = self._lake.days("bags", self._robot)
             span = days.newest(date.max, self._most_bags, self._fewest_days)
             self._newest = self._window(days, span, self._newest, FOLDER)
-            self._snapshot = Snapshot(self._newest.timeline, scanned_at=self._clock.now())
+            self._snapshot = Snapshot(
+                self._newest.timeline, scanned_at=self._clock.now(), older=self._newest.older
+            )
             return self._snapshot
 
     def unseen_before(self) -> date | None:
@@ -179,9 +184,9 @@ class LakeIndex:
 
         None where it was shown all.
         """
-        found: date | None = getattr(self._asked, "since", None)
-        self._asked.since = None
-        return found
+        found: date = getattr(self._asked, "since", date.min)
+        self._asked.since = date.max
+        return found if date.min < found < date.max else None
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
@@ -221,9 +226,8 @@ class LakeIndex:
         return any(topic in each.whole_topics for each in (self._newest, *self._older.values()))
 
     def _note(self, window: _Window) -> None:
-        since: date | None = getattr(self._asked, "since", None)
-        if window.since is not None and (since is None or window.since < since):
-            self._asked.since = window.since
+        known: date = getattr(self._asked, "since", date.max)
+        self._asked.since = min(known, window.since or date.min)
 
     def _window_before(self, day: date) -> _Window:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
@@ -245,11 +249,12 @@ class LakeIndex:
         """Returns what the lake has of some days; the known one where no file is another."""
         if days is None:
             return _Window()
-        since = None if days[0] == known_days.known[0] else days[0]
+        before = known_days.known[: bisect_left(known_days.known, days[0])]
+        since, older = (days[0], end_of(before[-1])) if before else (None, None)
         of_robot = [self._lake.days(table, self._robot) for table in _TABLES]
         made_of = tuple(locations(chain.from_iterable(each.files(*days) for each in of_robot)))
         if made_of == known.made_of:
-            return replace(known, since=since)
+            return replace(known, since=since, older=older)
         select = partial(self._lake.select, robots=[self._robot], days=days)
         bags, topics = select(_BAGS, ["bags"]), select(_TOPICS, ["digests", "bags"])
         files = [*self._files(bags, topics, folder)]
@@ -261,7 +266,7 @@ class LakeIndex:
             for each in ("sightings", "messages")
         )
         by_path = {bag.file: bag for bag in files}
-        return _Window(made_of, since, Timeline.of(files), by_path, detectors, whole_topics)
+        return _Window(made_of, since, older, Timeline.of(files), by_path, detectors, whole_topics)
 
     def _files(self, bags: pa.Table, topics: pa.Table, folder: str) -> Iterator[BagFile]:
         summaries = _summaries(bags, topics)

@@ -267,7 +267,7 @@ class LakeReader(BagReader):
         """Returns the rows of a topic in a bag, in order.
 
         The first bags of a day that are asked for are read alone: the newest match is in one of
-        these. Who goes on reads most of the day.
+        these. Who goes on reads most of the day. Its track is short: it is read at once.
         """
         select = partial(self._lake.select, robots=[self._robot], days=(bag.day, bag.day))
         asked = {"key": topic_key(topic), "topic": topic}
@@ -276,7 +276,7 @@ class LakeReader(BagReader):
         with self._lock:
             known = self._days.get(key)
             self._read_alone[key] += known is None
-            is_alone = self._read_alone[key] <= _MOST_ALONE
+            is_alone = table != "poses" and self._read_alone[key] <= _MOST_ALONE
         rows: Sequence[Mapping[str, JsonValue]]
         if known is None and is_alone:
             of_bag = f"{sql} AND bag_id = $bag ORDER BY {order}"

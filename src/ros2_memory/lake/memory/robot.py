@@ -106,7 +106,7 @@ class LakeRobot:
         since = self._index.unseen_before()
         if since is not None:
             yield (
-                f"the lake has days before {since}, which were not looked at: an end (or a time) "
-                "there has them looked at"
+                f"the lake has days before {since}, which were not looked at: an end (or before, "
+                "or a time) there has them looked at"
             )
         yield from self._reader.take_notes()
