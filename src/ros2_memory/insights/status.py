@@ -129,7 +129,7 @@ def _recorder(snapshot: Snapshot, heartbeat: Heartbeat | None, *, live: bool) ->
     """Returns the recorder's state; without one, whether another program records here."""
     if heartbeat is not None:
         return state_of(heartbeat, live=live)
-    return ANOTHER if any(each.reason != HELD_BACK for each in snapshot.active) else None
+    return ANOTHER if any(each.growing for each in snapshot.active) else None
 
 
 def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:

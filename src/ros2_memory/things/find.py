@@ -79,7 +79,7 @@ def find_things(
         raise InvalidArgumentsError(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
         )
-    note_robots(view, limits.pose_topic, window)
+    note_robots(view, view.pose_topic, window)
     known = known_things(view, lowest, limits.labels)
     asked = {known.labels.key(each): each for each in labels}
     finder = _Finder(known, window, region, limits.places)
