@@ -101,7 +101,8 @@ def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> Non
         status = shown(memory, tmp_path)
         # A file without an end that nobody was seen to write to may be left of a crash.
         expected = "another program" if second == 62 else None
-        assert status["recorder"] == expected and not status["recorder_alive"]
+        assert status["recorder"] == expected
+        assert not status["recorder_alive"]
     beating(tmp_path, RecorderState.RECORDING, 59.0)
     status = shown(memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S)), tmp_path)
     assert status["recorder"] == "recording"
