@@ -434,8 +434,8 @@ def nearest_wall(last_s: float) -> Judge:
 def trusted(replies: Replies, asked: CallContext) -> None:
     reply = replies[-1]
     # The newest split, which no recorder names here.
-    young = "1 file without an end is young and not known to grow: being written, or left open by"
-    same("trust", text(reply, "trust"), f"{young} a crash")
+    young = "1 file has no end yet: being written, or left by a crash"
+    same("trust", text(reply, "trust"), young)
     near("age", number(reply, "newest_age_s"), _ago(asked.known[-1]), SAME_S)
     same("silent topics", items(reply, "fell_silent"), [])
     same("damaged", number(reply, "damaged"), 0)

@@ -176,11 +176,8 @@ def missing_data(view: View) -> Iterator[str]:
         yield nothing_here(snapshot)
     undecided = [each for each in snapshot.active if not each.growing and each.reason != HELD_BACK]
     if undecided:
-        files = counted(len(undecided), "file without an end", "files without an end")
-        verb = "is" if len(undecided) == 1 else "are"
-        yield (
-            f"{files} {verb} young and not known to grow: being written, or left open by a crash"
-        )
+        files = counted(len(undecided), "file has", "files have")
+        yield f"{files} no end yet: being written, or left by a crash"
     if left_open := snapshot.timeline.disk_use[1]:
         bags = counted(left_open, "bag was", "bags were")
         yield f"{bags} left open by a crash: unwritten messages are lost"

@@ -335,8 +335,8 @@ def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> Non
         find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
     ):
         [note] = [note for note in answer.notes if "as from several robots" in note]
-        assert note.startswith("2 recordings have different messages on /odom")
-        assert note.endswith(": r1, r2")
+        assert "2 recordings have different messages on /odom" in note
+        assert ": r1, r2" in note
 
 
 @each_way

@@ -394,7 +394,7 @@ class TestWhatIsMissingIsNamedAndCounted:
         def trust(memory: Memory) -> str:
             return str(shown(memory, tmp_path)["trust"])
 
-        memory, young = memory_of(tmp_path, clock=clock), "1 file without an end is young"
+        memory, young = memory_of(tmp_path, clock=clock), "1 file has no end yet"
         assert young in trust(memory)
         # Seen to grow, it is being written.
         path.write_bytes(content + b"x")

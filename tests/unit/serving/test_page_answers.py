@@ -51,13 +51,11 @@ from tests.support.memories import memory_of, recalling
 from tests.unit.test_positions import fix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ros2_memory.history.context import Memory
-    from tests.support.bags import Msg
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -542,21 +540,22 @@ def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: floa
     assert len(cells) <= 8_000
 
 
-@pytest.mark.parametrize(
-    ("message", "why"),
-    [
-        (lambda at: fix(at, 0.0, 0.0), "latitude and longitude are on /fix"),
-        (lambda at: tf(at, transform(at, "odom", "base", (0.0, 0.0, 0.0))), "get_transform_at"),
-    ],
-    ids=["a satellite receiver", "transforms"],
-)
-def test_without_a_path_it_says_what_gives_one(
-    tmp_path: Path, message: Callable[[int], Msg], why: str
-) -> None:
-    write_mcap(tmp_path / "bag.mcap", [message(BEGIN)])
+def test_without_a_path_it_says_what_gives_one(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [fix(BEGIN, 0.0, 0.0)])
     found = shown(memory_of(tmp_path))
     assert found["path"] is None
-    assert why in found["no_path"]
+    assert "latitude and longitude are on /fix" in found["no_path"]
+
+
+def test_transforms_of_the_body_give_the_path_where_no_topic_has_poses(tmp_path: Path) -> None:
+    moved = [
+        tf(at, transform(at, "odom", "base", (nth / 2, 0.0, 0.0)))
+        for nth, at in enumerate(range(BEGIN, BEGIN + 10 * S, S))
+    ]
+    write_mcap(tmp_path / "bag.mcap", moved)
+    path = shown(memory_of(tmp_path))["path"]
+    assert path["frame"] == "odom"
+    assert (path["x"][0], path["x"][-1]) == (0.0, 4.5)
 
 
 def test_the_only_topic_of_poses_gives_the_path_with_a_note(tmp_path: Path) -> None:
