@@ -453,13 +453,19 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     asked_for = TimeWindow(start, end)
     deleted = deleted_between(view.snapshot, memory.index.bag_dir, asked_for)
     if gap_around(view, asked) is not None:
-        what = "is here any more of what was recorded" if deleted else "was recorded"
-        view.notes.add(f"nothing {what} {window}")
+        view.notes.add(why_nothing(window, deleted=bool(deleted)))
     elif gaps or max(outside) > _EDGE_NS:
         part = unix_from_ns(max(whole - missing, 0))
         places = 0 if whole >= 100 * NS_PER_S else 1
         what = "here are only" if deleted else "recorded only"
         view.notes.add(f"{what} {part:.{places}f} of {unix_from_ns(whole):.{places}f} s {window}")
+
+
+def why_nothing(when: str, *, deleted: bool) -> str:
+    """Returns that a time has no messages: none were recorded, or retention deleted them."""
+    if deleted:
+        return f"what was recorded {when} was deleted by retention"
+    return f"nothing was recorded {when}"
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:

@@ -28,6 +28,7 @@ from ros2_memory.history.coverage import (
     note_unread,
     note_unrecorded,
     unix_text,
+    why_nothing,
 )
 from ros2_memory.index.recordings import is_named_after_folder
 
@@ -377,10 +378,7 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
     else:
         when = f"between {unix_text(start)} and {unix_text(end)}"
     deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, asked)
-    what = "is here any more of what was recorded" if deleted else "was recorded"
-    detail = [f"nothing {what} {when}"]
-    if deleted:
-        detail.append("it was deleted by retention")
+    detail = [why_nothing(when, deleted=bool(deleted))]
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
         reason = between(view, asked)

@@ -454,10 +454,10 @@ class Housekeeping(Housekeeper):
                 "budget_not_held",
                 total_bytes=collected.total_bytes,
                 state_bytes=state,
-                reason=f"of what may not be deleted, the recorder's and the server's own files "
-                f"(.episodic, .ros_log) take {state / _MB:.3g} MB, saved moments {saved / _MB:.3g} "
-                f"MB, and open, damaged or newest bags {others / _MB:.3g} MB, more than "
-                f"{self._max_bytes / _MB:.3g} MB in all; raise retention.max_total_gb",
+                reason=f"files that are never deleted exceed {self._max_bytes / _MB:.3g} MB: "
+                f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
+                f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
+                "raise retention.max_total_gb",
             )
         self._over_budget = not collected.fits
 

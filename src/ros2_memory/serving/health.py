@@ -1,6 +1,6 @@
 """What `/health` shows, and the tasks that read the bag directory between queries.
 
-The reply stays small whatever is wrong: all faults are counted, and the newest few are named.
+The reply counts all faults and names the newest few, so that it stays small.
 """
 
 from __future__ import annotations

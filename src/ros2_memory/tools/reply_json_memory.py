@@ -182,7 +182,7 @@ def _newest_moments(newest: results.MomentList | None) -> JsonObject:
 def _budget(budget: results.Budget) -> JsonObject:
     """Returns gigabytes, and for how many days they last; older bags are deleted then.
 
-    `state_gb` is how much of it is no recording, if that is a large part of what may be kept.
+    `state_gb` is the size of all but recordings, if that is a large part of the budget.
     `foreign_gb` is the size of bags that the recorder did not make; the others exclude it.
     """
     most, per_day = budget.most, budget.per_day

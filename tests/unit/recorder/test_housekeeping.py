@@ -358,7 +358,7 @@ class TestDeletionsThatFail:
         with structlog.testing.capture_logs() as captured:
             keeper.apply()
         (reported,) = events(captured, "budget_not_held")
-        assert "(.episodic, .ros_log) take 4.2 MB, saved moments 0 MB" in reported["reason"]
+        assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
         assert keeper.usage() == (size_of(tmp_path), 4_200_000)
         assert BackgroundHousekeeper(keeper).usage() == keeper.usage()
 

@@ -57,8 +57,7 @@ class LossCounter:
         self._reached: dict[str, Ns] = {}
         # The values of the newest splits by topic, ascending.
         self._recent: deque[tuple[str, Mapping[str, array[int]]]] = deque(maxlen=_RECENT)
-        # The end of what was measured, by recording and topic: from the first open hole on, or the
-        # last message.
+        # By recording and topic: the newest messages, from the first gap on that may still close.
         self._ends: dict[tuple[str, str], Sequence[Position]] = {}
         self._pending: list[_Pending] = []
         self._lately: deque[Loss] = deque(maxlen=10_000)
