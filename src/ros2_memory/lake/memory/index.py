@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from functools import partial
-from itertools import chain
+from itertools import chain, groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import pyarrow.compute as pc
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.lake.partitions import Days
     from ros2_memory.retention.foreign import Foreign
 
-FOLDER: Final = "lake"
+_FOLDER: Final = "lake"
 _ENCODING: Final = "json"
 _BAGS: Final = (
     "SELECT bag_id, day, size, sha256, made_of, mtime_ns, start_ns, end_ns FROM bags"
@@ -73,23 +73,39 @@ class LakeBag:
     is_current: bool
 
 
+class _Day(NamedTuple):
+    """What the lake has of one day of a robot.
+
+    Attributes:
+        made_of: the files of its rows.
+        bags: its bags.
+        detectors: topics of which all detections are rows.
+        whole_topics: topics of which some bags have all messages as rows.
+    """
+
+    made_of: tuple[str, ...]
+    bags: Sequence[BagFile]
+    detectors: frozenset[str]
+    whole_topics: frozenset[str]
+
+
 @dataclass(frozen=True)
 class _Window:
     """Consecutive days of a robot, and what the lake has of them.
 
     Attributes:
-        made_of: the files of its rows.
         since: its first day, where there are older ones; None otherwise.
         older: the end of the newest day before that, as a log time.
-        timeline: its bags.
+        days: what is known of each.
+        timeline: the bags of all.
         files: these by their paths.
         detectors: topics of which all detections are rows.
         whole_topics: topics of which some bags have all messages as rows.
     """
 
-    made_of: tuple[str, ...] = ()
     since: date | None = None
     older: Ns | None = None
+    days: Mapping[date, _Day] = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
     files: Mapping[str, BagFile] = field(default_factory=dict)
     detectors: frozenset[str] = frozenset()
@@ -173,7 +189,7 @@ class LakeIndex:
             self._lake.refresh(self._refresh_s / _LOOKS)
             days = self._lake.days("bags", self._robot)
             span = days.newest(date.max, self._most_bags, self._fewest_days)
-            self._newest = self._window(days, span, self._newest, FOLDER)
+            self._newest = self._window(days, span, self._newest)
             self._snapshot = Snapshot(
                 self._newest.timeline, scanned_at=self._clock.now(), older=self._newest.older
             )
@@ -236,39 +252,75 @@ class LakeIndex:
             span = days.newest(day + timedelta(days=1), self._most_bags, _FEWEST_DAYS)
             last = day if span is None else span[1]
             known = self._older.pop(last, _Window())
-            window = self._window(days, span, known, f"{FOLDER}-{last}")
+            window = self._window(days, span, known)
             self._older[last] = window
             # A new dict: other threads iterate over the old one.
             kept = [*self._older.items()][-_MOST_WINDOWS:]
             self._older = dict(kept)
             return window
 
-    def _window(
-        self, known_days: Days, days: tuple[date, date] | None, known: _Window, folder: str
-    ) -> _Window:
-        """Returns what the lake has of some days; the known one where no file is another."""
-        if days is None:
+    def _window(self, known_days: Days, span: tuple[date, date] | None, known: _Window) -> _Window:
+        """Returns what the lake has of some days; only those are read of which a file is new."""
+        if span is None:
             return _Window()
-        before = known_days.known[: bisect_left(known_days.known, days[0])]
-        since, older = (days[0], end_of(before[-1])) if before else (None, None)
+        begin, end = bisect_left(known_days.known, span[0]), bisect_right(known_days.known, span[1])
+        older = end_of(known_days.known[begin - 1]) if begin else None
+        bounds = replace(known, since=span[0] if begin else None, older=older)
         of_robot = [self._lake.days(table, self._robot) for table in _TABLES]
-        made_of = tuple(locations(chain.from_iterable(each.files(*days) for each in of_robot)))
-        if made_of == known.made_of:
-            return replace(known, since=since, older=older)
-        select = partial(self._lake.select, robots=[self._robot], days=days)
-        bags, topics = select(_BAGS, ["bags"]), select(_TOPICS, ["digests", "bags"])
-        files = [*self._files(bags, topics, folder)]
-        detectors, whole_topics = (
-            # Of a table name of this module.
-            frozenset(select(f"SELECT DISTINCT topic FROM {each}", [each])["topic"].to_pylist())  # noqa: S608
-            if self._lake.days(each, self._robot).files(*days)
-            else frozenset[str]()
-            for each in ("sightings", "messages")
+        made_of = {
+            day: locations(chain.from_iterable(each.files(day, day) for each in of_robot))
+            for day in known_days.known[begin:end]
+        }
+        days = {
+            day: known.days[day]
+            for day, files in made_of.items()
+            if day in known.days and known.days[day].made_of == files
+        }
+        if days.keys() == made_of.keys() == known.days.keys():
+            return bounds
+        for is_known, run in groupby(made_of, key=days.keys().__contains__):
+            if not is_known:
+                days |= self._read({day: made_of[day] for day in run}, known.files)
+        files = {bag.file: bag for day in made_of for bag in days[day].bags}
+        removed = [bag for file, bag in known.files.items() if file not in files]
+        added = [bag for file, bag in files.items() if file not in known.files]
+        return replace(
+            bounds,
+            days=days,
+            timeline=known.timeline.changed(removed, added),
+            files=files,
+            detectors=frozenset[str]().union(*(each.detectors for each in days.values())),
+            whole_topics=frozenset[str]().union(*(each.whole_topics for each in days.values())),
         )
-        by_path = {bag.file: bag for bag in files}
-        return _Window(made_of, since, older, Timeline.of(files), by_path, detectors, whole_topics)
 
-    def _files(self, bags: pa.Table, topics: pa.Table, folder: str) -> Iterator[BagFile]:
+    def _read(
+        self, made_of: Mapping[date, tuple[str, ...]], known: Mapping[str, BagFile]
+    ) -> dict[date, _Day]:
+        """Returns what the lake has of days between which there is no other; known bags stay."""
+        span = min(made_of), max(made_of)
+        select = partial(self._lake.select, robots=[self._robot], days=span)
+        bags: dict[date, list[BagFile]] = {day: [] for day in made_of}
+        for day, bag in self._files(select(_BAGS, ["bags"]), select(_TOPICS, ["digests", "bags"])):
+            bags.setdefault(day, []).append(known.get(bag.file, bag))
+        topics: dict[tuple[str, date], set[str]] = {}
+        for table in ("sightings", "messages"):
+            if self._lake.days(table, self._robot).files(*span):
+                # Of a table name of this module.
+                found = select(f"SELECT DISTINCT day, topic FROM {table}", [table])  # noqa: S608
+                for row in found.to_pylist():
+                    topics.setdefault((table, _day(row["day"])), set()).add(str(row["topic"]))
+        return {
+            day: _Day(
+                files,
+                bags[day],
+                frozenset(topics.get(("sightings", day), ())),
+                frozenset(topics.get(("messages", day), ())),
+            )
+            for day, files in made_of.items()
+        }
+
+    def _files(self, bags: pa.Table, topics: pa.Table) -> Iterator[tuple[date, BagFile]]:
+        """Yields bags with their days."""
         summaries = _summaries(bags, topics)
         is_old = pc.not_equal(topics["version"], str(DIGEST_VERSION))
         old = frozenset(topics["bag_id"].filter(is_old).to_pylist())
@@ -277,12 +329,13 @@ class LakeIndex:
                 continue
             key = str(row["bag_id"]), str(row["sha256"]), str(row["made_of"])
             number = self._numbers.get(key)
+            day = _day(row["day"])
             if number is None:
-                self._bags.append(LakeBag(key[0], _day(row["day"]), key[0] not in old))
+                self._bags.append(LakeBag(key[0], day, key[0] not in old))
                 number = self._numbers[key] = len(self._bags)
-            # Numbered in the order of time, as the splits of one recording are.
-            yield BagFile(
-                f"{self.bag_dir}/{folder}/{folder}_{nth}.mcap",
+            # By its number, so that bags that are shipped later leave it as it is.
+            file = BagFile(
+                f"{self.bag_dir}/{_FOLDER}/{_FOLDER}_{number}.mcap",
                 _whole(row["size"]),
                 _whole(row["mtime_ns"]),
                 BagState.CLOSED,
@@ -291,6 +344,7 @@ class LakeIndex:
                 _whole(row["end_ns"]),
                 number,
             )
+            yield day, file
 
 
 def _summaries(bags: pa.Table, topics: pa.Table) -> dict[int, BagSummary]:

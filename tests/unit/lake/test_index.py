@@ -1,0 +1,149 @@
+"""What is read again of a lake, and what stays, when more is shipped while a server runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import date, timedelta
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.index.timeline import SEGMENT_BAGS
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
+from ros2_memory.lake.files import Lake
+from ros2_memory.lake.memory.robot import LakeRobot
+from ros2_memory.lake.tables import day_of
+from tests.support.bags import detections, text, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.fleets import NOW, SEEN, START_S
+from tests.support.lake_rows import fill, lake_in, lake_robots
+from tests.support.memories import memory_of, recalling
+
+DAY_S = 86_400
+
+
+class WatchedEngine(LakeEngine):
+    """Keeps which files were read."""
+
+    def __init__(self, engine: LakeEngine) -> None:
+        self._engine = engine
+        self.read: set[str] = set()
+
+    def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
+        for files in tables.values():
+            self.read.update(files.locations)
+        return self._engine.select(sql, tables, parameters)
+
+    def days(self) -> set[date]:
+        """The days of the files that were read since it was last asked."""
+        folders = (part for each in self.read for part in each.split("/"))
+        found = {date.fromisoformat(each[4:]) for each in folders if each.startswith("day=")}
+        self.read.clear()
+        return found
+
+
+class Shipping:
+    """A robot whose bags are shipped a few at a time."""
+
+    def __init__(self, folder: Path, engine: LakeEngine) -> None:
+        self._folder = folder
+        self.engine = WatchedEngine(engine)
+        self._catalog = lake_in(folder)
+        self._passes = 0
+
+    def ship(self, starts_s: Sequence[int], label: str = "cup") -> None:
+        """Ships bags that begin at these times, and in which the robot saw something."""
+        self._passes += 1
+        bags = self._folder / f"bags_{self._passes}"
+        for start_s in starts_s:
+            at = start_s * NS_PER_S
+            messages = [detections(at, [label]), text(at, label)]
+            write_mcap(bags / "rec" / f"rec_{start_s}.mcap", messages)
+        fill(self._catalog, {"hall": recalling(memory_of(bags), bags)}, ["/chatter"])
+
+    def robot(self) -> LakeRobot:
+        return lake_robots(self._catalog, self.engine, ["hall"])["hall"]
+
+
+@pytest.fixture
+def shipping(tmp_path: Path, engine: LakeEngine) -> Shipping:
+    return Shipping(tmp_path, engine)
+
+
+def starts(robot: LakeRobot) -> list[int]:
+    return [bag.start // NS_PER_S for bag in robot.memory.index.refresh().bags]
+
+
+def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
+    old, now = START_S - 2 * DAY_S, START_S
+    shipping.ship([old, old + 60, now])
+    robot = shipping.robot()
+    assert starts(robot) == [old, old + 60, now]
+    assert shipping.engine.days() == {day_of(old * NS_PER_S), day_of(now * NS_PER_S)}
+    assert starts(robot) == [old, old + 60, now]
+    assert shipping.engine.days() == set()
+    shipping.ship([now + 60])
+    assert starts(robot) == [old, old + 60, now, now + 60]
+    assert shipping.engine.days() == {day_of(now * NS_PER_S)}
+
+
+def test_days_on_both_sides_of_a_known_one_are_read(shipping: Shipping) -> None:
+    middle = START_S - DAY_S
+    shipping.ship([middle])
+    robot = shipping.robot()
+    assert starts(robot) == [middle]
+    shipping.engine.days()
+    shipping.ship([START_S - 2 * DAY_S, START_S], label="fork")
+    assert starts(robot) == [START_S - 2 * DAY_S, middle, START_S]
+    known = day_of(middle * NS_PER_S)
+    assert shipping.engine.days() == {known - timedelta(days=1), known + timedelta(days=1)}
+
+
+def test_segments_without_a_new_bag_stay(shipping: Shipping) -> None:
+    """What was computed of them is kept by segment."""
+    shipping.ship(range(START_S, START_S + SEGMENT_BAGS + 8))
+    robot = shipping.robot()
+    before = robot.memory.index.refresh().timeline.segments
+    shipping.ship([START_S + 2 * SEGMENT_BAGS])
+    after = robot.memory.index.refresh().timeline.segments
+    assert len(before) > 1
+    assert [*map(id, after[: len(before) - 1])] == [*map(id, before[:-1])]
+
+
+def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shipping) -> None:
+    """A question that is under way reads the bag that it found."""
+    shipping.ship([START_S])
+    robot = shipping.robot()
+    [bag] = robot.memory.index.refresh().bags
+    shipping.ship([START_S - 60], label="fork")
+    late, same = robot.memory.index.refresh().bags
+    assert same is bag
+    assert late.file != bag.file
+    [record] = robot.memory.reader.records(bag.path, [SEEN], TimeWindow(bag.start, bag.end + 1))
+    assert "cup" in record.payload.decode()
+
+
+def test_the_newest_days_move_on_and_older_ones_are_still_found(
+    tmp_path: Path, shipping: Shipping
+) -> None:
+    lake = Lake(lake_in(tmp_path), shipping.engine)
+    first = shipping.robot().memory
+    robot = LakeRobot(
+        lake,
+        "hall",
+        FixedClock(NOW),
+        first.limits,
+        first.extractor,
+        refresh_s=0,
+        days=1,
+        most_bags=1,
+    )
+    shipping.ship([START_S - DAY_S])
+    assert starts(robot) == [START_S - DAY_S]
+    shipping.ship([START_S])
+    assert starts(robot) == [START_S]
+    older = robot.memory.index.snapshot((START_S - DAY_S) * NS_PER_S)
+    assert older.bags[0].start == (START_S - DAY_S) * NS_PER_S
