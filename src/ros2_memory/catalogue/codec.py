@@ -79,7 +79,7 @@ def decode_poses(packed: bytes) -> PoseDigest:
         ValueError: the bytes are not valid.
     """
     try:
-        poses, invalid, driven, twist, frames, error_m, stored = json.loads(packed)
+        poses, invalid, driven, twist, frames, error_m, stored = json.loads(packed.decode())
         totals = MotionTotals(*driven)
         totals.head, totals.tail = _decode_leg(totals.head), _decode_leg(totals.tail)
         totals.resets = tuple(totals.resets)

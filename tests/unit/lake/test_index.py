@@ -9,6 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
+from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.timeline import SEGMENT_BAGS
@@ -147,3 +148,16 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(
     assert starts(robot) == [START_S]
     older = robot.memory.index.snapshot((START_S - DAY_S) * NS_PER_S)
     assert older.bags[0].start == (START_S - DAY_S) * NS_PER_S
+
+
+def test_static_transforms_are_known_not_to_be_there(shipping: Shipping) -> None:
+    """So a question about places does not look for them in each bag."""
+    shipping.ship([START_S])
+    memory = shipping.robot().memory
+    [bag] = memory.index.refresh().bags
+    assert memory.recall is not None
+    edges = memory.recall.catalogue.edges
+    [number] = memory.recall.catalogue.find([BagKey.of(bag, memory.recall.bag_dir)])
+    assert number is not None
+    assert edges("/tf_static", [number])[number].pairs == ()
+    assert edges("/tf", [number]) == {}

@@ -13,6 +13,7 @@ from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.map_digest import NO_STATICS, decode_map_tracks
 from ros2_memory.catalogue.store import BagKey, Catalogue
+from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.lake.partitions import locations
 
 if TYPE_CHECKING:
@@ -140,6 +141,11 @@ class LakeCatalogue(Catalogue):
         """Returns that no message is of another recording: such were not shipped."""
         del topic
         return dict.fromkeys(numbers, False)
+
+    def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
+        """Returns that static transforms have no edges; those of others are not known."""
+        none = EdgeDigest((), None, None)
+        return dict.fromkeys(numbers, none) if topic in self._static_topics else {}
 
     def messages(self, topic: str, numbers: Sequence[int]) -> dict[int, tuple[Record, ...]]:
         """Returns that there are no static transforms; of other topics nothing is known."""
