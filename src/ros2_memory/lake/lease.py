@@ -197,13 +197,11 @@ def _id_in(state_dir: Path) -> str:
 
 @contextmanager
 def leased(location: LakeLocation, clock: Clock) -> Iterator[WarehouseLease]:
-    """Holds the lease of a lake, whose lock the caller holds.
+    """Yields the lease of a lake, whose lock the caller holds, and ends it if it was taken.
 
-    Raises:
-        LakeError: another state directory has it, or the warehouse cannot be reached.
+    It is taken with the first `renew`, which a service tries again where that fails.
     """
     lease = WarehouseLease(location, clock)
-    lease.renew()
     try:
         yield lease
     finally:

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import bootstrap_lake, cli
+from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
-from ros2_memory.lake.lease import writing_alone
+from ros2_memory.lake.lease import WarehouseLease, writing_alone
 from tests.support.fleets import seeded, write_robot
 from tests.support.lakes import lake_column
 
@@ -90,6 +91,32 @@ def test_a_second_writer_ends_and_names_the_first(
     assert "process" in capsys.readouterr().err
     with writing_alone(tmp_path / "lake" / ".ros2-memory"):
         pass
+
+
+def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    taken = WarehouseLease.renew
+    waited: list[float] = []
+
+    def renew(lease: WarehouseLease) -> None:
+        if not waited:
+            raise LakeError("the store cannot be reached")
+        taken(lease)
+
+    def wait(seconds: float) -> None:
+        if seconds > 0:  # not before a commit
+            waited.append(seconds)
+        if len(waited) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(WarehouseLease, "renew", renew)
+    monkeypatch.setattr(ship_module, "_wait", wait)
+    settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake"]
+    assert cli.main(["ship", *settings]) == 130
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
 
 
 def test_doctor_tells_of_a_lake_what_keeps_it_from_working(

@@ -76,11 +76,12 @@ def ship(
     configure_logging(shown, settings.logging.format)
     pace = _Pace(settings.lake.commit_interval_s)
     with writing_alone(location.state_dir), leased(location, WallClock()) as lease:
+        if forget is None and not once:
+            _ship_on(settings, location, robots, pace, lease)
+        lease.renew()
         if forget is not None and window is not None:
             _forget(location, forget, window, as_json=as_json)
             return
-        if not once:
-            _ship_on(settings, location, robots, pace, lease)
         with _shipper(settings, location, robots, pace, lease) as shipper:
             done = shipper.run()
             shipper.keep_up(ns_from_unix(settings.lake.grace_h * 3600))
