@@ -41,7 +41,8 @@ from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.spec_tools import build_tools
 
 _SETTING: Final = re.compile(
-    r"((recording|data|reader|retention|server|fleet|logging)\.\w|(deployment|storage|recorder)=).*",
+    r"\+{0,2}((recording|data|reader|retention|server|fleet|lake|logging)\.\w"
+    r"|(deployment|storage|recorder|lake)=).*",
     re.DOTALL,
 )
 """A word that sets a setting; no argument of a tool is named so."""

@@ -56,8 +56,11 @@ class LakeSource(Protocol):
     def latest(self) -> Ns | None:
         """The log time of the newest message that was shipped; None if there is none."""
 
-    def notes(self) -> Iterable[str]:
-        """Returns the notes for the answer that this thread has just computed."""
+    def notes(self, begin: Ns | None = None) -> Iterable[str]:
+        """Returns the notes for the answer that this thread has just computed.
+
+        `begin` is from when (log time) the answer is; None for one that is of all days.
+        """
 
 
 class Robot:
@@ -105,27 +108,39 @@ class Robot:
         """Its memory over what was shipped to a lake; None without one."""
         return None if self._lake_source is None else self._lake_source.memory
 
-    def asked(self, ask: Callable[[Memory], T], *, lake: bool) -> tuple[T, FromLake | None]:
+    def asked(
+        self,
+        ask: Callable[[Memory], T],
+        *,
+        lake: bool,
+        begin_of: Callable[[T, Ns], Ns | None] = lambda *_: None,
+    ) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
         With `lake` that is the memory of the lake, where there is one; the mounted one answers what
-        needs messages that the lake does not hold.
+        needs messages that the lake does not hold, and for a robot of which it has nothing.
+        `begin_of` returns from when an answer is, by it and the newest log time.
 
         Raises:
             NotShippedError: it needs those, and no other memory is mounted.
         """
         source = self._lake_source
         if source is not None and (lake or not self.is_mounted):
+            begin: Ns | None = None
             try:
                 try:
                     found = ask(source.memory)
+                    if source.latest is not None:
+                        begin = begin_of(found, source.latest)
                 finally:
                     # Also of an answer that failed: they are not those of the next one.
-                    notes = (*source.notes(),)
-                return found, FromLake(source.latest, notes)
+                    notes = (*source.notes(begin),)
+                if source.latest is not None or not self.is_mounted:
+                    return found, FromLake(source.latest, notes)
             except NoDataError as error:
-                detail = "; ".join((error.detail, *notes))
-                raise NoDataError(error.reason, detail, error.notes) from error
+                if source.latest is not None or not self.is_mounted:
+                    detail = "; ".join((error.detail, *notes))
+                    raise NoDataError(error.reason, detail, error.notes) from error
             except NotShippedError:
                 if not self.is_mounted:
                     raise

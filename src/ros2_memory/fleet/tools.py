@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import (
     BagError,
@@ -19,7 +19,7 @@ from ros2_memory.core.errors import (
     RefusedError,
 )
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, unix_rounded_up
+from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_rounded_up
 from ros2_memory.fleet.fan_out import AT_ONCE, FanOut
 from ros2_memory.fleet.merging import (
     ANSWER_FOR_ALL,
@@ -33,7 +33,7 @@ from ros2_memory.fleet.merging import (
 )
 from ros2_memory.fleet.page import Page
 from ros2_memory.fleet.robots import Robot, StoppedClock
-from ros2_memory.results import OfFleet, OfRobot, Sightings
+from ros2_memory.results import Match, OfFleet, OfRobot, Sightings
 from ros2_memory.tools.replies import as_json
 from ros2_memory.tools.reply_json import ROBOT_NAME
 
@@ -112,6 +112,13 @@ def _for_all(tool: str, text: str) -> str:
     return f"{text} Of all robots: {shape}."
 
 
+class _Asked(NamedTuple):
+    """A question to one robot, and its arguments as they were given."""
+
+    question: Question
+    given: Mapping[str, object]
+
+
 @dataclass(frozen=True, slots=True)
 class _FleetQuestions:
     """Checks the arguments of a call, and returns what asks one robot or all."""
@@ -123,18 +130,18 @@ class _FleetQuestions:
 
     def __call__(self, given: Mapping[str, object]) -> Question:
         own = {name: value for name, value in given.items() if name != ROBOT}
-        question = self.tool.question(own)
+        asked = _Asked(self.tool.question(own), own)
         name = given.get(ROBOT)
         if name is not None:
-            return lambda _, call: self._of_one(self.fleet.named(name, call), question, call)
+            return lambda _, call: self._of_one(self.fleet.named(name, call), asked, call)
         is_table = self.tool.name in TABLE_FOR_ALL and given.get("by") is not None
         if self.tool.name not in ANSWER_FOR_ALL and not is_table:
             return lambda _, call: self._of_one(
-                self.fleet.the_one(self.tool.name, call), question, call
+                self.fleet.the_one(self.tool.name, call), asked, call
             )
-        return lambda _, call: self._of_all(question, own, call)
+        return lambda _, call: self._of_all(asked, call)
 
-    def _of_one(self, robot: Robot, question: Question, call: Call) -> OfRobot:
+    def _of_one(self, robot: Robot, asked: _Asked, call: Call) -> OfRobot:
         """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
 
         Raises:
@@ -142,7 +149,11 @@ class _FleetQuestions:
         """
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None]:
-            return robot.asked(lambda memory: _single(question(memory, own)), lake=self._is_of_lake)
+            return robot.asked(
+                lambda memory: _single(asked.question(memory, own)),
+                lake=self._is_of_lake,
+                begin_of=partial(_begin_of, asked.given),
+            )
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
@@ -155,8 +166,8 @@ class _FleetQuestions:
     def _is_of_lake(self) -> bool:
         return self.tool.name in OF_LAKE
 
-    def _of_all(self, question: Question, given: Mapping[str, object], call: Call) -> OfFleet:
-        robots = self.fleet.allowed(call)
+    def _of_all(self, asked: _Asked, call: Call) -> OfFleet:
+        robots, given = self.fleet.allowed(call), asked.given
         if not robots:
             raise RefusedError("there is no robot that this token may ask about")
         if len(robots) > 1 and not self.fleet.shared_map and (name := _coordinates_in(given)):
@@ -168,7 +179,7 @@ class _FleetQuestions:
         now = StoppedClock(self.fleet.clock.now())
         limit, oldest_first = self._limit(given.get("limit")), given.get("oldest_first") is True
         page = Page(limit, oldest_first=oldest_first)
-        found = self.fan_out.ask(robots, partial(self._reply, question, now, page), call)
+        found = self.fan_out.ask(robots, partial(self._reply, asked, now, page), call)
         replies = [each for each in found.values() if isinstance(each, RobotReply)]
         errors = {name: each for name, each in found.items() if isinstance(each, EpisodicError)}
         if not replies:
@@ -185,7 +196,7 @@ class _FleetQuestions:
         )
 
     def _reply(
-        self, question: Question, now: StoppedClock, page: Page, robot: Robot, call: Call
+        self, asked: _Asked, now: StoppedClock, page: Page, robot: Robot, call: Call
     ) -> RobotReply:
         """Returns a robot's reply; runs in a thread of its own.
 
@@ -193,15 +204,19 @@ class _FleetQuestions:
             EpisodicError: it has none.
         """
 
-        def ask(memory: Memory) -> RobotReply:
-            return self._replied(question, replace(memory, clock=now), page, robot, call)
+        def ask(memory: Memory) -> tuple[RobotReply, OneAnswer]:
+            return self._replied(asked.question, replace(memory, clock=now), page, robot, call)
 
-        reply, lake = robot.asked(ask, lake=self._is_of_lake)
+        (reply, _), lake = robot.asked(
+            ask,
+            lake=self._is_of_lake,
+            begin_of=lambda found, latest: _begin_of(asked.given, found[1], latest),
+        )
         return replace(reply, lake=lake)
 
     def _replied(
         self, question: Question, memory: Memory, page: Page, robot: Robot, call: Call
-    ) -> RobotReply:
+    ) -> tuple[RobotReply, OneAnswer]:
         snapshot = memory.index.snapshot()
         if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
             # "Never" would be a claim about bags that were not searched.
@@ -214,7 +229,7 @@ class _FleetQuestions:
         if isinstance(answer, Sightings) and not is_ahead:
             page.add(each.last for each in answer.sightings)
         value = as_json(answer, memory.index.bag_dir)
-        return RobotReply(robot.name, value, latest, is_ahead)
+        return RobotReply(robot.name, value, latest, is_ahead), answer
 
     def _limit(self, given: object) -> int | None:
         """Returns how many rows a call wants, all robots together."""
@@ -224,6 +239,16 @@ class _FleetQuestions:
         schema = properties.get("limit") if isinstance(properties, dict) else None
         default = schema.get("default") if isinstance(schema, dict) else None
         return default if isinstance(default, int) else None
+
+
+def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns) -> Ns | None:
+    """Returns from when an answer is: its match, or the start that was given; None if from ever."""
+    if isinstance(answer, Match) and answer.found is not None:
+        return answer.found.sample.time
+    start, last_s = given.get("start"), given.get("last_s", given.get("seconds"))
+    if isinstance(start, int | float):
+        return ns_from_unix(start)
+    return latest - ns_from_unix(last_s) if isinstance(last_s, int | float) else None
 
 
 def _single(answer: Answer) -> OneAnswer:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import shutil
 from pathlib import Path
 
 import anyio
 import pytest
 
+from ros2_memory import cli
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.bootstrap_lake import engine_of
 from ros2_memory.config import DuckdbNode, load_settings
@@ -47,6 +49,35 @@ def test_a_robot_whose_bags_are_gone_is_answered_from_the_lake(tmp_path: Path) -
     assert found["notes"][-1].startswith("from the lake, which has what was shipped: ")
     assert fleet.robots["attic"].is_mounted
     assert not fleet.robots["hall"].is_mounted
+
+
+def test_a_mounted_robot_that_was_never_shipped_is_answered_from_its_bags(tmp_path: Path) -> None:
+    for name in ("hall", "attic"):
+        write_bag(tmp_path / name, 0)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert fleet is not None
+    found = reply(fleet, "find_last_match", CUP)
+    assert {row["robot_name"] for row in found["matches"]} == {"hall", "attic"}
+    [note] = found["notes"]
+    assert note.startswith("from the lake, which has what was shipped: hall up to ")
+    assert "attic" not in note
+    assert reply(fleet, "find_things", {"robot": "attic"})["robot_name"] == "attic"
+
+
+def test_the_command_line_asks_a_lake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    write_bag(tmp_path / "hall", 0)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    shutil.rmtree(tmp_path / "hall")
+    settings = [*overrides(tmp_path, "duckdb"), "+lake.properties={x.y: z}"]
+    question = [f"{key}={value}" for key, value in CUP.items()]
+    capsys.readouterr()
+    assert cli.main(["ask", "--json", "find_last_match", *settings, *question]) == 0
+    [match] = json.loads(capsys.readouterr().out)["matches"]
+    assert match["robot_name"] == "hall"
 
 
 def test_a_robot_that_only_the_lake_knows_is_asked_unless_a_token_forbids_it(

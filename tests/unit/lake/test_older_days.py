@@ -71,9 +71,30 @@ def test_what_was_seen_before_the_newest_days_is_found(tmp_path: Path, engine: L
         found = asked(robot, label)
         [match] = found["matches"]
         assert match["timestamp"] == START_S - ago * DAY_S
-    assert "not looked at" not in str(found)
+        assert "not looked at" not in str(found)
     before = asked(robot, "mug", before=START_S - 2 * DAY_S)
     assert "never" not in before
+
+
+@pytest.mark.parametrize(
+    ("more", "is_noted"),
+    [
+        ({}, True),
+        ({"start": START_S - DAY_S}, True),
+        ({"start": START_S}, False),
+        ({"last_s": 60}, False),
+        ({"end": START_S - 2 * DAY_S}, True),
+    ],
+)
+def test_days_before_are_named_only_where_the_answer_is_of_them(
+    tmp_path: Path, engine: LakeEngine, more: dict[str, object], *, is_noted: bool
+) -> None:
+    robot = old_robot(engine, tmp_path)
+    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot.memory, lake=robot)], FixedClock(NOW))
+    given = {"topic": SEEN, "condition_type": "contains", "value": "cup", **more}
+    for robot_name in ({}, {"robot": "hall"}):
+        found = reply(fleet, "find_matches", {**given, **robot_name})
+        assert ("not looked at" in str(found)) is is_noted
 
 
 def test_never_is_of_all_days(tmp_path: Path, engine: LakeEngine) -> None:

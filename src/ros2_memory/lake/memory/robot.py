@@ -12,6 +12,7 @@ from ros2_memory.lake.memory.catalogue import LakeCatalogue
 from ros2_memory.lake.memory.index import MOST_BAGS, LakeIndex
 from ros2_memory.lake.memory.reader import LakeReader
 from ros2_memory.lake.memory.rows_as_messages import stated_in
+from ros2_memory.lake.tables import day_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -101,10 +102,13 @@ class LakeRobot:
         known = self._index.published
         return None if known is None else known.latest
 
-    def notes(self) -> Iterator[str]:
-        """Yields the notes for the answer that this thread has just computed."""
+    def notes(self, begin: Ns | None = None) -> Iterator[str]:
+        """Yields the notes for the answer that this thread has just computed.
+
+        `begin` is from when (log time) the answer is; None for one that is of all days.
+        """
         since = self._index.unseen_before()
-        if since is not None:
+        if since is not None and (begin is None or day_of(begin) < since):
             yield (
                 f"the lake has days before {since}, which were not looked at: an end (or before, "
                 "or a time) there has them looked at"
