@@ -9,6 +9,7 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import timedelta
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import pyarrow as pa
@@ -30,10 +31,12 @@ from ros2_memory.catalogue.store import relative
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
-from ros2_memory.lake.conditions import equal, of_bags
+from ros2_memory.core.spans import united
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.lake.conditions import any_of, of_bags, overlapping
 from ros2_memory.lake.forgetting import forget_in_lake
 from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of, to_arrow
+from ros2_memory.lake.tables import TABLES, day_of, end_of, to_arrow
 from ros2_memory.lake.tombstones import Tombstone, append_tombstone
 from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.warehouse import quiet_deletes
@@ -129,6 +132,25 @@ class _Known(NamedTuple):
     day: date
 
 
+@dataclass(slots=True)
+class _OfRobot:
+    """What is known of the bags that a robot has, and no longer of those that it had.
+
+    Attributes:
+        days: of which the lake was asked, with those beside them.
+        known: the bags of these days that are in the lake, by their ids.
+        ids: by path, with the size and time of the file.
+        forbidden: whether a state of a bag has messages that were forgotten.
+        receipts: by path; None before they were read.
+    """
+
+    days: frozenset[date] = frozenset()
+    known: dict[str, _Known] = field(default_factory=dict)
+    ids: dict[str, tuple[tuple[int, Ns], str]] = field(default_factory=dict)
+    forbidden: dict[str, bool] = field(default_factory=dict)
+    receipts: dict[str, Receipt] | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class _Ready:
     """A bag of a batch, its rows, and the days and ids under which older ones of it may lie."""
@@ -173,13 +195,10 @@ class Shipper:
         self._clock = clock
         self._messages = messages
         self._tombstones = set(tombstones)
-        self._forbidden: dict[str, bool] = {}
         self._pause = pause
         self._alive = alive
         self._most_bags = most_bags
-        self._known: dict[str, dict[str, _Known]] = {}
-        self._ids: dict[str, tuple[tuple[int, Ns], str]] = {}
-        self._receipts: dict[str, dict[str, Receipt]] = {}
+        self._of = {each.name: _OfRobot() for each in robots}
         self._refused: set[str] = set()
 
     @property
@@ -235,9 +254,13 @@ class Shipper:
             ]
             self._tombstones.add(each)
         if new:
-            self._known.clear()
-            self._forbidden.clear()
+            self._look_again()
         return True
+
+    def _look_again(self) -> None:
+        """Has the lake asked again what it has, and bags whether they were forgotten."""
+        for each in self._of.values():
+            each.days, each.known, each.forbidden = frozenset(), {}, {}
 
     def keep_up(self, grace: Ns) -> None:
         """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
@@ -255,12 +278,12 @@ class Shipper:
         if snapshot.problem is not None:
             done.problems.append(f"{robot.name}: {snapshot.problem}")
             return
-        known = self._known_of(robot.name)
+        bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
+        known = self._known_of(robot.name, bags)
         by_file = {each.file: each for each in known.values()}
         stale = {bag.file for bag in robot.digests.waiting()}
         seen: set[str] = set()
         receipts: list[_Known] = []
-        bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
         # A saved moment's copy of a bag counts where the bag itself is gone.
         for bag in sorted(bags, key=lambda each: (self._is_moment(robot, each), each.start)):
             self._alive()
@@ -287,6 +310,23 @@ class Shipper:
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{robot.name}: {error}")
         self._confirm(robot, receipts, done)
+        self._drop_gone(robot, bags)
+
+    def _drop_gone(self, robot: RobotBags, bags: Sequence[BagFile]) -> None:
+        """Drops what is known of bags that the robot has no longer: a hub runs for years."""
+        of_robot, root = self._of[robot.name], str(robot.bag_dir)
+        present = {each.file: each for each in bags}
+        ids = {file: each for file, each in of_robot.ids.items() if file in present}
+        states = {_state_of(present[file], bag_id) for file, (_, bag_id) in ids.items()}
+        names = {relative(file, root) for file in present}
+        of_robot.ids = ids
+        of_robot.forbidden = {
+            state: each for state, each in of_robot.forbidden.items() if state in states
+        }
+        if of_robot.receipts is not None:
+            of_robot.receipts = {
+                name: each for name, each in of_robot.receipts.items() if name in names
+            }
 
     @staticmethod
     def _is_moment(robot: RobotBags, bag: BagFile) -> bool:
@@ -294,10 +334,11 @@ class Shipper:
 
     def _id_of(self, robot: RobotBags, bag: BagFile) -> str:
         stat = (bag.size, bag.mtime_ns)
-        found = self._ids.get(bag.file)
+        ids = self._of[robot.name].ids
+        found = ids.get(bag.file)
         if found is None or found[0] != stat:
             found = stat, bag_id_of(robot.name, bag, robot.first_in(bag.path))
-            self._ids[bag.file] = found
+            ids[bag.file] = found
         return found[1]
 
     def _made(
@@ -321,18 +362,18 @@ class Shipper:
 
         Each state of a bag is read once.
         """
-        key = f"{bag_id} {bag.size} {bag.mtime_ns} {bag.sidecar_ns}"
-        if key not in self._forbidden:
+        key, forbidden = _state_of(bag, bag_id), self._of[robot.name].forbidden
+        if key not in forbidden:
             reader = robot.memory.reader
-            self._forbidden[key] = any(
+            forbidden[key] = any(
                 each.forbids(reader, robot.name, bag, bag_id) for each in self._tombstones
             )
-        if self._forbidden[key]:
+        if forbidden[key]:
             done.problems.append(
                 f"{robot.name}: {bag.file} has messages that were forgotten in the lake; it is "
                 "not shipped: delete it, or the messages, with ros2-memory forget"
             )
-        return self._forbidden[key]
+        return forbidden[key]
 
     def _described(
         self, robot: RobotBags, bag: BagFile, bag_id: str, before: _Known | None
@@ -347,21 +388,42 @@ class Shipper:
         day = day_of(bag.start)
         return _Known(bag_id, file, bag.size, sha256, bag.mtime_ns, made, bag.start, bag.end, day)
 
-    def _known_of(self, robot: str) -> dict[str, _Known]:
-        """Returns the bags of a robot that are in the lake; it is asked once."""
-        if robot not in self._known:
-            with self._location.translated("reading the lake's bags"):
-                found = (
-                    self._tables["bags"]
-                    .refresh()
-                    .scan(row_filter=equal("robot", robot), selected_fields=_KNOWN)
-                    .to_arrow()
-                    .select(_KNOWN)
-                )
-                columns = [found[name].to_pylist() for name in _KNOWN]
-            rows = [_Known(*row) for row in zip(*columns, strict=True)]
-            self._known[robot] = {each.bag_id: each for each in rows}
-        return self._known[robot]
+    def _known_of(self, robot: str, bags: Sequence[BagFile]) -> dict[str, _Known]:
+        """Returns what the lake has of the days of some bags; of each day it is asked once.
+
+        And of the days beside them: another first message of a bag that counts moves its begin.
+        """
+        of_robot = self._of[robot]
+        own = {day for bag in bags for day in (day_of(bag.start), day_of(bag.end))}
+        days = frozenset(day + timedelta(beside) for day in own for beside in (-1, 0, 1))
+        if missing := days - of_robot.days:
+            found = {each.bag_id: each for each in self._read_known(robot, missing)}
+            of_robot.known = {**found, **of_robot.known}
+        if days != of_robot.days:
+            of_robot.known = {
+                bag_id: each
+                for bag_id, each in of_robot.known.items()
+                if any(each.day <= day <= day_of(each.end) for day in days)
+            }
+            of_robot.days = days
+        return of_robot.known
+
+    def _read_known(self, robot: str, days: Iterable[date]) -> Iterator[_Known]:
+        """Yields the bags of a robot in the lake that have something of some days.
+
+        Raises:
+            LakeError: the lake cannot be read.
+        """
+        spans = united(
+            (end_of(day - timedelta(1)) + 1, min(end_of(day) + 1, MAX_NS)) for day in days
+        )
+        reaching = [overlapping(robot, ("start_ns", "end_ns"), *span) for span in spans]
+        with self._location.translated("reading the lake's bags"):
+            scan = self._tables["bags"].refresh().scan(any_of(reaching), selected_fields=_KNOWN)
+            found = scan.to_arrow().select(_KNOWN)
+            columns = [found[name].to_pylist() for name in _KNOWN]
+        for row in zip(*columns, strict=True):
+            yield _Known(*row)
 
     def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
         """Commits a batch.
@@ -387,10 +449,10 @@ class Shipper:
                 rows += table.num_rows
                 self._overwrite(name, table, condition)
         except LakeError:
-            self._known.clear()
+            self._look_again()
             raise
         for each in batch:
-            known = self._known_of(each.robot.name)
+            known = self._of[each.robot.name].known
             for old in each.replaced:
                 known.pop(old.bag_id, None)
             known[each.known.bag_id] = each.known
@@ -414,9 +476,10 @@ class Shipper:
         if not has_recorded(robot.bag_dir):
             return
         try:
-            if robot.name not in self._receipts:
-                self._receipts[robot.name] = read_receipts(robot.bag_dir)
-            known, lake = self._receipts[robot.name], self.lake_id
+            of_robot, lake = self._of[robot.name], self.lake_id
+            if of_robot.receipts is None:
+                of_robot.receipts = read_receipts(robot.bag_dir)
+            known = of_robot.receipts
             missing = [
                 Receipt(each.file, each.bag_id, each.size, each.sha256, lake, self._clock.now())
                 for each in bags
@@ -435,6 +498,11 @@ class Shipper:
                 log.warning("receipts_not_written", robot=robot.name, reason=str(error))
                 self._refused.add(robot.name)
             done.problems.append(problem)
+
+
+def _state_of(bag: BagFile, bag_id: str) -> str:
+    """Returns what names a state of a bag."""
+    return f"{bag_id} {bag.size} {bag.mtime_ns} {bag.sidecar_ns}"
 
 
 def _is_same(before: _Known, now: _Known) -> bool:

@@ -25,6 +25,7 @@ from tests.support.lakes import (
 
 ROBOTS = ("hall", "kitchen")
 BAGS = 3
+DAY_S = 86_400
 
 
 class _Killed(BaseException):
@@ -123,6 +124,39 @@ def test_a_saved_copy_of_a_bag_is_shipped_only_where_the_bag_is_not(tmp_path: Pa
     shutil.rmtree(tmp_path / "hall" / "rec")
     assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 0
     assert len(values(tmp_path / "lake")) == 6
+
+
+def test_days_of_which_a_robot_has_no_bag_any_more_are_not_read(tmp_path: Path) -> None:
+    old = write_bag(tmp_path / "hall", 0, at_s=START_S - 30 * DAY_S)
+    write_bag(tmp_path / "hall", 1)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    old.unlink()
+    own = tmp_path / "lake" / "ros2_memory" / "bags" / "data" / "robot=hall"
+    shutil.rmtree(min(own.iterdir()))
+    write_bag(tmp_path / "hall", 2)
+    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 1
+
+
+def test_a_bag_across_midnight_that_lost_its_first_day_replaces_its_rows(tmp_path: Path) -> None:
+    midnight = START_S // DAY_S * DAY_S
+    write_bag(tmp_path / "hall", 0, at_s=midnight - 2, most=4)
+    with shipping(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]) as shipper:
+        assert shipper.run().bags == 1
+        write_bag(tmp_path / "hall", 0, at_s=midnight, most=2)
+        assert shipper.run().bags == 1
+        assert shipper.run().bags == 0
+    assert values(tmp_path / "lake") == ["n0", "n1"]
+
+
+def test_what_ships_for_years_forgets_bags_that_are_gone(tmp_path: Path) -> None:
+    with shipping(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]) as shipper:
+        for day in range(6):
+            bag = write_bag(tmp_path / "hall", day, at_s=START_S + day * DAY_S)
+            assert shipper.run().bags == 1
+            of_robot = shipper._of["hall"]
+            kept = [len(of_robot.known), len(of_robot.ids), len(of_robot.forbidden)]
+            assert max(*kept, len(of_robot.receipts or ())) <= 2
+            bag.unlink()
 
 
 def test_read_only_bags_are_shipped_and_reported(
