@@ -15,14 +15,18 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
+from statistics import mean
 from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import urlsplit
 
 from pyiceberg.catalog.sql import SqlCatalog
 
 from benchmarks.home.__main__ import made
 from benchmarks.home.days import Scale
 from benchmarks.report import machine
+from ros2_memory.lake.written_files import WRITTEN_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -117,6 +121,23 @@ class Hub:
                 list(table.scan(row_filter=f"robot = '{robot}'").plan_files())
             return manifests, (time.process_time() - begun) / _PLANS
 
+    def version_bytes(self) -> float:
+        """Returns by how much a version makes the list of versions of a table longer, at most.
+
+        Each commit writes that list again.
+        """
+        with self._tables() as tables:
+            return max(
+                Path(urlsplit(table.metadata_location).path).stat().st_size / len(table.snapshots())
+                for table in tables.values()
+                if table.snapshots()
+            )
+
+    def recorded_bytes(self) -> float:
+        """Returns the bytes by which `ship` records a file that it writes."""
+        [record] = (self._folder / "lake").rglob(WRITTEN_FILE)
+        return record.stat().st_size / len(record.read_text().splitlines())
+
     def _lake(self) -> tuple[int, int, int, int]:
         """Returns snapshots, files and bytes of data, and all other bytes."""
         with self._tables() as tables:
@@ -179,16 +200,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     shipped("the first bag of all others", others, 1)
     each = shipped("one bag of each robot", hub.robots, 1)
     before = shipped("nothing new, all robots", [], 0)
-    last = before
     few = hub.planned(first)
-    for commit in range(_COMMITS):
-        last = shipped(f"one bag of each other robot, {commit + 1} of {_COMMITS}", others, 1)
-    many = hub.planned(first)
+    turns = [
+        shipped(f"one bag of each other robot, {commit + 1} of {_COMMITS}", others, 1)
+        for commit in range(_COMMITS)
+    ]
+    last, many, version = turns[-1], hub.planned(first), hub.version_bytes()
     much = shipped("an hour of each robot", hub.robots, hour)
+    seen = shipped("nothing new, many bags", [], 0)
     after = shipped("nothing new, and no old versions", [], 0, "lake.grace_h=0")
     hours = given.robots
     per_bag = (much.processor_s - each.processor_s) / (much.bags - each.bags)
     commits = each.snapshots - passes[3].snapshots
+    added = [new.snapshots - old.snapshots for old, new in pairwise(turns)]
+    plain = [one.processor_s for one, more in zip(turns[1:], added, strict=True) if more <= commits]
+    closing = [
+        one.processor_s for one, more in zip(turns[1:], added, strict=True) if more > commits
+    ]
+    held = sum(each.bags for each in passes)
     lines = {
         "a pass that ships nothing: processor, s": nothing.processor_s,
         "the same with all robots": before.processor_s,
@@ -196,6 +225,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         "each bag of a batch: processor, s": per_bag,
         "each robot-hour in batches: processor, s": per_bag * hour,
         "versions that a batch of all tables adds": commits,
+        "versions that closing days adds": max(added) - commits,
+        "closing a day of a robot: processor, s": (mean(closing) - mean(plain)) / len(others),
+        "a bag that was shipped before: peak memory, kB": (seen.peak_mb - nothing.peak_mb)
+        / (held - hour)
+        * 1e3,
+        "the list of versions of a table: kB for each": version / 1e3,
+        "the record of a file that was written: bytes": hub.recorded_bytes(),
         f"planning one robot, {few[0]} manifests: processor, s": few[1],
         f"the same, {many[0]} manifests": many[1],
         "each robot-hour: data, kB": (after.data_bytes - last.data_bytes) / hours / 1e3,
