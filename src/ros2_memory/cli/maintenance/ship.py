@@ -105,6 +105,8 @@ def ship(
             print_line(f"forgotten as on the robot: {counted(done.forgotten, 'bag')}")
         for problem in done.problems:
             print(f"note: {problem}", file=sys.stderr)
+    if done.forgotten:
+        _note_versions(location)
     if done.waiting or done.problems:
         raise typer.Exit(EXIT_NEGATIVE)
 
@@ -146,13 +148,18 @@ def _forget(location: "LakeLocation", robot: str, window: TimeWindow, *, as_json
         print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
         for each in gone.kept_by:
             print(f"note: a branch or tag keeps an older version: {each}", file=sys.stderr)
-    if "://" in location.warehouse and not location.warehouse.startswith("file:"):
+    _note_versions(location)
+    if gone.kept_by:
+        raise typer.Exit(EXIT_NEGATIVE)
+
+
+def _note_versions(location: "LakeLocation") -> None:
+    """Prints, after something was forgotten, what a bucket may still have of it."""
+    if not location.warehouse.startswith("file:"):
         print(
             "note: where the bucket keeps versions of deleted objects, those are not erased",
             file=sys.stderr,
         )
-    if gone.kept_by:
-        raise typer.Exit(EXIT_NEGATIVE)
 
 
 class _Pace:
