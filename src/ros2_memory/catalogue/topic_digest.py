@@ -169,6 +169,8 @@ class TopicCollector:
     def digest(self, undecodable: dict[str, str]) -> TopicDigest:
         """Returns the digest; `undecodable` says, by type, why its messages cannot be decoded."""
         self._decode_batch()
+        # Its functions are methods of this one: the cycle would keep all messages in memory.
+        del self._decoder
         few = self._kept is not None and (self._latched or bool(self._pairs))
         return TopicDigest(
             topic=self._topic,

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
 
 from ros2_memory.catalogue.map_digest import Statics, statics_of
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.core.model import StampedTransform
+from ros2_memory.core.model import StampedTransform, TimeWindow
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
 from ros2_memory.history.transforms import sessions_of, static_at, static_changes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile, Transform
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 Topics: TypeAlias = "tuple[str, ...]"
 _Key: TypeAlias = "tuple[Topics, str | None]"
 """The topics of static transforms, and that of poses where it is not the configured one."""
+_MOST_DECODED: Final = 1_024
+"""Messages whose transforms stay in memory while guessing; mostly all have the same bytes."""
 
 
 @dataclass(slots=True)
@@ -88,16 +92,23 @@ _OF_TIMELINES: Final[WeakKeyDictionary[Timeline, dict[_Key, _OfTimeline]]] = Wea
 
 
 class BagStatics:
-    """The static transforms in force for each bag of a view, at the bag's end."""
+    """The static transforms in force for each bag of a view, at the bag's end.
+
+    Attributes:
+        timeline: has the bags.
+    """
 
     def __init__(self, view: View) -> None:
         self._view = view
+        self.timeline = view.snapshot.timeline
         limits = view.memory.limits
         self._topics = limits.tf_static_topics
         self._poses = None if view.pose_topic == limits.pose_topic else view.pose_topic
-        of_timeline = _OF_TIMELINES.setdefault(view.snapshot.timeline, {})
+        of_timeline = _OF_TIMELINES.setdefault(self.timeline, {})
         self._known = of_timeline.setdefault((self._topics, self._poses), _OfTimeline())
         self._complete: dict[str, _SessionStatics] = {}
+        self._first: dict[tuple[Session, Path], list[StampedTransform]] = {}
+        self._reader = _StaticReader(view)
 
     def of(self, bag: BagFile) -> Statics:
         """Returns the static transforms of a bag's session at its end."""
@@ -105,13 +116,70 @@ class BagStatics:
         known = self._complete.get(folder)
         if known is not None:
             return known.at(bag.end)
+        session = self._session_of(bag)
+        if session is None:
+            return statics_of((), self._poses)
+        known = self._statics(session)
+        if session == sessions_of(self._view).of(bag.recording):
+            self._complete[folder] = known
+        return known.at(bag.end)
+
+    def guessed(self, bag: BagFile) -> Statics:
+        """Returns what `of` would most likely return, without reading all bags of the session.
+
+        That follows from the first messages of the session and of the bag's recording, from what
+        was carried, and from the bag itself: nearly always they are all that there is.
+        """
+        session = self._session_of(bag)
+        if session is None:
+            return statics_of((), self._poses)
+        known = self._known.sessions.get(session)
+        if known is None:
+            static = [*self._first_of(session, bag.recording), *self._read(bag)]
+            static.sort(key=lambda each: each.log_time)
+            known = _SessionStatics(static, static_changes(static), self._poses)
+        return known.at(bag.end)
+
+    def _session_of(self, bag: BagFile) -> Session | None:
+        """Returns the session whose static transforms hold in a bag; None where none has any."""
         sessions = sessions_of(self._view)
         own = sessions.of(bag.recording)
         if sessions.has_all_kinds(own):
-            self._complete[folder] = known = self._statics(own)
-            return known.at(bag.end)
-        session = sessions.lending_to(bag.recording, bag.end)
-        return self._statics(session).at(bag.end) if session else statics_of((), self._poses)
+            return own
+        return sessions.lending_to(bag.recording, bag.end) or None
+
+    def _first_of(self, session: Session, recording: Path) -> Sequence[StampedTransform]:
+        """Returns the static transforms that a session begins with, one of its recordings too.
+
+        And those that were carried for it.
+        """
+        key = session, recording
+        if key not in self._first:
+            sessions = sessions_of(self._view)
+            recordings = sessions.recordings_of(session, self._topics)
+            recorded = {
+                path: span[0]
+                for path, span in recordings.items()
+                if not sessions.holds_carried(path)
+            }
+            begins = {min(recorded, key=lambda path: recorded[path])} if recorded else set()
+            begins |= {recording} & recorded.keys()
+            bags = [bag for path in begins for bag in self._bags_at(path, recorded[path])]
+            self._first[key] = [each for bag in bags for each in self._read(bag)]
+            self._first[key] += self._carried_for(session)
+        return self._first[key]
+
+    def _bags_at(self, recording: Path, at: Ns) -> set[BagFile]:
+        """Returns the bags of a recording with static transforms around a moment."""
+        window = TimeWindow(at, at + 1)
+        every = chain.from_iterable(self.timeline.extents(topic, window) for topic in self._topics)
+        return {each.bag for each in every if each.bag.recording == recording}
+
+    def _read(self, bag: BagFile) -> list[StampedTransform]:
+        """Returns the static transforms in one bag."""
+        topics = [topic for topic in self._topics if topic in bag.summary.schema.positions]
+        found = self._view.bags.read(bag, topics, TimeWindow.everything()) if topics else ()
+        return [each for message in found for each in self._reader.transforms(message)]
 
     def remembered(
         self, digests: SegmentDigests, compute: Callable[[], dict[str, int]]
@@ -125,29 +193,37 @@ class BagStatics:
     def _statics(self, session: Session) -> _SessionStatics:
         known = self._known.sessions.get(session)
         if known is None:
-            folders, sessions = self._folders(), sessions_of(self._view)
+            folders = self._folders()
             static = [
                 each
                 for name in session
                 for segment in folders.get(name, ())
                 for each in self._gathered_in(segment, name).own
             ]
-            for name in self._known.carried:
-                for segment in folders[name]:
-                    for found, transforms in self._gathered_in(segment, name).carried:
-                        if sessions.has(session, found):
-                            static += transforms
+            static += self._carried_for(session)
             static.sort(key=lambda each: each.log_time)
             known = _SessionStatics(static, static_changes(static), self._poses)
             self._known.sessions[session] = known
         return known
+
+    def _carried_for(self, session: Session) -> list[StampedTransform]:
+        """Returns the static transforms that were carried of deleted bags of a session."""
+        folders, sessions = self._folders(), sessions_of(self._view)
+        return [
+            each
+            for name in self._known.carried
+            for segment in folders[name]
+            for found, transforms in self._gathered_in(segment, name).carried
+            if sessions.has(session, found)
+            for each in transforms
+        ]
 
     def _folders(self) -> dict[str, list[Segment]]:
         """Returns the segments that hold static transforms of each folder."""
         if self._known.folders is None:
             sessions = sessions_of(self._view)
             found: dict[str, dict[Segment, None]] = {}
-            for segment in self._view.snapshot.timeline.segments:
+            for segment in self.timeline.segments:
                 held = [topic for topic in self._topics if topic in segment.spans]
                 bags = [bag for topic in held for bag in segment.bags_with(topic)]
                 # By text: a path for each bag takes longer than all else.
@@ -231,6 +307,17 @@ class _StaticReader:
                 self._latest[folder, each.child] = each
                 if before is None or _place(before) != _place(each):
                     yield each
+
+    def transforms(self, found: StoredMessage) -> list[StampedTransform]:
+        """Returns the transforms of a message; the same bytes are decoded once."""
+        channel = found.record.channel
+        key = (channel.type, channel.encoding, found.record.payload)
+        known = self._known.get(key)
+        if known is None:
+            if len(self._known) >= _MOST_DECODED:
+                self._known.clear()
+            known = self._known[key] = self.decoded(found)
+        return [_at(each, found.time) for each in known]
 
     def decoded(self, found: StoredMessage) -> tuple[StampedTransform, ...]:
         """Returns the transforms of a message; none where it cannot be decoded."""

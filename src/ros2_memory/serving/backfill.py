@@ -60,6 +60,8 @@ log = get_logger(__name__)
 
 BACKLOG: Final = 8
 """A child process digests more bags than these, so that answers stay fast."""
+MOST_READ: Final = 64
+"""Bags without an entry whose static transforms are read before others are digested."""
 PRUNE_INTERVAL_S: Final = 600.0
 """How often the entries of deleted files are removed."""
 
@@ -111,16 +113,35 @@ class Backfill:
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
         self._shared_from: Ns = MIN_NS
-        self._view: View | None = None
+        self._statics: BagStatics | None = None
         self._stale: tuple[Timeline, int, list[BagFile]] | None = None
+        self._guesses = False
 
-    def waiting(self) -> list[BagFile]:
-        """Returns the bags to be digested, the newest first."""
+    def waiting(self, *, guesses: bool = False) -> list[BagFile]:
+        """Returns the bags to be digested, the newest first.
+
+        Args:
+            guesses: where many bags have no entry, only these are returned, and `digest` guesses
+                their static transforms: all of a session's bags have these, and would be read
+                before the first is digested. Once few are left, those that were guessed wrong wait.
+        """
+        missing, self._guesses = self._waiting(guesses=guesses)
+        return missing
+
+    def _waiting(self, *, guesses: bool) -> tuple[list[BagFile], bool]:
+        """Returns the bags to be digested, and whether their static transforms are guessed."""
         timeline = self._memory.index.snapshot().timeline
-        missing = bags_without_entry(timeline.segments, self._digests)
-        missing += self._with_other_statics(timeline)
+        missing = self._not_refused(bags_without_entry(timeline.segments, self._digests))
+        guesses = guesses and len(missing) > MOST_READ
+        if not guesses:
+            missing += self._not_refused(self._with_other_statics(timeline))
         missing.sort(key=in_time, reverse=True)
-        return [bag for bag in missing if not self._is_refused(self._key(bag))]
+        return missing, guesses
+
+    def _not_refused(self, bags: list[BagFile]) -> list[BagFile]:
+        if not self._refused:
+            return bags
+        return [bag for bag in bags if not self._is_refused(self._key(bag))]
 
     def _with_other_statics(self, timeline: Timeline) -> list[BagFile]:
         """Returns the bags whose entry was made with static transforms that are not in force now.
@@ -129,7 +150,9 @@ class Backfill:
         """
         newest = self.catalogue.newest()
         if self._stale is None or self._stale[:2] != (timeline, newest):
-            maps = MapDigests(self._view_of(timeline))
+            # An older view would read the static transforms of bags that have an entry since.
+            maps = MapDigests(View(self._memory, Call()))
+            self._statics = maps.statics
             stale: list[BagFile] = []
             for segment in timeline.segments:
                 digests = self._digests.digests_for(segment, newest)
@@ -144,18 +167,16 @@ class Backfill:
             self._stale = timeline, newest, stale
         return self._stale[2]
 
-    def _view_of(self, timeline: Timeline) -> View:
-        """Returns a view of the memory; the same one while the timeline is the same."""
-        if self._view is None or self._view.snapshot.timeline is not timeline:
-            self._view = View(self._memory, Call())
-        return self._view
-
     def progress(self) -> Progress:
-        """Returns how much of the catalogue is filled."""
+        """Returns how much of the catalogue is filled.
+
+        While many bags have no entry, those whose static transforms were guessed wrong are not
+        counted as waiting.
+        """
         bags = self._memory.index.snapshot().bags
         closed = sum(bag.state is BagState.CLOSED for bag in bags)
         refused = sum(self._is_refused(key) for key in list(self._refused))
-        return Progress(closed, len(self.waiting()), refused)
+        return Progress(closed, len(self._waiting(guesses=True)[0]), refused)
 
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""
@@ -210,8 +231,10 @@ class Backfill:
         return [bag for bag in bags if self._key(bag) not in renewed] if renewed else [*bags]
 
     def _statics_of(self, bag: BagFile) -> Statics:
-        view = self._view_of(self._memory.index.snapshot().timeline)
-        return BagStatics(view).of(bag)
+        timeline = self._memory.index.snapshot().timeline
+        if self._statics is None or self._statics.timeline is not timeline:
+            self._statics = BagStatics(View(self._memory, Call()))
+        return self._statics.guessed(bag) if self._guesses else self._statics.of(bag)
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Returns the catalogue to its file, unless the bag directory itself is missing.
@@ -421,13 +444,14 @@ class Filler:
         backfill = self._backfill
         due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
         await _in_thread(partial(backfill.look_after, thorough=due))
-        waiting = await _in_thread(backfill.waiting)
+        find = partial(backfill.waiting, guesses=True)
+        waiting = await _in_thread(find)
         waiting = await _in_thread(partial(backfill.renew, waiting))
         # A catalogue that is in memory cannot be filled by another process.
         has_file = backfill.catalogue.path is not None
         if len(waiting) > BACKLOG and has_file and await _run_helper(self._helper):
             # Bags that the helper could not digest are tried here, and refused if they fail.
-            waiting = await _in_thread(backfill.waiting)
+            waiting = await _in_thread(find)
         done = await _digest(backfill, waiting[:BACKLOG])
         # Earlier, bags without a digest would be read for it.
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:

@@ -5,21 +5,27 @@ time from the process that answers.
 """
 
 import ctypes
+import gc
 import json
 import multiprocessing
 import os
 import signal
 import sys
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Annotated, Final, Protocol
+from typing import Annotated, Final
 
 import typer
 
 from ros2_memory.bootstrap import build_backfill, build_memory, shared_parts
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
+from ros2_memory.cli.maintenance.second_process import (
+    FreeCores,
+    SecondProcess,
+    Worker,
+    is_second,
+)
 from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
     AsJson,
@@ -42,27 +48,14 @@ NICENESS: Final = 15
 """So low a priority that the process that answers goes first."""
 
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
-_BATCH: Final = 64
+_BATCH: Final = 256
+"""Bags digested before the program looks which others closed meanwhile, among all that wait."""
+_COMPACTED: Final = 64
+"""After as many new entries the catalogue is compacted."""
 _CACHE_MB: Final = 8
-"""Bags digested before the program looks which others closed meanwhile."""
-_SHARED: Final = 512
-"""A second process takes half of more bags than these."""
-_FREE_CORES: Final = 1.0
-"""Cores less the load average, from which on there is room for two."""
-_LOOK_S: Final = 2.0
 _BAR_WIDTH: Final = 40
-
-
-class Worker(Protocol):
-    """Another process that digests its share of the bags."""
-
-    def is_alive(self) -> bool:
-        """Returns whether it goes on."""
-        ...
-
-    def join(self, timeout: float | None = None) -> None:
-        """Waits for its end, at most `timeout` seconds."""
-        ...
+_RARELY: Final = (50_000, 20, 100)
+"""Thresholds of `gc`: a digest makes no cycles, and the index of a week has many objects."""
 
 
 def index(
@@ -128,9 +121,8 @@ def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None =
             known = progress.closed - progress.waiting
             bar.update(task, completed=known, total=progress.closed)
 
-        missing = len(memory.index.snapshot().bags) - len(backfill.catalogue.paths())
-        with _second_worker(settings, missing) as worker:
-            return fill_catalogue(backfill, show, worker)
+        with _second_process(settings) as second:
+            return fill_catalogue(backfill, show, second)
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
@@ -154,75 +146,95 @@ def _low_priority_backfill(settings: Settings) -> Backfill:
 
 
 @contextmanager
-def _second_worker(settings: Settings, missing: int) -> Iterator[Worker | None]:
-    """Runs a second process that digests half of the bags, where many miss and a core is free.
+def _second_process(settings: Settings) -> Iterator[SecondProcess]:
+    """Has a second process digest some of the bags within the block, while a core is free."""
 
-    It ends with the block.
-    """
-    free = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
-    if missing <= _SHARED or free < _FREE_CORES:
-        yield None
-        return
-    # Not forked: SQLite forbids that a connection is used on both sides.
-    worker = multiprocessing.get_context("spawn").Process(
-        target=_digest_second_share, args=(settings, os.getpid()), daemon=True
-    )
-    worker.start()
+    def start(nth: int) -> Worker:
+        # Not forked: SQLite forbids that a connection is used on both sides.
+        worker = multiprocessing.get_context("spawn").Process(
+            target=_digest_second_share, args=(settings, os.getpid(), nth), daemon=True
+        )
+        worker.start()
+        return worker
+
+    second = SecondProcess(start, FreeCores())
     try:
-        yield worker
+        yield second
     finally:
-        worker.terminate()
-        worker.join()
+        second.stop()
 
 
-def _digest_second_share(settings: Settings, parent: int) -> None:
-    """Digests the second worker's bags, until none of them waits."""
+def _digest_second_share(settings: Settings, parent: int, nth: int) -> None:
+    """Digests the second process's bags, until none of them waits."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends both
     # What cannot be digested waits for the first process, which reports it.
     configure_logging("error", settings.logging.format)
-    if _end_with_parent(parent):
-        _digest(_low_priority_backfill(settings), is_own=lambda bag: is_second(bag.file))
-
-
-def is_second(file: str) -> bool:
-    """Whether a bag is the second worker's: every other one, in no order."""
-    return bool(zlib.crc32(file.encode()) & 1)
+    if not _end_with_parent(parent):
+        return
+    backfill = _low_priority_backfill(settings)
+    with _garbage_collected_rarely():
+        _digest(backfill, lambda waiting: [bag for bag in waiting if is_second(bag.file, nth)])
 
 
 def fill_catalogue(
     backfill: Backfill,
     show: Callable[[Progress], None] = lambda _: None,
-    worker: Worker | None = None,
+    second: SecondProcess | None = None,
 ) -> Progress:
     """Digests until no bag waits, the newest first, and returns the progress at the end.
 
-    A bag that changed a few seconds ago is left for a later run. While a second worker runs, its
-    bags are left to it; it may end at any time.
+    A bag that changed a few seconds ago is left for a later run. `second` digests some of the bags
+    while a core is free for it.
     """
-    total = 0
-    while worker is not None and worker.is_alive():
-        total += _digest(backfill, show, is_own=lambda bag: not is_second(bag.file))
-        show(backfill.progress())
-        worker.join(_LOOK_S)
-    total += _digest(backfill, show)
+    with _garbage_collected_rarely():
+        total = _digest(backfill, _every if second is None else second.share, show)
+        if second is not None:
+            second.stop()
+        # Many may be left that cannot be digested now: those that were guessed wrong come anyway.
+        total += _digest(backfill, _every, show, guesses=False)
     backfill.prune()
     backfill.precompute()
-    if total >= _BATCH:
+    if total >= _COMPACTED:
         backfill.catalogue.compact()
     return backfill.progress()
 
 
+@contextmanager
+def _garbage_collected_rarely() -> Iterator[None]:
+    """Has Python look for unused cycles rarely in the block, and not among what there is now."""
+    before = gc.get_threshold()
+    gc.freeze()
+    gc.set_threshold(*_RARELY)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
+        gc.unfreeze()
+
+
+def _every(waiting: Sequence[BagFile]) -> Sequence[BagFile]:
+    return waiting
+
+
 def _digest(
     backfill: Backfill,
+    share: Callable[[Sequence[BagFile]], Sequence[BagFile]],
     show: Callable[[Progress], None] = lambda _: None,
     *,
-    is_own: Callable[[BagFile], bool] = lambda _: True,
+    guesses: bool = True,
 ) -> int:
-    """Digests until none of the process's own bags waits; returns how many it digested."""
+    """Digests until nothing of the process's share waits; returns how many bags it digested.
+
+    Args:
+        backfill: digests the bags.
+        share: returns which of the waiting bags are the process's own.
+        show: takes the progress, before each bag.
+        guesses: as in `Backfill.waiting`.
+    """
     done, total = 1, 0
     while done:
         progress = backfill.progress()
-        waiting = [bag for bag in backfill.waiting() if is_own(bag)][:_BATCH]
+        waiting = share(backfill.waiting(guesses=guesses))[:_BATCH]
         left = backfill.renew(waiting)
         done = len(waiting) - len(left)
         for number, bag in enumerate(left, done):
