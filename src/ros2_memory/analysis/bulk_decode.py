@@ -80,8 +80,10 @@ class BulkDecoder(Generic[T, P]):
         """Returns what each message decodes into, or why it cannot be decoded."""
         found: dict[int, T | UndecodableError] = {}
         rest = deque(range(len(records)))
-        for known in self._known:
+        for nth, known in enumerate(self._known):
             rest = self._match(known, records, rest, found)
+            if not rest and not nth:
+                return [*found.values()]  # in order, as in most batches
         while rest:
             record = records[at := rest.popleft()]
             try:
@@ -117,7 +119,8 @@ class BulkDecoder(Generic[T, P]):
         matched, rows = template.matching(first, records, rest)
         if not matched:
             return rest
-        among = [records[at] for at in matched]
+        is_whole = len(matched) == len(records)
+        among = records if is_whole else [records[at] for at in matched]
         found.update(zip(matched, self._apply(template, decoded, among, rows), strict=True))
         return deque() if len(matched) == len(rest) else deque(at for at in rest if at not in found)
 

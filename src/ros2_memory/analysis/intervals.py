@@ -226,6 +226,16 @@ class IntervalBuilder:
                     self.left_out += 1
                 self._open[label] = _Open(time, self._nth, best)
 
+    def add_empty(self, times: Sequence[Ns]) -> None:
+        """Takes the next messages, at least one, none of which has a label."""
+        if self._first is None:
+            self._first = self._last = times[0]
+        nth, last = self._nth, self._last
+        for time in times:
+            nth += 2 if time - last > SILENCE_NS else 1
+            last = time
+        self._nth, self._last = nth, last
+
     def part(self) -> IntervalPart | None:
         """Returns what was visible so far; None without a message."""
         if self._first is None:

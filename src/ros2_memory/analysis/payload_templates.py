@@ -115,17 +115,20 @@ class PayloadTemplate:
 
         A row is the payload of one record.
         """
+        size, channel = self.layout.size, first.channel
         candidates = [
             at
             for at in among
-            if len(records[at].payload) == self.layout.size and records[at].channel is first.channel
+            if len((record := records[at]).payload) == size and record.channel is channel
         ]
         payloads = b"".join([records[at].payload for at in candidates])
-        rows = np.frombuffer(payloads, dtype=np.uint8).reshape(len(candidates), self.layout.size)
+        rows = np.frombuffer(payloads, dtype=np.uint8).reshape(len(candidates), size)
         # Picking the fixed bytes of each row would take several times as long.
         other = rows != np.frombuffer(first.payload, dtype=np.uint8)
         equal = ~(other & self.fixed).any(axis=1)
-        return [candidates[at] for at in np.flatnonzero(equal)], rows[equal]
+        if equal.all():
+            return candidates, rows
+        return [candidates[at] for at in np.flatnonzero(equal).tolist()], rows[equal]
 
     def poses(self, rows: Bytes) -> Iterable[Pose | None]:
         """Returns the pose of each row."""

@@ -232,6 +232,14 @@ class TopicEventsBuilder:
         if state.levels or state.reports:
             self._changes.add(time, state.levels, state.reports)
 
+    def add_empty(self, times: Sequence[Ns]) -> None:
+        """Takes the next messages, as `add` does with `EMPTY_STATE` one by one."""
+        if not times:
+            return
+        if self._builder is None:
+            self._builder = IntervalBuilder(MAX_SEEN)
+        self._builder.add_empty(times)
+
     def join(self, events: TopicEvents) -> None:
         """Takes all messages of a bag that come next, as if they were added one by one."""
         self._undecodable += events.undecodable

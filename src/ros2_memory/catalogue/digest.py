@@ -98,12 +98,13 @@ class Digester:
             )
             for topic, is_latched in latched.items()
         }
+        add = {topic: collector.add for topic, collector in collectors.items()}
         left = _ALWAYS_READ_BYTES + _MAX_EXPANSION * _size(path)
         for record in self._reader.records(path, tuple(latched), TimeWindow.everything()):
             left -= len(record.payload) + _MESSAGE_BYTES
             if left < 0:
                 raise BagError(str(path), "its messages unpack to more than they can be worth")
-            collectors[record.channel.topic].add(record)
+            add[record.channel.topic](record)
         reasons = self._reasons(path)
         topics = tuple(each.digest(reasons.get(topic, {})) for topic, each in collectors.items())
         return Digest(summary, topics, in_map.digest(statics))

@@ -46,6 +46,9 @@ class TextRunsBuilder:
         self._chars = 0
         self._bits: dict[str, int] = {}
         self._is_given_up = False
+        # The newest messages have the same texts, from this one on.
+        self._same: Collection[str] = ()
+        self._since = 0
 
     def give_up(self) -> None:
         """Stores nothing for this topic, since the texts of a message are unknown."""
@@ -55,23 +58,32 @@ class TextRunsBuilder:
         """Takes the next message."""
         if self._is_given_up:
             return
-        bit = 1 << self._size
         if self._last is not None and time - self._last > SILENCE_NS:
-            self._silent |= bit
+            self._silent |= 1 << self._size
         self._last = time
+        if texts is not self._same:
+            self._take()
+            self._same, self._since = texts, self._size
         self._size += 1
-        for text in texts:
-            known = self._bits.get(text)
-            if known is None:
-                self._chars += len(text)
-                known = 0
-            self._bits[text] = known | bit
-        self._is_given_up = (
+
+    def _take(self) -> None:
+        """Takes the texts of the newest messages, which have the same."""
+        bits = (1 << self._size) - (1 << self._since)
+        if bits:
+            for text in self._same:
+                known = self._bits.get(text)
+                if known is None:
+                    self._chars += len(text)
+                    known = 0
+                self._bits[text] = known | bits
+        self._since = self._size
+        self._is_given_up |= (
             len(self._bits) > MAX_TEXTS or self._chars > MAX_TEXT_CHARS or self._size > MAX_MESSAGES
         )
 
     def runs(self) -> TextRuns | None:
         """Returns the texts of all messages; None where they are too many, or none has any."""
+        self._take()
         if self._is_given_up or not self._bits:
             return None
         return TextRuns(self._size, self._silent, dict(sorted(self._bits.items())))

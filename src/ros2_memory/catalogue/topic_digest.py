@@ -13,7 +13,12 @@ from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
 from ros2_memory.analysis.motion.trajectory import PoseCollector
 from ros2_memory.analysis.state_changes import follow_numbers, levels_by_number
-from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEventsBuilder, state_of
+from ros2_memory.analysis.topic_events import (
+    EMPTY_STATE,
+    MAX_PER_BAG,
+    TopicEventsBuilder,
+    state_of,
+)
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.catalogue.text_runs import TextRunsBuilder
 from ros2_memory.core.errors import UndecodableError
@@ -214,10 +219,12 @@ class TopicCollector:
         batch, self._batch, self._batch_bytes = self._batch, [], 0
         if batch:
             self._ends = (batch[0] if self._ends is None else self._ends[0], batch[-1])
-        to, events = self._map, self._events
-        sights = None if to is None else to.sights
-        map_poses = to if self._map_poses else None
-        for record, sample in zip(batch, self._decoder.decode(batch), strict=True):
+        events = self._events
+        quiet: list[Ns] = []
+        map_poses = self._map if self._map_poses else None
+        samples = self._decoder.decode(batch)
+        self._add_sights(batch, samples)
+        for record, sample in zip(batch, samples, strict=True):
             if isinstance(sample, UndecodableError):
                 self._zone_map.give_up()
                 self._fields.give_up()
@@ -226,11 +233,14 @@ class TopicCollector:
                 events.add_undecodable()
                 continue
             time = record.log_time
-            events.add(time, sample.state)
+            if sample.state is EMPTY_STATE:  # as of most messages
+                quiet.append(time)
+            else:
+                events.add_empty(quiet)
+                quiet.clear()
+                events.add(time, sample.state)
             self._texts.add(time, sample.texts)
             pose = sample.pose
-            if sights is not None and self._wants_sights(record.channel.schema.name):
-                sights.add(record, sample.detections)
             if pose is None:
                 self._poses = None
                 continue
@@ -240,6 +250,21 @@ class TopicCollector:
                 self._poses.add(time, pose, sample.speed_mps)
                 if is_place(pose.position):
                     self._standstills.add(time, pose.position, pose.orientation)
+        events.add_empty(quiet)
+
+    def _add_sights(
+        self, batch: Sequence[Record], samples: Sequence[_Sample | UndecodableError]
+    ) -> None:
+        """Takes what detectors saw."""
+        to = None if self._map is None else self._map.sights
+        types = {record.channel.schema.name for record in batch}
+        if to is None or not any(map(self._wants_sights, types)):
+            return
+        for record, sample in zip(batch, samples, strict=True):
+            if isinstance(sample, UndecodableError):
+                continue
+            if self._wants_sights(record.channel.schema.name):
+                to.add(record, sample.detections)
 
     def _wants_sights(self, type_name: str) -> bool:
         if type_name not in self._sights:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import groupby
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -102,6 +104,22 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
         if part is not None:
             builder.join(part)
     assert _comparable(builder.events()) == _comparable(events_of(messages))
+
+
+@given(histories())
+def test_many_messages_without_an_event_are_taken_as_if_one_by_one(
+    history: tuple[Messages, list[int]],
+) -> None:
+    messages, _ = history
+    builder = TopicEventsBuilder()
+    for is_empty, group in groupby(messages, lambda each: each[1] is EMPTY_STATE):
+        if is_empty:
+            builder.add_empty([time for time, _ in group])
+        else:
+            for time, state in group:
+                builder.add(time, state)
+    builder.add_empty([])
+    assert builder.events() == events_of(messages)
 
 
 def test_a_boolean_that_toggles_is_reported_with_its_new_value() -> None:

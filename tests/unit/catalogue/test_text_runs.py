@@ -27,12 +27,15 @@ MESSAGES = st.lists(
 def test_what_is_stored_says_of_each_message_which_texts_it_has(
     messages: list[tuple[int, set[str]]],
 ) -> None:
-    builder = TextRunsBuilder()
+    builder, one_by_one = TextRunsBuilder(), TextRunsBuilder()
     time = 0
+    same: dict[frozenset[str], set[str]] = {}
     for pause, texts in messages:
         time += pause
-        builder.add(time, texts)
+        builder.add(time, same.setdefault(frozenset(texts), texts))
+        one_by_one.add(time, {*texts})
     found = builder.runs()
+    assert found == one_by_one.runs()
     every = set().union(*(texts for _, texts in messages))
     if found is None:
         assert not every
