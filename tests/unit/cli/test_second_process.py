@@ -91,6 +91,10 @@ def test_it_is_stopped_where_other_programs_need_the_core_and_started_again() ->
     machine.free = 1.1
     assert machine.second.share(MANY) == MANY
     assert not machine.started[0].alive
+    # Not at once: each start reads the summaries of all bags.
+    for free in (*[2.0] * 11, 1.6, *[2.0] * 5, None, *[2.0] * 6):
+        machine.free = free
+        assert machine.second.share(MANY) == MANY
     machine.free = 2.0
     assert machine.second.share(MANY) == [bag for bag in MANY if not is_second(bag.file, 2)]
     machine.second.stop()

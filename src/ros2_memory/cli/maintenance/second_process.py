@@ -21,6 +21,9 @@ _STARTED: Final = 1.75
 """Cores that other programs must leave for it to be started: the first process needs one."""
 _KEPT: Final = 1.5
 """Cores that other programs must leave for it to go on."""
+_AGAIN: Final = 12
+"""Looks in a row at which a core must be free after the process was stopped for other programs: it
+reads the summaries of all bags that wait when it starts."""
 _MEASURED_NS: Final[Ns] = 5 * NS_PER_S
 """How long the processors are watched, at least, before it is started or stopped."""
 _TICKS_OF_PROGRAMS: Final = (0, 1, 2, 5, 6, 7)
@@ -64,6 +67,8 @@ class SecondProcess:
         self._free_cores = free_cores
         self._worker: Worker | None = None
         self._round = 0
+        self._looks_free = 0
+        self._looks_needed = 1
 
     def share(self, waiting: Sequence[BagFile]) -> Sequence[BagFile]:
         """Returns the bags that the first process digests now, of all that wait.
@@ -74,9 +79,14 @@ class SecondProcess:
         worker = self._worker
         second = None if worker is None else worker.pid
         free = self._free_cores([os.getpid()] if second is None else [os.getpid(), second])
-        if worker is not None and (not worker.is_alive() or (free is not None and free < _KEPT)):
+        if free is not None:
+            self._looks_free = self._looks_free + 1 if free >= _STARTED else 0
+        if worker is not None and not worker.is_alive():
             self.stop()
-        elif worker is None and len(waiting) > _SHARED and free is not None and free >= _STARTED:
+        elif worker is not None and free is not None and free < _KEPT:
+            self.stop()
+            self._looks_needed = _AGAIN
+        elif worker is None and len(waiting) > _SHARED and self._looks_free >= self._looks_needed:
             self._round += 1
             self._worker = self._start(self._round)
         if self._worker is None:
