@@ -5,6 +5,8 @@ import math
 import sys
 import time
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
@@ -22,7 +24,7 @@ from ros2_memory.cli.options import (
     print_line,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import InvalidArgumentsError, LakeError
+from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, LakeError
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.sd_notify import READY, WATCHDOG, notify
@@ -30,7 +32,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import WallClock, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.lake.lease import WarehouseLease
     from ros2_memory.lake.shipper import RobotBags, Shipper
@@ -77,7 +79,8 @@ def ship(
     pace = _Pace(settings.lake.commit_interval_s)
     with writing_alone(location.state_dir), leased(location, WallClock()) as lease:
         if forget is None and not once:
-            _ship_on(settings, location, robots, pace, lease)
+            load = partial(load_for, None, overrides)
+            _ship_on(settings, location, robots, pace, lease, load=load)
         lease.renew()
         if forget is not None and window is not None:
             _forget(location, forget, window, as_json=as_json)
@@ -227,8 +230,13 @@ def _ship_on(
     robots: "Sequence[RobotBags]",
     pace: _Pace,
     lease: "WarehouseLease",
+    *,
+    load: "Callable[[], Settings]",
 ) -> NoReturn:
-    """Ships until the process is stopped; a lake that fails is tried again."""
+    """Ships until the process is stopped; a lake that fails is tried again.
+
+    `load` returns the settings as of now: a pattern may match the folders of more robots.
+    """
     notify(READY)
     log.info("shipping", robots=len(robots), warehouse=location.warehouse)
     known: list[str] = []
@@ -241,14 +249,36 @@ def _ship_on(
                 while True:
                     lease.renew()
                     problems = shipper.run().problems
-                    if time.monotonic() - kept_up_s >= _UPKEEP_S:
+                    is_due = time.monotonic() - kept_up_s >= _UPKEEP_S
+                    if is_due:
                         shipper.keep_up(grace)
                         kept_up_s = time.monotonic()
                     for problem in problems:
                         if problem not in known:
                             log.warning("not_shipped", reason=problem)
                     known = problems
+                    if is_due and (new := _new_robots(load, robots)):
+                        robots = [*robots, *new]
+                        break
                     _wait(settings.reader.index_refresh_s)
         except LakeError as error:
             log.warning("lake_failed", reason=str(error))
             _wait(_RETRY_S)
+
+
+def _new_robots(
+    load: "Callable[[], Settings]", robots: "Sequence[RobotBags]"
+) -> "Sequence[RobotBags]":
+    """Returns the robots of the settings that were not there before."""
+    try:
+        settings = load()
+        known = {each.name for each in robots}
+        new = {name: bags for name, bags in settings.fleet.robots.items() if name not in known}
+        if not new:
+            return []
+        found = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)))
+    except ConfigError as error:
+        log.warning("not_shipped", reason=f"robots that are new are not looked for: {error}")
+        return []
+    log.info("shipping", robots=len(robots) + len(found), warehouse=settings.lake.warehouse)
+    return found
