@@ -214,6 +214,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     hours = given.robots
     per_bag = (much.processor_s - each.processor_s) / (much.bags - each.bags)
     commits = each.snapshots - passes[3].snapshots
+    commits_files = (turns[0].data_files - before.data_files) / len(others)
     added = [new.snapshots - old.snapshots for old, new in pairwise(turns)]
     plain = [one.processor_s for one, more in zip(turns[1:], added, strict=True) if more <= commits]
     closing = [
@@ -226,6 +227,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "one bag more: processor, s": one.processor_s - nothing.processor_s,
         "each bag of a batch: processor, s": per_bag,
         "each robot-hour in batches: processor, s": per_bag * hour,
+        "each bag of a batch with one of each robot: processor, s": (
+            mean(plain) - nothing.processor_s
+        )
+        / len(others),
+        "files of such a batch, for each robot": commits_files,
         "versions that a batch of all tables adds": commits,
         "versions that closing days adds": max(added) - commits,
         "closing a day of a robot: processor, s": (mean(closing) - mean(plain)) / len(others),
@@ -241,7 +247,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"the same, {many[0]} manifests": many[1],
         "each robot-hour: data, kB": (after.data_bytes - last.data_bytes) / hours / 1e3,
         "each robot-hour: recorded, kB": sum(b.stat().st_size for b in bags[:hour]) / 1e3,
-        "a robot's day once it is compacted: files": after.data_files / given.robots,
         "what is not data, old versions deleted: MB": after.other_bytes / 1e6,
     }
     print()

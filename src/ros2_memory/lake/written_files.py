@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
@@ -58,20 +59,17 @@ def recorded_files(state_dir: Path) -> dict[str, Ns]:
     Raises:
         OSError: the record cannot be read.
     """
-    try:
-        lines = (state_dir / WRITTEN_FILE).read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        return {}
     found: dict[str, Ns] = {}
-    for line in lines:
-        try:
-            fields: object = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(fields, dict):
-            file, at = fields.get("file"), fields.get("at")
-            if isinstance(file, str) and isinstance(at, int):
-                found[file] = at
+    with suppress(FileNotFoundError), (state_dir / WRITTEN_FILE).open(encoding="utf-8") as lines:
+        for line in lines:
+            try:
+                fields: object = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(fields, dict):
+                file, at = fields.get("file"), fields.get("at")
+                if isinstance(file, str) and isinstance(at, int):
+                    found[file] = at
     return found
 
 
