@@ -66,10 +66,14 @@ def _to_compact(table: IcebergTable, closed: date) -> list[tuple[date, list[str]
     """Returns what to put together of the days before `closed`: a day, and some of its robots."""
     files: Counter[tuple[date, str]] = Counter()
     size: Counter[tuple[date, str]] = Counter()
-    for task in table.scan().plan_files():
-        part = _day(task.file.partition[1]), task.file.partition[0]
-        files[part] += 1
-        size[part] += task.file.file_size_in_bytes
+    snapshot = table.current_snapshot()
+    # A plan of the whole table would have all its files in memory, 6 kB each.
+    for manifest in () if snapshot is None else snapshot.manifests(table.io):
+        for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=True):
+            file = entry.data_file
+            part = _day(file.partition[1]), file.partition[0]
+            files[part] += 1
+            size[part] += file.file_size_in_bytes
     found: list[tuple[date, list[str]]] = []
     room = 0
     for part in sorted(files):
