@@ -102,14 +102,18 @@ def sees(label: str) -> Callable[[float], bool]:
     return lambda t: label in _labels(t)
 
 
+_pose_in_map: Final = cache(robot.pose_in_map)
+
+
 def _near(place: Planar | tuple[float, float], radius: float) -> Callable[[float], bool]:
     def holds(t: float) -> bool:
-        here = robot.pose_in_map(t)
+        here = _pose_in_map(t)
         return math.hypot(here.x - place[0], here.y - place[1]) <= radius
 
     return holds
 
 
+@cache
 def _stands(t: float) -> bool:
     return abs(robot.twist(t)[0]) < 0.005
 

@@ -12,6 +12,7 @@ where that is in `map` (the frame of `flat`). Frames and axes follow REP-103 and
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -202,7 +203,7 @@ def _ranges(t: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
 def _leg(t: float) -> tuple[int, float]:
     """Returns the current leg and the share of its duration that has passed, in [0, 1]."""
     phase = t % LAP_S
-    index = max(i for i, start in enumerate(_STARTS[:-1]) if start <= phase)
+    index = bisect_right(_STARTS, phase, hi=len(LAP)) - 1
     return index, (phase - _STARTS[index]) / LAP[index].duration
 
 
