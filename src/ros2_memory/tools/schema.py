@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
@@ -159,7 +159,8 @@ class Signature:
             yield f"{name} was {abbreviate(given[name])}{why}; expected {expected}"
 
 
-def _properties(arguments: type[Arguments]) -> dict[str, JsonObject]:
+@cache
+def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
     """Returns the JSON schema of each argument; an optional one has a default and no null."""
     schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
     return {name: _flat(each) for name, each in schema.items()}
