@@ -18,7 +18,12 @@ from xdist.remote import Producer
 
 from tests.support.composed import composed_once
 from tests.support.examples import examples
-from tests.support.measured import is_measured, nothing_measured, only_ours_measured
+from tests.support.measured import (
+    foreign_untraced,
+    is_measured,
+    nothing_measured,
+    only_ours_measured,
+)
 from tests.support.real_recorder import real_recorder  # noqa: F401 (a fixture)
 from tests.support.workers import Groups, give_way, place, workers_for
 
@@ -143,6 +148,13 @@ def types_compiled_once() -> Iterator[None]:
 def _configuration_composed_once() -> Iterator[None]:
     """Hydra takes long to compose what most tests have in common, and its lines are not ours."""
     with patch("ros2_memory.config.compose", composed_once):
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _foreign_code_untraced() -> Iterator[None]:
+    """What is slow of other projects, and only slower while it is traced."""
+    with foreign_untraced():
         yield
 
 

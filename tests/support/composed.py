@@ -25,18 +25,17 @@ SHIPPED: Final = Path(__file__).resolve().parents[2] / "config"
 _BAG_DIR: Final = re.compile(r"\+\+recording\.bag_dir=(?:'(/[\w/.-]+)'|(/[\w/.-]+))")
 _COMPOSED: Final[dict[tuple[str, ...], DictConfig]] = {}
 
-_compose: Final = untraced(compose)
 
-
+@untraced
 def composed_once(config_name: str, overrides: Sequence[str]) -> DictConfig:
     """As Hydra's `compose`, whose place it takes in `ros2_memory.config`."""
     found = [_BAG_DIR.fullmatch(each) for each in overrides]
     rest = tuple(each for each, is_it in zip(overrides, found, strict=True) if is_it is None)
     whole = any(re.match(r"\W*recording\W*=", each) for each in rest)
     if whole or _folder() != SHIPPED:
-        return _compose(config_name, list(overrides))
+        return compose(config_name, list(overrides))
     if rest not in _COMPOSED:
-        _COMPOSED[rest] = _compose(config_name, list(rest))
+        _COMPOSED[rest] = compose(config_name, list(rest))
     composed = deepcopy(_COMPOSED[rest])
     for bag_dir in found:
         if bag_dir is not None:

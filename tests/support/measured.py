@@ -8,8 +8,9 @@ tests of `unit` and `project` that were measured once take 88 s of processor tim
 from __future__ import annotations
 
 import sys
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib.machinery import SourceFileLoader
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, ParamSpec, TypeVar
 from unittest.mock import patch
 
@@ -67,6 +68,20 @@ UNMEASURED: Final = (
 """Files, or tests of a file by how their names begin, that are not measured.
 
 They ask much of everything at once, of hours of poses, or of programs over and over.
+"""
+FOREIGN: Final = (
+    "omegaconf:OmegaConf.load",
+    "pyiceberg.catalog.sql:SqlCatalog.create_table",
+    "pyiceberg.catalog.sql:SqlCatalog.load_table",
+    "pyiceberg.table:Table.append",
+    "pyiceberg.table:Table.delete",
+    "pyiceberg.table:Table.overwrite",
+    "pyiceberg.table:Table.refresh",
+    "yaml:safe_load",
+)
+"""Functions of other projects that run many lines of their own: they are run untraced.
+
+While they were traced, `unit/lake` and `unit/cli` spent most of what is measured of them there.
 """
 DRAWN: Final = "hypothesis"
 """The mark of tests that draw their examples: the same lines many times, so not measured either."""
@@ -128,6 +143,18 @@ def only_ours_measured() -> Iterator[None]:
             yield
     finally:
         sys.settrace(tracing)
+
+
+@contextmanager
+def foreign_untraced() -> Iterator[None]:
+    """Within it `FOREIGN` is run untraced, as far as it is imported by now."""
+    with ExitStack() as patches:
+        for each in FOREIGN:
+            module, _, path = each.partition(":")
+            if module in sys.modules:
+                plain = attrgetter(path)(sys.modules[module])
+                patches.enter_context(patch(f"{module}.{path}", untraced(plain)))
+        yield
 
 
 def untraced(function: Callable[_P, _R]) -> Callable[_P, _R]:
