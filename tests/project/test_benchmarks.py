@@ -25,6 +25,12 @@ if TYPE_CHECKING:
     from benchmarks.timing import Ask
 
 
+@pytest.fixture(autouse=True)
+def no_collecting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For exact times the garbage of all tests would be collected before each side."""
+    monkeypatch.setattr("benchmarks.timing.gc.collect", lambda: 0)
+
+
 @pytest.fixture(scope="module")
 def history(tmp_path_factory: pytest.TempPathFactory) -> History:
     return made(tmp_path_factory.mktemp("benchmark"), 2)
