@@ -35,8 +35,8 @@ The first two mostly wait for real time, and take longest. "heavy" burns process
 test at a time leaves some to those that wait.
 """
 
-WORKERS: Final = 3
-"""On two cores: most of a whole run is waiting, and two of them do little else."""
+WORKERS: Final = 4
+"""On two cores: two mostly wait for real time at first, and the others leave no core idle."""
 
 PUNCTUAL: Final = ("live", "recorder")
 """Groups whose programs are to run when their time has come, whatever else there is to do."""
