@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
+from operator import attrgetter
 from pathlib import PurePath
 
 import pytest
 from coverage import Coverage
 
-from tests.support.measured import UNMEASURED, is_measured, nothing_measured, untraced
+from tests.support.measured import (
+    FOREIGN,
+    UNMEASURED,
+    foreign_untraced,
+    is_measured,
+    nothing_measured,
+    untraced,
+)
 from tests.support.workers import TESTS
 
 
@@ -57,3 +66,12 @@ def test_what_is_run_untraced_leaves_the_tracing_as_it_was() -> None:
     before = sys.gettrace()
     assert untraced(sys.gettrace)() is None
     assert sys.gettrace() is before
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_what_is_run_untraced_of_other_projects_is_there(name: str) -> None:
+    module, _, path = name.partition(":")
+    before = attrgetter(path)(import_module(module))
+    with foreign_untraced():
+        assert attrgetter(path)(import_module(module)) is not before
+    assert attrgetter(path)(import_module(module)) is before
