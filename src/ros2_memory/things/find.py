@@ -6,7 +6,8 @@ import difflib
 import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -26,11 +27,12 @@ from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.where import Where
     from ros2_memory.things.instances import Instance, Mover, PlacedStay
@@ -84,6 +86,7 @@ def find_things(
     asked = {known.labels.key(each): each for each in labels}
     finder = _Finder(known, window, region, limits.places)
     found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
+    things = tuple(each.described() for each in found[:limit])
     totals: dict[str, int] = {}
     for each in found:
         totals[each.label] = totals.get(each.label, 0) + (each.at_once or 1)
@@ -100,8 +103,8 @@ def find_things(
         of_label = _label_notes(known, label, key, window, inside, found=key in keys_found)
         notes += [note if len(asked) == 1 else f"{abbreviate(label)}: {note}" for note in of_label]
     return Things(
-        frame_id=_frame_of(known, found),
-        things=tuple(found[:limit]),
+        frame_id=_frame_of(known, things),
+        things=things,
         total=sum(totals.values()),
         labels=tuple(sorted(totals.items())),
         now=now,
@@ -110,9 +113,9 @@ def find_things(
     )
 
 
-def _frame_of(known: KnownThings, found: Sequence[Thing]) -> str:
-    if found:
-        return found[0].frame_id
+def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
+    if shown:
+        return shown[0].frame_id
     # Without a map, the frame of the newest odometry; nothing where no detector published.
     return known.frames[0] if known.has_map else "".join(known.frames[1:][-1:])
 
@@ -137,6 +140,16 @@ def _unseen(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]
     yield from describe_silences(view, sights.topics, window)
 
 
+class _Found(NamedTuple):
+    """A thing of a question, which is described where it is shown: there may be thousands."""
+
+    label: str
+    last: Ns
+    place: tuple[float, float, float]
+    at_once: int | None
+    described: Callable[[], Thing]
+
+
 @dataclass(frozen=True, slots=True)
 class _Finder:
     """Selects the things of a question, and describes them."""
@@ -146,7 +159,7 @@ class _Finder:
     where: Where | None
     places: tuple[Place, ...]
 
-    def find(self, keys: Collection[str]) -> Iterator[Thing]:
+    def find(self, keys: Collection[str]) -> Iterator[_Found]:
         """Yields the things of these keys, or all where there are none."""
         result = self.known.estimate
         for instance in result.instances:
@@ -160,15 +173,29 @@ class _Finder:
                 if thing is not None:
                     yield thing
 
-    def _instance(self, instance: Instance) -> Thing | None:
+    def _instance(self, instance: Instance) -> _Found | None:
         seen = ((stay, self._seen(stay.spots)) for stay in instance.stays)
         parts = [(stay, rows) for stay, rows in seen if len(rows)]
         if not parts:
             return None
-        last, _ = parts[-1]
-        frame = self.known.frames[instance.epoch]
-        if not self._is_there(frame, last.x, last.y):
+        last, newest = parts[-1]
+        if not self._is_there(self.known.frames[instance.epoch], last.x, last.y):
             return None
+        spots = self.known.estimate.sights.spots
+        at_once = self._side_by_side(newest)
+        return _Found(
+            self.known.estimate.names[instance.key],
+            max(int(spots[rows, Spot.LAST].max()) for _, rows in parts),
+            _place(last.x, last.y, last.z),
+            at_once,
+            partial(self._described, instance, parts, at_once),
+        )
+
+    def _described(
+        self, instance: Instance, parts: Sequence[tuple[PlacedStay, Ints]], at_once: int | None
+    ) -> Thing:
+        last, newest = parts[-1]
+        frame = self.known.frames[instance.epoch]
         every = np.concatenate([rows for _, rows in parts])
         stays = [self._stay(frame, group) for group in _by_place(parts)]
         best, median = self._scores(every)
@@ -186,10 +213,10 @@ class _Finder:
             count=int(self.known.estimate.counts[every].sum()),
             best=best,
             median=median,
-            robot=self._robot(parts[-1][1]),
-            still_there=self._still_there(instance, *parts[-1]),
+            robot=self._robot(newest),
+            still_there=self._still_there(instance, last, newest),
             moved=tuple(stays) if len(stays) > 1 else (),
-            at_once=self._side_by_side(parts[-1][1]),
+            at_once=at_once,
         )
 
     def _side_by_side(self, rows: Ints) -> int | None:
@@ -215,7 +242,7 @@ class _Finder:
         number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
         return number if number > 1 else None
 
-    def _mover(self, mover: Mover) -> Thing | None:
+    def _mover(self, mover: Mover) -> _Found | None:
         """Returns a mover: where it was last seen, inside the region if one is given."""
         rows = self._seen(mover.spots)
         result, frame = self.known.estimate, self.known.frames[mover.epoch]
@@ -228,7 +255,7 @@ class _Finder:
         newest = int(spots[:, Spot.LAST].argmax())
         x, y, z, dev = spots[newest, [Spot.X, Spot.Y, Spot.Z, Spot.DEV]].tolist()
         best, median = self._scores(rows)
-        return Thing(
+        thing = Thing(
             label=result.names[mover.key],
             also_seen_as=(),
             place=_place(x, y, z),
@@ -245,6 +272,7 @@ class _Finder:
             at_once=most_at_once(spots),
             moves=True,
         )
+        return _Found(thing.label, thing.last, thing.place, thing.at_once, lambda: thing)
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
         where = self.where

@@ -8,6 +8,8 @@ are many and short is of something that moves by itself: it has a track, and no 
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -26,7 +28,7 @@ from ros2_memory.things.presence import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Container, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -192,11 +194,13 @@ def estimate(
     labels: Labels,
     epochs: Sequence[int] | None = None,
     min_score: float = 0.0,
+    go_on: Callable[[], None] = lambda: None,
 ) -> Estimate:
     """Returns the things in the sights of bags that are in order of time.
 
     `epochs` has the coordinate system of each bag: bags of different ones are separate.
-    Detections whose score lies below `min_score`, to 0.05, do not count.
+    Detections whose score lies below `min_score`, to 0.05, do not count. `go_on` is called again
+    and again; what it raises ends the estimate.
     """
     spots = sights.spots
     epoch = np.zeros(sights.bags, np.int64) if epochs is None else np.array(epochs, np.int64)
@@ -212,13 +216,13 @@ def estimate(
         key_name = shown[key]
         group = _Group(key_name, nth, np.flatnonzero(group_of == number))
         if not _is_named_mover(key_name):
-            _find_stays(group, seen)
+            _find_stays(group, seen, go_on)
         groups.append(group)
-    _fold(groups, seen, keys)
+    _fold(groups, seen, keys, go_on)
     instances: list[Instance] = []
     movers: list[Mover] = []
     for group in groups:
-        linked = _link(group, seen)
+        linked = _link(group, seen, go_on)
         if _moves_by_itself(group, linked):
             if not _is_seen(group, seen):
                 continue
@@ -301,12 +305,13 @@ def _fields_of_view(sights: Sights, cells: Cells, hits: Ints) -> dict[int, Field
     return found
 
 
-def _find_stays(group: _Group, seen: _Seen) -> None:
+def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     """Finds the places of a label, and when it was there."""
     every, counts = seen.sights.spots, seen.counts
     spots = every[group.rows]
     place, where = places_of(spots[:, Spot.X], spots[:, Spot.Y], counts[group.rows])
     for nth, (x, y) in enumerate(where.tolist()):
+        go_on()
         mine = group.rows[place == nth]
         if not len(mine) or counts[mine].sum() < _FEWEST:
             continue
@@ -358,32 +363,20 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     )
 
 
-def _fold(groups: list[_Group], seen: _Seen, keys: Sequence[str]) -> None:
+def _fold(
+    groups: list[_Group], seen: _Seen, keys: Sequence[str], go_on: Callable[[], None]
+) -> None:
     """Removes stays that are other things under a wrong name, or the noise around one."""
-    beside = _BesideCounts(seen.sights, keys)
     every = [(group, stay) for group in groups for stay in group.stays]
-    x = np.array([stay.x for _, stay in every])
-    y = np.array([stay.y for _, stay in every])
-    first = np.array([stay.first for _, stay in every])
-    last = np.array([stay.last for _, stay in every])
+    hosts = _Hosts(every, seen, keys)
     gone: set[int] = set()
     for nth in sorted(range(len(every)), key=lambda each: every[each][1].count):
+        go_on()
         group, stay = every[nth]
-        away = np.hypot(x - stay.x, y - stay.y)
-        near = (away <= _HALO_MM) & (first <= stay.last) & (last >= stay.first)
         best, most = None, 0
-        for other in np.flatnonzero(near).tolist():
+        for other, hosted in hosts.of(nth, gone):
             host_group, host = every[other]
-            if other == nth or other in gone or host.weak or host_group.epoch != group.epoch:
-                continue
-            same = host_group is group
-            if not same and (
-                away[other] > _SAME_PLACE_MM
-                or beside(stay, host_group.key) >= _BESIDE_SHARE * stay.count
-            ):
-                continue
-            hosted = _seen_during(seen, host, stay)
-            share = _HALO_SHARE if same else _SMALL_SHARE
+            share = _HALO_SHARE if host_group is group else _SMALL_SHARE
             few = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
             if (few or stay.count <= hosted * share) and hosted > most:
                 best, most = other, hosted
@@ -398,8 +391,64 @@ def _fold(groups: list[_Group], seen: _Seen, keys: Sequence[str]) -> None:
         group.stays = [each for each in group.stays if id(each) in kept and not each.weak]
 
 
+class _Hosts:
+    """Finds the stays that one may be a wrong name of, or the noise around."""
+
+    def __init__(
+        self, every: Sequence[tuple[_Group, PlacedStay]], seen: _Seen, keys: Sequence[str]
+    ) -> None:
+        self._every = every
+        self._near = _NearStays([stay for _, stay in every])
+        self._often = [_SeenDuring(seen, stay) for _, stay in every]
+        self._beside = _BesideCounts(seen.sights, keys)
+
+    def of(self, nth: int, gone: Container[int]) -> Iterator[tuple[int, int]]:
+        """Yields their numbers, in order, and how often each was seen in the bags of the stay."""
+        group, stay = self._every[nth]
+        beside: dict[str, int] | None = None
+        for other, away in self._near.of(stay):
+            host_group, host = self._every[other]
+            if other == nth or other in gone or host.weak or host_group.epoch != group.epoch:
+                continue
+            if host_group is not group:
+                if away > _SAME_PLACE_MM:
+                    continue
+                beside = self._beside.of(stay) if beside is None else beside
+                if beside.get(host_group.key, 0) >= _BESIDE_SHARE * stay.count:
+                    continue
+            yield other, self._often[other].during(stay.stay)
+
+
+class _NearStays:
+    """Finds stays near others, in squares as wide as what is near."""
+
+    def __init__(self, stays: Sequence[PlacedStay]) -> None:
+        self._x = np.array([stay.x for stay in stays])
+        self._y = np.array([stay.y for stay in stays])
+        self._first = np.array([stay.first for stay in stays])
+        self._last = np.array([stay.last for stay in stays])
+        squares: dict[tuple[int, int], list[int]] = {}
+        for nth, stay in enumerate(stays):
+            squares.setdefault(self._square(stay), []).append(nth)
+        self._squares = {square: np.array(inside) for square, inside in squares.items()}
+
+    def _square(self, stay: PlacedStay) -> tuple[int, int]:
+        return math.floor(stay.x / _HALO_MM), math.floor(stay.y / _HALO_MM)
+
+    def of(self, stay: PlacedStay) -> Iterator[tuple[int, float]]:
+        """Yields which stays are near one while it lasts, in order, and how far (mm)."""
+        column, row = self._square(stay)
+        around = [(column + dx, row + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+        parts = [self._squares[each] for each in around if each in self._squares]
+        some = np.sort(np.concatenate(parts))
+        some = some[(self._first[some] <= stay.last) & (self._last[some] >= stay.first)]
+        away = np.hypot(self._x[some] - stay.x, self._y[some] - stay.y)
+        near = away <= _HALO_MM
+        yield from zip(some[near].tolist(), away[near].tolist(), strict=True)
+
+
 class _BesideCounts:
-    """How often a stay's detections had another label beside them in the same message."""
+    """How often a stay's detections had other labels beside them in the same message."""
 
     def __init__(self, sights: Sights, keys: Sequence[str]) -> None:
         table = sights.beside
@@ -407,23 +456,34 @@ class _BesideCounts:
         self._starts = np.searchsorted(self._rows[:, Beside.SPOT], np.arange(len(sights.spots) + 1))
         self._keys = keys
 
-    def __call__(self, stay: PlacedStay, key: str) -> int:
-        return sum(
-            n
-            for spot in stay.spots.tolist()
-            for _, label, n in self._rows[self._starts[spot] : self._starts[spot + 1]].tolist()
-            if self._keys[label] == key
-        )
+    def of(self, stay: PlacedStay) -> dict[str, int]:
+        """Returns how often, by the key of the label."""
+        starts = self._starts[stay.spots]
+        rows = self._rows[in_ranges(starts, self._starts[stay.spots + 1] - starts)]
+        counts: dict[str, int] = {}
+        for _, label, n in rows.tolist():
+            key = self._keys[label]
+            counts[key] = counts.get(key, 0) + n
+        return counts
 
 
-def _seen_during(seen: _Seen, host: PlacedStay, stay: PlacedStay) -> int:
-    """Returns how often one was seen in the bags of the other."""
-    bag = seen.sights.spots[host.spots, Spot.BAG]
-    inside = (bag >= stay.stay.first_bag) & (bag <= stay.stay.last_bag)
-    return int(seen.counts[host.spots[inside]].sum())
+class _SeenDuring:
+    """How often a stay was seen in some bags."""
+
+    def __init__(self, seen: _Seen, stay: PlacedStay) -> None:
+        bags = seen.sights.spots[stay.spots, Spot.BAG]
+        order = np.argsort(bags, kind="stable")
+        self._bags: list[int] = bags[order].tolist()
+        self._counts: list[int] = [0, *np.cumsum(seen.counts[stay.spots][order]).tolist()]
+
+    def during(self, stay: Stay) -> int:
+        """Returns how often in the bags of another one."""
+        begin = bisect_left(self._bags, stay.first_bag)
+        end = bisect_right(self._bags, stay.last_bag)
+        return self._counts[end] - self._counts[begin]
 
 
-def _link(group: _Group, seen: _Seen) -> list[Instance]:
+def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instance]:
     """Links stays into as few things as explain them.
 
     A stay goes on where one had ended, that is, where its place was seen without it. Of a label
@@ -432,7 +492,7 @@ def _link(group: _Group, seen: _Seen) -> list[Instance]:
     instances = _chained(group, group.stays, proven=True)
     if any(_is_moved(each) for each in instances):
         unproven = _chained(group, group.stays, proven=False)
-        split = _chained(group, _split(group.stays, seen), proven=False)
+        split = _chained(group, _split(group.stays, seen, go_on), proven=False)
         instances = min(instances, unproven, split, key=len)
     for each in instances:
         each.stays = _without_overlap(each.stays, seen)
@@ -468,10 +528,11 @@ def _is_moved(instance: Instance) -> bool:
     return len({each.place for each in instance.stays}) > 1
 
 
-def _split(stays: Sequence[PlacedStay], seen: _Seen) -> list[PlacedStay]:
+def _split(stays: Sequence[PlacedStay], seen: _Seen, go_on: Callable[[], None]) -> list[PlacedStay]:
     """Splits stays that have another one of the same label between two sightings."""
     found = []
     for stay in stays:
+        go_on()
         others = [
             (each.firm_first, each.firm_last)
             for each in stays

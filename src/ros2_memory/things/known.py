@@ -2,13 +2,15 @@
 
 Sights come from the catalogue, joined once for each segment of bags; of bags without a valid entry
 they are made from the bags, as the catalogue would have them. So the estimate is the same with the
-catalogue and without; where reading takes too long it begins later, and says so.
+catalogue and without; where reading takes too long it begins later, and says so. So it does where
+there are too many sightings: a detector that sees things everywhere has thousands in an hour.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from itertools import accumulate
 from threading import Lock
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
@@ -22,6 +24,7 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagState
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.transforms import sessions_of
@@ -41,6 +44,11 @@ if TYPE_CHECKING:
 
 _MADE: Final = 1024
 _ESTIMATES: Final = 4
+_MOST_SPOTS: Final = 300_000
+"""Places of a label in a bag that are looked at together: a home robot has 50,000 in a week."""
+_ESTIMATING_S: Final = 6.0
+_FEWER: Final = 4
+"""Where that takes longer, so many times fewer are looked at, from then on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +60,7 @@ class KnownThings:
         frames: by epoch, the frame of its places; epoch 0 is the map.
         has_map: whether any sights are in the map.
         since: how far back it reaches, where not all bags could be read in time; else None.
+        crowded: whether it begins there because there are too many sightings before.
     """
 
     estimate: Estimate
@@ -59,6 +68,7 @@ class KnownThings:
     frames: tuple[str, ...]
     since: Ns | None = None
     has_map: bool = True
+    crowded: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +89,15 @@ class _Made:
         self._estimates: WeakKeyDictionary[
             Timeline, OrderedDict[tuple[object, ...], KnownThings]
         ] = WeakKeyDictionary()
+        self._most_spots: dict[tuple[object, ...], int] = {}
+
+    def most_spots(self, key: tuple[object, ...]) -> int:
+        with self._lock:
+            return self._most_spots.get(key, _MOST_SPOTS)
+
+    def put_most_spots(self, key: tuple[object, ...], most: int) -> None:
+        with self._lock:
+            self._most_spots[key] = most
 
     def sights(self, key: tuple[object, ...]) -> bytes | None:
         with self._lock:
@@ -121,14 +140,24 @@ def known_things(
     described = tuple(sorted((name, tuple(each)) for name, each in spellings.items()))
     key = (min_score, described, view.memory.limits.map_frame, id(view.memory.reader))
     known = _CACHE.estimate(timeline, key)
-    if known is not None:
-        return known
-    before = view.notes.added
-    known = _Loader(view).load(min_score, Labels(spellings))
-    active = any(bag.state is BagState.ACTIVE for bag in view.snapshot.bags)
-    if known.since is None and not active and view.notes.added == before:
-        _CACHE.put_estimate(timeline, key, known)
+    if known is None:
+        before = view.notes.added
+        known = _Loader(view).load(min_score, Labels(spellings), (id(view.memory.index), *key))
+        active = any(bag.state is BagState.ACTIVE for bag in view.snapshot.bags)
+        is_read = known.since is None or known.crowded
+        if is_read and not active and view.notes.added == before:
+            _CACHE.put_estimate(timeline, key, known)
+    if known.crowded and known.since is not None:
+        view.notes.complete = False
+        view.notes.add(
+            f"things are known since {unix_text(known.since)} only: there are too many sightings "
+            "to compare older ones, which find_matches finds"
+        )
     return known
+
+
+class _TakesTooLongError(Exception):
+    """An estimate takes longer than an answer may."""
 
 
 class _Loader:
@@ -140,26 +169,62 @@ class _Loader:
         self._reading: Deadline | None = None
         self._since: Ns | None = None
 
-    def load(self, min_score: float, labels: Labels) -> KnownThings:
-        """Returns the things in all that could be read."""
-        parts: list[_Part] = []
-        for segment in reversed(self._view.snapshot.timeline.segments):
-            self._view.bags.check_deadline()
-            parts.append(self._part(segment))
-            if self._since is not None:
-                break
-        parts.reverse()
-        frames = [frame for part in parts for frame in part.frames]
-        bags = [bag for part in parts for bag in part.bags]
-        epochs, names = self._epochs(frames, bags)
-        found = estimate(joined(part.sights for part in parts), labels, epochs, min_score)
+    def load(self, min_score: float, labels: Labels, key: tuple[object, ...]) -> KnownThings:
+        """Returns the things in all that could be read, and compared in time."""
+        parts, crowded = self._newest(_CACHE.most_spots(key))
         if self._since is not None:
             self._view.notes.complete = False
             self._view.notes.add(
                 f"things are known since {unix_text(self._since)} only: reading older bags takes "
                 f"too long; {self._view.bags.backfill_progress()}ask again"
             )
-        return KnownThings(found, labels, names, self._since, 0 in epochs)
+        while True:
+            try:
+                return self._known(parts, min_score, labels, crowded=crowded)
+            except _TakesTooLongError:
+                most = sum(len(part.sights.spots) for part in parts) // _FEWER
+                _CACHE.put_most_spots(key, most)
+                parts, crowded = _within(parts, most), True
+
+    def _newest(self, most: int) -> tuple[list[_Part], bool]:
+        """Returns the newest bags, in order, and whether they have so many spots already."""
+        parts: list[_Part] = []
+        spots = 0
+        for segment in reversed(self._view.snapshot.timeline.segments):
+            if spots >= most:
+                return parts[::-1], True
+            self._view.bags.check_deadline()
+            parts.append(self._part(segment))
+            spots += len(parts[-1].sights.spots)
+            if self._since is not None:
+                break
+        return parts[::-1], False
+
+    def _known(
+        self, parts: Sequence[_Part], min_score: float, labels: Labels, *, crowded: bool
+    ) -> KnownThings:
+        """Returns the things in some bags.
+
+        Raises:
+            _TakesTooLongError: that takes longer than an answer may, and fewer would do.
+        """
+        frames = [frame for part in parts for frame in part.frames]
+        bags = [bag for part in parts for bag in part.bags]
+        epochs, names = self._epochs(frames, bags)
+        time = self._view.call.partial_after(_ESTIMATING_S)
+
+        def go_on() -> None:
+            if self._since is None:  # else the call's time may be over, and this is its answer
+                self._view.bags.check_deadline()
+            if len(parts) > 1 and time.expired():
+                raise _TakesTooLongError
+
+        sights = joined(part.sights for part in parts)
+        found = estimate(sights, labels, epochs, min_score, go_on)
+        since = self._since
+        if crowded:
+            since = max(bags[0].start, MIN_NS if since is None else since)
+        return KnownThings(found, labels, names, since, 0 in epochs, crowded)
 
     def _part(self, segment: Segment) -> _Part:
         digests = self._view.bags.digests_of(segment)
@@ -241,6 +306,12 @@ class _Loader:
                 names.append(frame)
             epochs.append(known[key])
         return epochs, tuple(names)
+
+
+def _within(parts: Sequence[_Part], most: int) -> list[_Part]:
+    """Returns the newest parts that have at most so many spots, at least one."""
+    spots = accumulate(len(part.sights.spots) for part in reversed(parts))
+    return [*parts[-max(sum(each <= most for each in spots), 1) :]]
 
 
 def _is_sound(packed: bytes) -> bool:

@@ -13,6 +13,8 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call
+from ros2_memory.index import timeline
+from ros2_memory.things import known
 from ros2_memory.things.find import find_things
 from tests.support.memories import memory_of, recalling
 from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked, write
@@ -78,3 +80,51 @@ def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None
     for answer in answers:
         for note in answer.notes:
             assert "only what is after" not in note or "2 of 8 bags" in note
+
+
+@pytest.fixture
+def crowded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Memory:
+    """A memory of eight bags in segments of two, each bag with a thing of its own."""
+    monkeypatch.setattr(timeline, "SEGMENT_BAGS", 2)
+    moments = [looked(10 * n, 10 * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
+    write(tmp_path, [message for some in moments for message in some])
+    return recalling(memory_of(tmp_path, limits=NAMED), tmp_path)
+
+
+def labels_and_notes(memory: Memory, deadline: Deadline) -> tuple[set[str], list[str]]:
+    found = find_things(memory, Call(deadline))
+    notes = [note for note in found.notes if "too many sightings" in note]
+    assert found.all_counted == (not notes)
+    return {each.label for each in found.things}, notes
+
+
+def test_of_too_many_sightings_the_newest_are_compared(
+    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = {label for label, *_ in THINGS}
+    assert labels_and_notes(crowded, Deadline.after(60)) == (every, [])
+    monkeypatch.setattr(known, "_MOST_SPOTS", 3)
+    again = replace(crowded, index=memory_of(crowded.index.bag_dir, limits=NAMED).index)
+    for _ in range(2):  # the second time it is known
+        labels, [note] = labels_and_notes(again, Deadline.after(60))
+        assert labels == {label for label, *_ in THINGS[4:]}
+        assert str(BEGIN + 40) in note
+
+
+def test_where_comparing_takes_too_long_fewer_are_compared_from_then_on(
+    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
+    newest = {label for label, *_ in THINGS[6:]}
+    labels, [note] = labels_and_notes(crowded, Deadline.after(60))
+    assert labels == newest
+    assert str(BEGIN + 60) in note
+
+
+def test_a_call_without_an_end_compares_all(
+    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
+    labels, notes = labels_and_notes(crowded, Deadline.never())
+    assert labels == {label for label, *_ in THINGS}
+    assert notes == []
