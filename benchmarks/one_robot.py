@@ -127,7 +127,8 @@ def asked(settings: Settings, call: Asked, *, warm: bool) -> tuple[float, float,
     memory = build_memory(settings)
     memory.index.refresh()
     dispatcher = build_server(settings, memory).dispatcher
-    if warm:
+    if warm:  # as a server does while nobody asks
+        build_backfill(settings, memory).precompute()
         _wait_until(partial(warm_up, memory, dispatcher))
 
     def ask() -> tuple[float, str]:

@@ -79,9 +79,10 @@ def without_constant_zeros(samples: Sequence[JsonValue]) -> tuple[list[JsonValue
     shared = [path for path, item in _items(samples[0]) if _is_zero(item)]
     removed = set(shared)
     for sample in samples[1:]:
-        removed &= {path for path, item in _items(sample) if _is_zero(item)}
+        removed = {path for path in removed if _is_zero(_found(sample, path))}
     for sample in samples:
-        for path, item in [((), sample), *_items(sample)]:
+        for path in {path[:-1] for path in removed}:
+            item = _found(sample, path)
             leaves = {(*path, key) for key in item} if isinstance(item, dict) else set()
             if leaves <= removed:
                 removed -= leaves
@@ -115,6 +116,13 @@ def _items(value: JsonValue, path: _Path = ()) -> Iterator[tuple[_Path, JsonValu
         for key, item in value.items():
             yield (*path, key), item
             yield from _items(item, (*path, key))
+
+
+def _found(value: JsonValue, path: _Path) -> JsonValue:
+    """Returns what an object has at a path; None where it has nothing there."""
+    for key in path:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
 
 
 def _without(value: JsonValue, removed: set[_Path], path: _Path = ()) -> JsonValue:
