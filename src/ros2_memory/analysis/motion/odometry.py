@@ -208,16 +208,23 @@ class Leg(NamedTuple):
     def joined(self, later: Leg) -> Leg:
         """Returns this leg continued, without a break, by a later one."""
         step_m = distance(self.last.position, later.first.position)
-        whole = self._replace(
+        is_bridged = (self.poses < FEWEST) != (later.poses < FEWEST)
+        head, tail, length_m, still = (
+            self._bridged(later, step_m) if is_bridged else self._linked(later, step_m)
+        )
+        # In one step: a path has a leg for each bag, and thousands of bags.
+        return Leg(
+            first=self.first,
             last=later.last,
             poses=self.poses + later.poses,
             period_ns=(self if self.poses >= later.poses else later).period_ns
             or self.period_ns
             or later.period_ns,
-            length_m=self.length_m + later.length_m,
+            length_m=length_m,
             sum_m=self.sum_m + step_m + later.sum_m,
-            tail=later.tail,
-            still=False,
+            head=head,
+            tail=tail,
+            still=still,
             near_first=self.near_first
             if self.poses > _NEARBY
             else self.near_first.or_more(later.near_first),
@@ -225,30 +232,30 @@ class Leg(NamedTuple):
             if later.poses > _NEARBY
             else later.near_last.or_more(self.near_last),
         )
-        if (self.poses < FEWEST) != (later.poses < FEWEST):
-            return self._bridged(later, whole, step_m)
+
+    def _linked(self, later: Leg, step_m: float) -> tuple[End, End, float, bool]:
+        """Returns the ends, the length and whether it is still of this leg and a later one."""
+        head, tail, length_m = self.head, later.tail, self.length_m + later.length_m
         before, after = self.tail.creep, later.head.creep
         if before is not None and after is not None:
             creep = before.joined(after)
             if self.still:
-                whole = whole._replace(head=self.head._replace(creep=creep))
+                head = head._replace(creep=creep)
             if later.still:
-                whole = whole._replace(tail=later.tail._replace(creep=creep))
+                tail = tail._replace(creep=creep)
             if not (self.still or later.still):
-                whole = whole._replace(length_m=whole.length_m + creep.length_m)
-            return whole._replace(still=self.still and later.still)
+                length_m += creep.length_m
+            return head, tail, length_m, self.still and later.still
         inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
         # A creep that filled its leg reaches only one end of the whole.
-        if self.still:
-            whole = whole._replace(head=self.head)
-        elif before is not None:
+        if before is not None and not self.still:
             inner_m += before.length_m
         if after is not None and not later.still:
             inner_m += after.length_m
-        return whole._replace(length_m=whole.length_m + inner_m)
+        return head, tail, length_m + inner_m, False
 
-    def _bridged(self, later: Leg, whole: Leg, step_m: float) -> Leg:
-        """Joins two legs one of which has too few poses to estimate its noise."""
+    def _bridged(self, later: Leg, step_m: float) -> tuple[End, End, float, bool]:
+        """Does as `_linked`, where one of the legs has too few poses to estimate its noise."""
         if later.poses < FEWEST:
             net_m = distance(self.last.position, later.last.position)
             end, short, long = self.tail, later, self
@@ -256,8 +263,7 @@ class Leg(NamedTuple):
             net_m = distance(self.first.position, later.first.position)
             end, short, long = later.head, self, later
         added_m = _step_m(end, end, short.poses, net_m, step_m + short.sum_m)
-        kept = whole._replace(length_m=long.length_m + added_m, head=long.head, tail=long.tail)
-        return kept._replace(still=long.still)
+        return long.head, long.tail, long.length_m + added_m, long.still
 
 
 def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -> float:
