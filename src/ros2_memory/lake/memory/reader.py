@@ -103,7 +103,7 @@ class LakeReader(BagReader):
         self._tf_topics = tf_topics
         self._served = threading.local()
         self._lock = threading.Lock()
-        self._known: OrderedDict[tuple[str, str], Sequence[Record]] = OrderedDict()
+        self._known: OrderedDict[tuple[str, str], Sequence[Record] | Tracks] = OrderedDict()
         self._days: OrderedDict[tuple[object, ...], RowsOfDay] = OrderedDict()
         self._read_alone = Counter[tuple[object, ...]]()
 
@@ -139,8 +139,7 @@ class LakeReader(BagReader):
             record
             for topic in sorted(topics)
             if bag.summary.schema.positions.get(topic)
-            for record in self._of_topic(bag, topic)
-            if window.contains(record.log_time)
+            for record in self._of_topic(bag, topic, window)
         ]
         found.sort(key=lambda each: each.log_time)
         yield from reversed(found) if newest_first else found
@@ -196,9 +195,17 @@ class LakeReader(BagReader):
             yield "steps of the clock inside of a bag are not seen in the lake"
         self._served.thinned = self._served.even = False
 
-    def _of_topic(self, bag: BagFile, topic: str) -> Sequence[Record]:
-        if topic == self._index.pose_topic:
+    def _of_topic(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Record]:
+        is_pose = topic == self._index.pose_topic
+        if is_pose:
             self._served.thinned = True
+        known = self._known_of(bag, topic)
+        if isinstance(known, Tracks):
+            return known.poses(topic, window) if is_pose else known.transforms(topic, window)
+        return [each for each in known if window.contains(each.log_time)]
+
+    def _known_of(self, bag: BagFile, topic: str) -> Sequence[Record] | Tracks:
+        """Returns all messages of a topic in a bag, or the track that they are made of."""
         here = self._index.bag(self._index.number(bag))
         key = here.bag_id, topic
         with self._lock:
@@ -213,7 +220,7 @@ class LakeReader(BagReader):
                 self._known.popitem(last=False)
         return known
 
-    def _read(self, bag: BagFile, here: LakeBag, topic: str) -> Sequence[Record]:
+    def _read(self, bag: BagFile, here: LakeBag, topic: str) -> Sequence[Record] | Tracks:
         if self._index.has_messages(topic):
             whole = [message(topic, row) for row in self._rows(_MESSAGES, "messages", here, topic)]
             if whole:
@@ -222,10 +229,10 @@ class LakeReader(BagReader):
             rows, packed = self._sightings(here, topic)
             empty = None if packed is None else unpacked_empty(packed)
             return detections(bag, topic, rows, empty)
-        if topic == self._index.pose_topic:
-            return self._tracks(bag, here).poses(topic)
-        if topic in self._tf_topics:
-            return self._tracks(bag, here).transforms(topic)
+        if topic == self._index.pose_topic or topic in self._tf_topics:
+            own = self._index.pose_topic
+            rows = self._rows_of_day("poses", _POSES, "time_ns", here, own)
+            return Tracks(bag, own, rows, self._map_frame)
         [summary, *_] = bag.summary.of(topic)
         if has_events(summary.type) or has_levels(summary.type):
             return [*states(topic, summary.type, self._runs(bag, here, topic))]
@@ -294,12 +301,6 @@ class LakeReader(BagReader):
         found, begins, counts = known
         rows = found.slice(begins.get(bag.bag_id, 0), counts.get(bag.bag_id, 0)).to_pylist()
         return rows
-
-    def _tracks(self, bag: BagFile, here: LakeBag) -> Tracks:
-        topic = self._index.pose_topic
-        return Tracks(
-            bag, topic, self._rows_of_day("poses", _POSES, "time_ns", here, topic), self._map_frame
-        )
 
     def _rows(
         self, sql: str, table: str, bag: LakeBag, topic: str

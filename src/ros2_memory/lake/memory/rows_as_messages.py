@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.topic_events import State
     from ros2_memory.core.bag_summary import TopicSummary
-    from ros2_memory.core.model import BagFile, JsonValue
+    from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.state_runs import StateRun
 
@@ -158,20 +158,20 @@ class Tracks:
         self._own_frame = min(by_frame, key=lambda each: each == map_frame, default="")
         self._own = by_frame.get(self._own_frame, [])
 
-    def poses(self, topic: str) -> Sequence[Record]:
-        """Returns poses in the poses' own frame."""
+    def poses(self, topic: str, window: TimeWindow) -> Sequence[Record]:
+        """Returns the poses of a window, in the poses' own frame."""
         return [
             record(topic, self._type, time, _posed(self._own_frame, x, y, heading))
-            for time, x, y, heading in self._at(self._own)
+            for time, x, y, heading in self._at(self._own, window)
         ]
 
-    def transforms(self, topic: str) -> Sequence[Record]:
-        """Returns the transforms from the poses' own frame to the map."""
+    def transforms(self, topic: str, window: TimeWindow) -> Sequence[Record]:
+        """Returns the transforms of a window, from the poses' own frame to the map."""
         if self._map is None or self._own_frame == self._map_frame:
             return ()
-        own = {time: (x, y, heading) for time, x, y, heading in self._at(self._own)}
+        own = {time: (x, y, heading) for time, x, y, heading in self._at(self._own, window)}
         found: list[Record] = []
-        for time, x, y, heading in self._at(self._map):
+        for time, x, y, heading in self._at(self._map, window):
             if time not in own or math.isnan(heading) or math.isnan(own[time][2]):
                 continue
             from_x, from_y, from_heading = own[time]
@@ -182,18 +182,21 @@ class Tracks:
             found.append(record(topic, "tf2_msgs/msg/TFMessage", time, {"transforms": [edge]}))
         return found
 
-    def _at(self, rows: Sequence[Row]) -> Sequence[tuple[Ns, float, float, float]]:
-        """Returns times, x, y (m) and headings (rad) where a track has no gap."""
-        if not rows:
+    def _at(
+        self, rows: Sequence[Row], window: TimeWindow
+    ) -> Sequence[tuple[Ns, float, float, float]]:
+        """Returns times of a window, x, y (m) and headings (rad) where a track has no gap."""
+        wanted = self._times[(self._times >= window.start) & (self._times < window.stop)]
+        if not rows or not len(wanted):
             return ()
         vertices = np.array([_ns(row["time_ns"]) for row in rows], np.int64)
         begins = np.array([bool(row["begins"]) for row in rows])
-        after = np.searchsorted(vertices, self._times, side="left")
-        inside = (after < len(vertices)) & (self._times >= vertices[0])
-        exact = np.zeros(len(self._times), np.bool_)
-        exact[inside] = vertices[after[inside]] == self._times[inside]
+        after = np.searchsorted(vertices, wanted, side="left")
+        inside = (after < len(vertices)) & (wanted >= vertices[0])
+        exact = np.zeros(len(wanted), np.bool_)
+        exact[inside] = vertices[after[inside]] == wanted[inside]
         inside[inside] &= exact[inside] | ~begins[after[inside]]
-        times = self._times[inside]
+        times = wanted[inside]
         since = (times - vertices[0]).astype(np.float64)
         known = (vertices - vertices[0]).astype(np.float64)
         x, y = (np.interp(since, known, _column(rows, name)) for name in ("x", "y"))
