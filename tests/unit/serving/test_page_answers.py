@@ -30,6 +30,8 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
+from ros2_memory.history.transforms import transform_at
+from ros2_memory.history.view import View
 from ros2_memory.serving.backfill import Progress
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.page import span
@@ -486,6 +488,23 @@ def test_a_look_after_a_warm_up_reads_nothing_that_is_stored(
     found = shown(fresh, "last=1000")
     for key in ("path", "events", "things", "distance_m"):
         assert found[key] == expected[key]
+
+
+def test_a_transform_after_a_warm_up_gathers_no_static_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at = BEGIN
+    arm = transform(at, "base_link", "camera", (0.2, 0.0, 0.5))
+    moves = [tf(at + n * S, transform(at + n * S, "odom", "base_link", (n, 0, 0))) for n in (0, 1)]
+    static = tf(at, arm, topic="/tf_static")
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [static, *moves, odom(at + S, 1.0, 0.0)])
+    memory = memory_of(tmp_path)
+    dispatcher = Dispatcher(memory, [], Replies(tmp_path, 9_000), call_timeout_s=5)
+    assert warm_up(memory, dispatcher)
+    gathered = "ros2_memory.history.transforms._once_decoded"
+    monkeypatch.setattr(gathered, lambda *_: pytest.fail("was gathered"))
+    found = transform_at(View(memory, Call()), "odom", "camera", at + S)
+    assert found.transform.translation == pytest.approx((1.2, 0.0, 0.5))
 
 
 async def test_a_warm_up_gives_way_to_a_question_and_goes_on_later(memory: Memory) -> None:

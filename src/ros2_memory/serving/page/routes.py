@@ -18,6 +18,8 @@ from starlette.routing import Route
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.transforms import sessions_of, static_transforms
+from ros2_memory.history.view import View
 from ros2_memory.serving.call_size import excess_in_json
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
 from ros2_memory.serving.page.recordings import Recordings
@@ -100,6 +102,7 @@ def page_routes(
 def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
     """Looks at the newest week while nobody asks, so that the first look of a page is a second one.
 
+    And at the static transforms of the newest session, so that the first transform is, too.
     Returns whether that is done. What was joined until somebody asked stays, so that the next time
     goes on from there.
     """
@@ -108,6 +111,7 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
         return False
     request = SpanRequest(last_s=_WEEK_S, patient=True)
     try:
+        _gather_static_transforms(memory, call)
         Recordings().shown(memory, memory, call)
         for _ in range(_MOST_TRIES):
             shown = span_shown(memory, call, request)
@@ -120,6 +124,12 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
     except Exception:
         log.exception("page_not_warmed_up")
     return True
+
+
+def _gather_static_transforms(memory: Memory, call: Call) -> None:
+    view = View(memory, call)
+    for bag in view.snapshot.bags[-1:]:
+        static_transforms(view, sessions_of(view).of(bag.recording))
 
 
 def span_request(given: QueryParams) -> SpanRequest:
