@@ -10,6 +10,7 @@ import pyarrow as pa
 import pytest
 
 from ros2_memory.catalogue.store import BagKey
+from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.timeline import SEGMENT_BAGS
@@ -150,6 +151,40 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(
     assert older.bags[0].start == (START_S - DAY_S) * NS_PER_S
 
 
+def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
+    tmp_path: Path, shipping: Shipping, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    older = START_S - DAY_S
+    shipping.ship([older, START_S])
+    first = shipping.robot().memory
+    lake = Lake(lake_in(tmp_path), shipping.engine)
+    robot = LakeRobot(
+        lake,
+        "hall",
+        FixedClock(NOW),
+        first.limits,
+        first.extractor,
+        refresh_s=0,
+        days=1,
+        most_bags=1,
+    )
+    index = robot.memory.index
+    assert starts(robot) == [START_S]
+    bag, *_ = index.snapshot(older * NS_PER_S).bags
+    shipping.ship([older + 60], label="fork")
+    index.refresh()
+    found: list[BagSummary] = []
+    select = shipping.engine.select
+
+    def selected(sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
+        found.append(robot.memory.reader.summarize(bag.path))
+        return select(sql, tables, parameters)
+
+    monkeypatch.setattr(shipping.engine, "select", selected)
+    assert len(index.snapshot(older * NS_PER_S).bags) == 3
+    assert set(found) == {bag.summary}
+
+
 def test_static_transforms_are_known_not_to_be_there(shipping: Shipping) -> None:
     """So a question about places does not look for them in each bag."""
     shipping.ship([START_S])
@@ -161,3 +196,52 @@ def test_static_transforms_are_known_not_to_be_there(shipping: Shipping) -> None
     assert number is not None
     assert edges("/tf_static", [number])[number].pairs == ()
     assert edges("/tf", [number]) == {}
+
+
+def test_bags_that_are_shipped_late_show_nothing_about_the_robots_clock(shipping: Shipping) -> None:
+    shipping.ship([START_S])
+    robot = shipping.robot()
+    assert starts(robot) == [START_S]
+    shipping.ship([START_S - 2 * DAY_S, START_S - 2 * DAY_S + 60], label="fork")
+    found = robot.memory.index.refresh()
+    assert len(found.bags) == 3
+    assert found.dating.faults == ()
+    assert found.earliest == found.bags[0].start
+
+
+def test_older_days_that_are_looked_at_show_nothing_about_the_robots_clock(
+    tmp_path: Path, shipping: Shipping
+) -> None:
+    before, last = START_S - 2 * DAY_S, START_S - DAY_S + 60
+    shipping.ship([before, last, START_S])
+    first = shipping.robot().memory
+    robot = LakeRobot(
+        Lake(lake_in(tmp_path), shipping.engine),
+        "hall",
+        FixedClock(NOW),
+        first.limits,
+        first.extractor,
+        refresh_s=0,
+        days=2,
+        most_bags=1,
+    )
+    assert starts(robot) == [last, START_S]
+    older = robot.memory.index.snapshot(before * NS_PER_S)
+    assert [bag.start // NS_PER_S for bag in older.bags] == [before, last]
+    assert older.dating.faults == ()
+
+
+def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_robot(
+    tmp_path: Path, engine: LakeEngine
+) -> None:
+    bags = tmp_path / "bags"
+    for name, begin in (("one/one_0", 0), ("one/one_1", 15), ("two/two_0", 30)):
+        at = START_S + begin
+        write_mcap(bags / f"{name}.mcap", [text((at + n) * NS_PER_S, "here") for n in range(10)])
+    on_robot = recalling(memory_of(bags), bags)
+    catalog = lake_in(tmp_path)
+    fill(catalog, {"hall": on_robot}, ["/chatter"])
+    in_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory
+    pause = (START_S + 24) * NS_PER_S, (START_S + 30) * NS_PER_S
+    assert [*on_robot.index.snapshot().gaps] == [pause]
+    assert [*in_lake.index.refresh().gaps] == [pause]

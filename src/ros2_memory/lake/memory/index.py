@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 import pyarrow.compute as pc
 
+from ros2_memory.bag_dir.layout import COMPRESSED
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagVanishedError
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 _FOLDER: Final = "lake"
 _ENCODING: Final = "json"
 _BAGS: Final = (
-    "SELECT bag_id, day, size, sha256, made_of, mtime_ns, start_ns, end_ns FROM bags"
+    "SELECT bag_id, day, file, size, sha256, made_of, mtime_ns, start_ns, end_ns FROM bags"
     " ORDER BY start_ns, end_ns, bag_id"
 )
 _TOPICS: Final = (
@@ -251,12 +252,10 @@ class LakeIndex:
             days = self._lake.days("bags", self._robot)
             span = days.newest(day + timedelta(days=1), self._most_bags, _FEWEST_DAYS)
             last = day if span is None else span[1]
-            known = self._older.pop(last, _Window())
-            window = self._window(days, span, known)
-            self._older[last] = window
-            # A new dict: other threads iterate over the old one.
-            kept = [*self._older.items()][-_MOST_WINDOWS:]
-            self._older = dict(kept)
+            window = self._window(days, span, self._older.get(last, _Window()))
+            # A new dict: other threads look for the bags of their answers in the old one.
+            others = [each for each in self._older.items() if each[0] != last]
+            self._older = dict([*others[1 - _MOST_WINDOWS :], (last, window)])
             return window
 
     def _window(self, known_days: Days, span: tuple[date, date] | None, known: _Window) -> _Window:
@@ -333,9 +332,11 @@ class LakeIndex:
             if number is None:
                 self._bags.append(LakeBag(key[0], day, key[0] not in old))
                 number = self._numbers[key] = len(self._bags)
-            # By its number, so that bags that are shipped later leave it as it is.
+            # Bags that are shipped later leave it as it is. Splits follow each other as on the
+            # robot, but all are in one folder: in which order its recordings ran is not known.
+            name = str(row["file"]).removesuffix(COMPRESSED).replace("/", ":")
             file = BagFile(
-                f"{self.bag_dir}/{_FOLDER}/{_FOLDER}_{number}.mcap",
+                f"{self.bag_dir}/{_FOLDER}/{name}-{number}",
                 _whole(row["size"]),
                 _whole(row["mtime_ns"]),
                 BagState.CLOSED,
