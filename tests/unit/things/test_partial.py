@@ -121,6 +121,18 @@ def test_where_comparing_takes_too_long_fewer_are_compared_from_then_on(
     assert str(BEGIN + 60) in note
 
 
+def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
+    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known._CACHE, "put_estimate", lambda *_: None)
+    monkeypatch.setattr(known, "_FEWER", 100)
+    monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
+    labels_and_notes(crowded, Deadline.after(60))
+    monkeypatch.setattr(known, "_ESTIMATING_S", 1e6)
+    compared = [len(labels_and_notes(crowded, Deadline.after(60))[0]) for _ in range(5)]
+    assert compared == [2, 2, 4, 8, 8]
+
+
 def test_a_call_without_an_end_compares_all(
     crowded: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
