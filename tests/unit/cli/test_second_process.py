@@ -161,3 +161,10 @@ def test_where_the_processors_cannot_be_watched_none_is_free() -> None:
         raise PermissionError
 
     assert FreeCores(read, lambda: 0)([1]) == 0.0
+
+
+def test_none_is_free_where_a_container_numbers_its_cores_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {6, 7})
+    assert FreeCores(lambda _name: proc_stat(10, 10), lambda: 0)([]) == 0.0

@@ -142,7 +142,8 @@ class FreeCores:
         try:
             busy = busy_ticks(self._read("stat"), self._cores)
             used = {pid: used_ticks(self._read(f"{pid}/stat")) for pid in own}
-        except (OSError, ValueError):
+        except (OSError, ValueError, LookupError):
+            # Containers show other cores there than those that a process may run on.
             return 0.0
         self._before = now, busy, used
         if before is None:
