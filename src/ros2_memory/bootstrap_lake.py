@@ -17,7 +17,6 @@ from ros2_memory.bootstrap import (
     build_memory,
     digest_config,
     instantiated,
-    shared_parts,
 )
 from ros2_memory.bootstrap_fleet import robot_settings
 from ros2_memory.config import RayNode
@@ -137,8 +136,8 @@ def engine_of(node: DuckdbNode | RayNode) -> LakeEngine:
     return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
 
 
-def build_robots(settings: Settings) -> list[RobotBags]:
-    """Returns the robots of `fleet.robots`, whose bags are only read.
+def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
+    """Returns the robots of `fleet.robots`, whose bags are only read, all with `shared`.
 
     Raises:
         ConfigError: there are none, or their settings are refused.
@@ -149,7 +148,6 @@ def build_robots(settings: Settings) -> list[RobotBags]:
             "fleet.robots: must name the robots whose bags are shipped: choose "
             "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
         )
-    shared = shared_parts(settings)
     return [_robot(settings, name, shared) for name in settings.fleet.robots]
 
 

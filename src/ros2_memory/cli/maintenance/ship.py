@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 
+from ros2_memory.bootstrap import shared_parts
 from ros2_memory.bootstrap_lake import build_robots, lake_location
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
@@ -34,6 +35,7 @@ from ros2_memory.core.timebase import WallClock, ns_from_unix
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from ros2_memory.bootstrap import SharedParts
     from ros2_memory.lake.lease import WarehouseLease
     from ros2_memory.lake.shipper import RobotBags, Shipper
     from ros2_memory.lake.warehouse import LakeLocation
@@ -70,7 +72,8 @@ def ship(
     """
     settings = load_for(None, overrides)
     window = _window_of(forget, start, end)
-    location, robots = lake_location(settings), build_robots(settings)
+    location, shared = lake_location(settings), shared_parts(settings)
+    robots = build_robots(settings, shared)
     # The extra is there: `lake_location` has checked that.
     from ros2_memory.lake.lease import leased, writing_alone  # noqa: PLC0415
 
@@ -79,8 +82,8 @@ def ship(
     pace = _Pace(settings.lake.commit_interval_s)
     with writing_alone(location.state_dir), leased(location, WallClock()) as lease:
         if forget is None and not once:
-            load = partial(load_for, None, overrides)
-            _ship_on(settings, location, robots, pace, lease, load=load)
+            new = partial(_new_robots, partial(load_for, None, overrides), shared)
+            _ship_on(settings, location, robots, pace, lease, new_robots=new)
         lease.renew()
         if forget is not None and window is not None:
             _forget(location, forget, window, as_json=as_json)
@@ -231,11 +234,11 @@ def _ship_on(
     pace: _Pace,
     lease: "WarehouseLease",
     *,
-    load: "Callable[[], Settings]",
+    new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]",
 ) -> NoReturn:
     """Ships until the process is stopped; a lake that fails is tried again.
 
-    `load` returns the settings as of now: a pattern may match the folders of more robots.
+    `new_robots` returns those that are in the settings now, besides the ones that it is given.
     """
     notify(READY)
     log.info("shipping", robots=len(robots), warehouse=location.warehouse)
@@ -257,7 +260,7 @@ def _ship_on(
                         if problem not in known:
                             log.warning("not_shipped", reason=problem)
                     known = problems
-                    if is_due and (new := _new_robots(load, robots)):
+                    if is_due and (new := new_robots(robots)):
                         robots = [*robots, *new]
                         break
                     _wait(settings.reader.index_refresh_s)
@@ -267,16 +270,16 @@ def _ship_on(
 
 
 def _new_robots(
-    load: "Callable[[], Settings]", robots: "Sequence[RobotBags]"
+    load: "Callable[[], Settings]", shared: "SharedParts", robots: "Sequence[RobotBags]"
 ) -> "Sequence[RobotBags]":
-    """Returns the robots of the settings that were not there before."""
+    """Returns the robots of the settings that were not there before: a pattern may match more."""
     try:
         settings = load()
         known = {each.name for each in robots}
         new = {name: bags for name, bags in settings.fleet.robots.items() if name not in known}
         if not new:
             return []
-        found = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)))
+        found = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)), shared)
     except ConfigError as error:
         log.warning("not_shipped", reason=f"robots that are new are not looked for: {error}")
         return []
