@@ -149,6 +149,7 @@ def qos_overrides(
     plan: QueuePlan,
     *,
     latched: Collection[str],
+    weakest: Collection[str] = (),
 ) -> str:
     """Returns YAML for `--qos-profile-overrides-path`.
 
@@ -157,8 +158,18 @@ def qos_overrides(
         plan: the depths of their queues.
         latched: the topics that count as latched and may have many publishers. All of their
             messages are asked for, unless their publishers are known to be volatile.
+        weakest: topics with a publisher that was refused. They are asked for with what fits every
+            publisher: rosbag2 itself asks for more where it knows none of them yet.
     """
-    profiles: dict[str, dict[str, str | int]] = {}
+    profiles: dict[str, dict[str, str | int]] = {
+        topic: {
+            "history": "keep_last",
+            "depth": DEFAULT_DEPTH,
+            "reliability": "best_effort",
+            "durability": "volatile",
+        }
+        for topic in weakest
+    }
     for topic, flow in flows.items():
         profiles[topic] = {
             "history": "keep_last",

@@ -111,7 +111,9 @@ class Reception:
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
             latched = [topic for topic in self._latched if topic not in self._asked_anew]
-            return qos_overrides(self._flows, plan, latched=latched)
+            # A latched topic that is asked for as volatile would lose what was published before.
+            weakest = self._asked_anew.difference(self._latched)
+            return qos_overrides(self._flows, plan, latched=latched, weakest=weakest)
 
     def recall(self, path: Path) -> None:
         """Measures a closed split of an earlier run at once. Raises nothing."""
@@ -169,7 +171,8 @@ class Reception:
     def refused(self, recording: str, topic: str) -> None:
         """Notes that a publisher does not fit how a recording subscribed to the topic.
 
-        The state of the topic is dropped: the next recording adapts to its publishers again.
+        The state of the topic is dropped: the next recording asks for what fits every publisher, or
+        of a latched topic adapts to those that it finds, until a split shows what they offer.
         """
         with self._lock:
             known = self._recordings.get(recording)

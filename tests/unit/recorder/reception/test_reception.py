@@ -85,7 +85,8 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     assert rotation.event == "asking_again"
     assert rotation.topics == {"/odom"}
     made.rotation_begun(rotation, 50.0)
-    assert "/odom" not in profiles(made, "b")
+    asked = profiles(made, "b")["/odom"]
+    assert (asked["reliability"], asked["durability"]) == ("best_effort", "volatile")
     made.refused("b", "/odom")
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S - 1) is None
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
@@ -144,3 +145,12 @@ def test_a_burst_counts_two_seconds_and_a_young_topic_goes_on() -> None:
     assert burst_of([T0 + tick * NS // 50 for tick in range(500)]) == 100
     assert burst_of([T0 + tick * NS // 50 for tick in range(11)]) == 100
     assert burst_of([T0] * 30) == 30
+
+
+def test_what_a_split_shows_of_a_refused_publisher_is_asked_for_again(tmp_path: Path) -> None:
+    made = reception()
+    made.overrides("a")
+    made.refused("a", "/odom")
+    made.overrides("b")
+    made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
+    assert profiles(made, "c")["/odom"]["reliability"] == "reliable"
