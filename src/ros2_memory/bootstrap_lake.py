@@ -18,7 +18,7 @@ from ros2_memory.bootstrap import (
     digest_config,
     instantiated,
 )
-from ros2_memory.bootstrap_fleet import robot_settings
+from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.config import RayNode
 from ros2_memory.core.errors import BagError, ConfigError
 
@@ -155,7 +155,7 @@ def _robot(settings: Settings, name: str, shared: SharedParts) -> RobotBags:
     from ros2_memory.lake.shipper import RobotBags
 
     own = robot_settings(settings, name)
-    memory = build_memory(own, shared)
+    memory = build_memory(own, shared, setting=ROBOTS_SETTING)
     config = digest_config(own, shared.schemas)
     entries = json.dumps([config.base, dict(config.entries)], sort_keys=True)
 

@@ -16,6 +16,7 @@ from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.lease import WarehouseLease, writing_alone
+from ros2_memory.lake.tombstones import TOMBSTONES_FILE
 from tests.support.fleets import seeded, write_robot
 from tests.support.lakes import lake_column
 
@@ -76,6 +77,18 @@ def test_a_time_is_forgotten_and_stays_so(
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 3
     assert ship("--forget", "hall") == 2
     assert "--start" in capsys.readouterr().err
+
+
+def test_a_robot_that_nobody_knows_is_not_forgotten(
+    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+) -> None:
+    """A mistyped name would look like success, and leave a tombstone for ever."""
+    assert ship() == 0
+    capsys.readouterr()
+    assert ship("--forget", "hal", "--start", "0", "--end", "1") == 2
+    assert "hall" in capsys.readouterr().err
+    assert not (tmp_path / "lake" / ".ros2-memory" / TOMBSTONES_FILE).exists()
+    assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
 
 
 def test_a_second_writer_ends_and_names_the_first(

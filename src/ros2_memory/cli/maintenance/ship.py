@@ -29,7 +29,7 @@ from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, LakeErro
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.sd_notify import READY, WATCHDOG, notify
-from ros2_memory.core.text import counted
+from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import WallClock, ns_from_unix
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def ship(
             _ship_on(settings, location, robots, pace, lease, new_robots=new)
         lease.renew()
         if forget is not None and window is not None:
-            _forget(location, forget, window, as_json=as_json)
+            _forget(location, forget, window, robots, as_json=as_json)
             return
         with _shipper(settings, location, robots, pace, lease) as shipper:
             done = shipper.run()
@@ -131,19 +131,34 @@ def _window_of(robot: str | None, start: str | None, end: str | None) -> TimeWin
     return TimeWindow.from_unix(parse_time(start, now), parse_time(end, now))
 
 
-def _forget(location: "LakeLocation", robot: str, window: TimeWindow, *, as_json: bool) -> None:
+def _forget(
+    location: "LakeLocation",
+    robot: str,
+    window: TimeWindow,
+    robots: "Sequence[RobotBags]",
+    *,
+    as_json: bool,
+) -> None:
     """Forgets a time of a robot in the lake, and prints what is gone.
 
     Raises:
+        InvalidArgumentsError: neither the lake nor the settings know the robot; nothing is done.
         LakeError: the lake cannot be read or written; the next start finishes it.
     """
     from ros2_memory.lake.forgetting import forget_in_lake  # noqa: PLC0415 - as in `ship`
+    from ros2_memory.lake.partitions import Partitions  # noqa: PLC0415
     from ros2_memory.lake.tables import TABLES  # noqa: PLC0415
     from ros2_memory.lake.tombstones import Tombstone, append_tombstone  # noqa: PLC0415
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.opened() as catalog:
         tables = location.tables(catalog, TABLES)
+        known = {*Partitions("bags").look(tables["bags"]), *(each.name for each in robots)}
+        if robot not in known:
+            raise InvalidArgumentsError(
+                f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
+                f"{listed(sorted(known))}"
+            )
         append_tombstone(location.state_dir, tombstone, done=False)
         gone = forget_in_lake(location, tables, tombstone, WallClock().now())
     if as_json:
