@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bootstrap import build_memory, places_of, query_settings_of, shared_parts
 from ros2_memory.config import NullRecorderNode, is_robot_name
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import WallClock
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.robot import LakeRobot
+
+log = get_logger(__name__)
 
 ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
@@ -66,6 +69,13 @@ def build_fleet(settings: Settings) -> Fleet | None:
     join = None if lake is None else partial(_only_in, lake, settings, shared)
     found = Fleet(robots, WallClock(), shared_map=fleet.shared_map, join=join)
     found.joined()
+    if lake is not None and not lake.robots():
+        log.warning(
+            "lake_empty",
+            warehouse=settings.lake.warehouse,
+            reason="the lake has no bag: only the robots' own bags answer. Check lake.warehouse, "
+            "unless ros2-memory ship has yet to write there",
+        )
     return found
 
 

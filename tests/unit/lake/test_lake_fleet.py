@@ -9,6 +9,7 @@ from pathlib import Path
 
 import anyio
 import pytest
+import structlog
 
 from ros2_memory import cli
 from ros2_memory.bootstrap_fleet import build_fleet
@@ -63,6 +64,20 @@ def test_a_mounted_robot_that_was_never_shipped_is_answered_from_its_bags(tmp_pa
     assert note.startswith("from the lake, which has what was shipped: hall up to ")
     assert "attic" not in note
     assert reply(fleet, "find_things", {"robot": "attic"})["robot_name"] == "attic"
+
+
+def test_a_lake_without_a_bag_is_reported(tmp_path: Path) -> None:
+    """As one is that was given by a wrong path."""
+    write_bag(tmp_path / "hall", 0)
+    with structlog.testing.capture_logs() as logs:
+        build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert [each["warehouse"] for each in logs if each["event"] == "lake_empty"] == [
+        str(tmp_path / "lake")
+    ]
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    with structlog.testing.capture_logs() as logs:
+        build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert "lake_empty" not in {each["event"] for each in logs}
 
 
 def test_the_command_line_asks_a_lake(
