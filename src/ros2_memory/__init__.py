@@ -26,6 +26,7 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     retention       garbage collection, latched carry-forward, repair, saved moments
     triggers        rules that keep what was recorded around an event
     recorder        the recorder; recorder.process: the child; recorder.handover: rotation
+    columns         closed bags decoded once, as columns in SQLite; scanned by questions
     catalogue       SQLite digests of closed bags; derived, disposable
     history         one call's view across many bags
     things          what detectors saw, as instances with places and a history

@@ -14,9 +14,9 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.catalogue.database import ROW_ID_BITS, VERSION
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed, unpacked
-from ros2_memory.catalogue.sql import NO_TOPIC, PACKED_IN, delete_entries
+from ros2_memory.catalogue.sql import NO_TOPIC, PACKED_IN, TABLES, delete_entries
+from ros2_memory.columns.database import ROW_ID_BITS
 from ros2_memory.core.errors import BagError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _purge(file: Path, bags: Sequence[str]) -> None:
     with closing(
         sqlite3.connect(address, uri=True, timeout=PATIENCE_S, isolation_level=None)
     ) as base:
-        if base.execute("PRAGMA user_version").fetchone()[0] != VERSION:
+        if base.execute("PRAGMA user_version").fetchone()[0] != TABLES.version:
             raise ValueError("it is of another version")
         base.execute("PRAGMA secure_delete = ON")
         base.execute("BEGIN IMMEDIATE")

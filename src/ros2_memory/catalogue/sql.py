@@ -19,11 +19,11 @@ from ros2_memory.catalogue.codec import (
     encode_topic_events,
     encode_zone_map,
 )
-from ros2_memory.catalogue.database import ROW_ID_BITS
 from ros2_memory.catalogue.field_columns import encode_field_ranges
 from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 from ros2_memory.catalogue.text_runs import encode_text_runs
+from ros2_memory.columns.database import ROW_ID_BITS, Tables
 
 if TYPE_CHECKING:
     import sqlite3
@@ -34,6 +34,53 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import Record
+
+TABLES: Final = Tables(
+    version=11,
+    names=(
+        "bags",
+        "held",
+        "tales",
+        "kept",
+        "payloads",
+        "channels",
+        "edges",
+        "shapes",
+        "maps",
+        "fields",
+        "models",
+        "configs",
+    ),
+    statements="""
+CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config INTEGER NOT NULL,
+  path TEXT NOT NULL, size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
+  shape INTEGER NOT NULL, counts BLOB NOT NULL, UNIQUE (config, path));
+CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
+CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
+CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
+CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
+  kept INTEGER, relatched INTEGER, undecodable TEXT, fields INTEGER, ranges BLOB, zones BLOB,
+  poses BLOB, texts BLOB);
+CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB, story BLOB);
+CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
+  PRIMARY KEY (topic, kind)) WITHOUT ROWID;
+CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
+  sights BLOB NOT NULL);
+CREATE TABLE fields (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
+CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
+CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
+  log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
+  payload INTEGER NOT NULL, PRIMARY KEY (topic, bag, nth)) WITHOUT ROWID;
+CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
+  encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
+  schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
+CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer BLOB NOT NULL)
+  WITHOUT ROWID;
+CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
+""",
+)
+"""In `held` and `tales` the high bits of an id (see `ROW_ID_BITS`) are the topic's: its rows lie
+together."""
 
 NO_TOPIC: Final = 0
 """The topic of models that belong to no topic."""

@@ -26,7 +26,6 @@ from ros2_memory.catalogue.codec import (
     decode_zone_box,
     decode_zone_map,
 )
-from ros2_memory.catalogue.database import CatalogueDatabase
 from ros2_memory.catalogue.digest_config import may_be_one
 from ros2_memory.catalogue.field_columns import field_column
 from ros2_memory.catalogue.map_digest import decode_map_tracks
@@ -42,6 +41,7 @@ from ros2_memory.catalogue.sql import (
     SIGHTS,
     STANDSTILLS,
     STORY,
+    TABLES,
     TEXTS,
     TRACK,
     UNDECODABLE,
@@ -63,6 +63,7 @@ from ros2_memory.catalogue.sql import (
 )
 from ros2_memory.catalogue.text_runs import decode_text_runs
 from ros2_memory.catalogue.topic_digest import EdgeDigest
+from ros2_memory.columns.database import Database
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.storage.base import Channel, Record, Schema
@@ -110,7 +111,7 @@ class BagKey(NamedTuple):
         return cls(relative(bag.file, str(bag_dir)), bag.size, bag.mtime_ns, bag.sidecar_ns)
 
 
-class Catalogue(CatalogueDatabase):
+class Catalogue(Database):
     """Stores digests, and finds those that one configuration can use.
 
     Safe for several threads and several processes.
@@ -136,7 +137,7 @@ class Catalogue(CatalogueDatabase):
         waits_for: Path | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        super().__init__(paths, sources=sources, waits_for=waits_for, monotonic=monotonic)
+        super().__init__(paths, TABLES, sources=sources, waits_for=waits_for, monotonic=monotonic)
         self._config = config
         self._channels: dict[int, Channel] = {}
 

@@ -24,8 +24,9 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.state.request_queue import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
-from ros2_memory.catalogue.database import open_file
+from ros2_memory.catalogue.sql import TABLES
 from ros2_memory.cli.maintenance.recover import recover_files
+from ros2_memory.columns.database import open_file
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
@@ -357,10 +358,10 @@ class TestDeletions:
         for name in ("catalogue.sqlite", "catalogue.sqlite-wal", "catalogue.sqlite-shm"):
             link = bags / "own" / name
             link.symlink_to(outside / "catalogue.sqlite")
-            refused = open_file([bags / "own" / "catalogue.sqlite"])
+            refused = open_file([bags / "own" / "catalogue.sqlite"], TABLES)
             assert "symbolic link" in str(refused)
             link.unlink()
-        assert "symbolic link" in str(open_file([bags / ".episodic" / "catalogue.sqlite"]))
+        assert "symbolic link" in str(open_file([bags / ".episodic" / "catalogue.sqlite"], TABLES))
         assert contents(outside) == before
 
 

@@ -14,7 +14,7 @@ import anyio
 import pytest
 
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
-from ros2_memory.catalogue.database import VERSION
+from ros2_memory.catalogue.sql import TABLES
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
 from tests.support.memories import ROOT
@@ -107,6 +107,9 @@ def as_it_was(file: Path) -> None:
 
 def older(file: Path) -> None:
     changed(file, "PRAGMA user_version = 3")
+
+
+VERSION = TABLES.version
 
 
 def newer(file: Path) -> None:

@@ -14,10 +14,10 @@ import pytest
 import structlog
 
 from ros2_memory.analysis.topic_events import NO_EVENTS
-from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue, relative
+from ros2_memory.columns.database import RETRY_S
 from ros2_memory.core.model import BagFile, BagState
 from tests.support.bags import boolean, detections, odom, tf, transform
 from tests.support.fakes import FakeReader
@@ -370,7 +370,7 @@ def test_a_file_of_a_newer_version_is_set_aside(tmp_path: Path) -> None:
 def test_a_locked_file_is_left_alone_and_memory_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.catalogue.database.BUSY_S", 0.01)
+    monkeypatch.setattr("ros2_memory.columns.database.BUSY_S", 0.01)
     made(tmp_path)
     path = tmp_path / FOLDER / FILE
     with closing(sqlite3.connect(path, isolation_level=None)) as other:

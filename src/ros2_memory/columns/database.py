@@ -1,4 +1,4 @@
-"""The catalogue's SQLite connection, which repairs itself.
+"""An SQLite file of derived data, which repairs itself.
 
 The file may be deleted, replaced, overwritten, locked or on a full disk at any moment. None of that
 raises here: a file that is damaged or of another version is renamed and created again, one that is
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-VERSION: Final = 11
-"""Version of the tables below and of their content; a file of any other version is set aside."""
-
 BUSY_S: Final = 1.0
 """How long a write waits for another program that holds the file."""
 RETRY_S: Final = 10.0
@@ -34,50 +31,38 @@ _SHORT_MS: Final = 20
 """How long SQLite waits in one attempt; queries wait as long."""
 _PAUSE_S: Final = 0.02
 ROW_ID_BITS: Final = 40
-"""An entry's number is the row's id in these low bits, and in the others which database it is of.
+"""The number of a row is its id in these low bits, and in the others which database it is of.
 
-So the number of an entry in a file that was lost never means a row of the file that replaced it.
-In the tables `held` and `tales` the other bits are the topic's, so that its rows lie together.
+So the number of a row in a file that was lost never means a row of the file that replaced it.
 """
 _SUFFIXES: Final = ("-wal", "-shm")
 """The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
-_FIRST_ROWS: Final = """
-SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
-  (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes),
-  (SELECT 1 FROM maps), (SELECT 1 FROM fields), (SELECT 1 FROM models),
-  (SELECT 1 FROM configs)
-"""
-_TABLES: Final = """
-CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config INTEGER NOT NULL,
-  path TEXT NOT NULL, size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
-  shape INTEGER NOT NULL, counts BLOB NOT NULL, UNIQUE (config, path));
-CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
-CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
-CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
-CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
-  kept INTEGER, relatched INTEGER, undecodable TEXT, fields INTEGER, ranges BLOB, zones BLOB,
-  poses BLOB, texts BLOB);
-CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB, story BLOB);
-CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
-  PRIMARY KEY (topic, kind)) WITHOUT ROWID;
-CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
-  sights BLOB NOT NULL);
-CREATE TABLE fields (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
-CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
-CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
-  log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
-  payload INTEGER NOT NULL, PRIMARY KEY (topic, bag, nth)) WITHOUT ROWID;
-CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
-  encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
-  schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
-CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer BLOB NOT NULL)
-  WITHOUT ROWID;
-CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
-"""
-
 T = TypeVar("T")
 
 log = get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """The tables of a database, and what distinguishes a file that has them.
+
+    Attributes:
+        version: of the tables and of their content; a file of any other version is set aside.
+        statements: the `CREATE` statements, separated by semicolons.
+        names: of the tables, of which the first rows are read to see that a file is intact.
+        pragmas: settings of each connection, made before anything else.
+    """
+
+    version: int
+    statements: str
+    names: tuple[str, ...]
+    pragmas: tuple[str, ...] = ()
+
+    @property
+    def first_rows(self) -> str:
+        """The query that looks where each table begins."""
+        looks = (f"(SELECT 1 FROM {name})" for name in self.names)
+        return f"SELECT {', '.join(looks)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +95,14 @@ class OpenDatabase:
         return now[:1] == self.identities[:1] and now != self.identities
 
 
-class CatalogueDatabase:
+class Database:
     """One SQLite database after the other, as files are lost and created again. Thread-safe.
 
     Args:
         paths: where the file may lie, in order of preference; a database in memory serves where
             none can be written. Where the candidates may change, a function that returns those
             of the moment.
+        tables: what the file holds.
         sources: other files that may be copied to a path that has none yet; only read.
         waits_for: a directory; while it does not exist, nothing is opened or made.
         monotonic: a clock that never steps, in seconds.
@@ -125,12 +111,14 @@ class CatalogueDatabase:
     def __init__(
         self,
         paths: Sequence[Path] | Callable[[], Sequence[Path]],
+        tables: Tables,
         *,
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._candidate_paths = paths if callable(paths) else lambda: paths
+        self._tables = tables
         self._sources = tuple(sources)
         self._waits_for = waits_for
         self._monotonic = monotonic
@@ -208,7 +196,7 @@ class CatalogueDatabase:
                 if opened is None:
                     return False
                 try:
-                    _transact(opened.connection, write, probing=self.is_failing)
+                    _transact(opened.connection, write, self._tables if self.is_failing else None)
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or self._monotonic() >= give_up_s:
                         self._failed(error)
@@ -262,7 +250,7 @@ class CatalogueDatabase:
         if opened.path is None or self._opened is not opened:
             return
         # SQLite's page cache hides that the file was overwritten, so another connection looks.
-        fault = _fault_of(opened.path, thorough=thorough)
+        fault = _fault_of(opened.path, self._tables, thorough=thorough)
         if fault is not None and not is_transient(fault):
             with self._lock:
                 if self._opened is opened:
@@ -278,8 +266,8 @@ class CatalogueDatabase:
         if self._opened is None and self._may_open():
             self._tried_s = self._monotonic()
             paths = self._candidate_paths()
-            found = open_file(paths, sources=self._sources)
-            self._opened = _in_memory() if isinstance(found, str) else found
+            found = open_file(paths, self._tables, sources=self._sources)
+            self._opened = _in_memory(self._tables) if isinstance(found, str) else found
             self.trouble = None
             if isinstance(found, str) and paths:
                 self.trouble = f"is kept in memory: {found}"
@@ -295,7 +283,7 @@ class CatalogueDatabase:
         # It stays at a path that is no longer a candidate.
         if before.path is not None:
             paths = paths[: paths.index(before.path)] if before.path in paths else ()
-        found = open_file(paths, again=True, previous=before.path) if paths else ""
+        found = open_file(paths, self._tables, again=True, previous=before.path) if paths else ""
         if isinstance(found, str):
             return
         with self._lock:
@@ -344,18 +332,17 @@ class CatalogueDatabase:
 def _transact(
     connection: sqlite3.Connection,
     write: Callable[[sqlite3.Connection], None],
-    *,
-    probing: bool,
+    probed: Tables | None,
 ) -> None:
-    """Writes in one transaction; `probing` makes sure that it writes a page at least.
+    """Writes in one transaction; with `probed`, its tables, it writes a page at least.
 
     A transaction without a change touches no disk, and so does not show that the disk works.
     """
     connection.execute("BEGIN IMMEDIATE")
     try:
         write(connection)
-        if probing:
-            connection.execute(f"PRAGMA user_version = {VERSION:d}")
+        if probed is not None:
+            connection.execute(f"PRAGMA user_version = {probed.version:d}")
         connection.execute("COMMIT")
     except BaseException:
         with suppress(sqlite3.Error):
@@ -365,6 +352,7 @@ def _transact(
 
 def open_file(
     paths: Sequence[Path],
+    tables: Tables,
     *,
     again: bool = False,
     previous: Path | None = None,
@@ -374,6 +362,7 @@ def open_file(
 
     Args:
         paths: where it may lie, in order of preference.
+        tables: what it holds.
         again: whether this was tried before, so that what is logged already is logged at debug.
         previous: its path until now. That file, or else the one at the next path, is copied
             to a path that has none yet.
@@ -385,8 +374,10 @@ def open_file(
             path.parent.mkdir(parents=True, exist_ok=True)
             _refuse_links(path)
             if not path.exists():
-                _copy_first_valid((previous,) if previous else (*paths[nth:], *sources), path)
-            connection = _connect_and_check(path)
+                _copy_first_valid(
+                    (previous,) if previous else (*paths[nth:], *sources), path, tables
+                )
+            connection = _connect_and_check(path, tables)
             connection.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
             return OpenDatabase(connection, path, _identities(path))
         except (OSError, sqlite3.Error) as error:
@@ -400,8 +391,8 @@ def open_file(
     return f"no file can be written for it ({reason})"
 
 
-def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
-    """Copies the first of these files that is a catalogue of this version, if any.
+def _copy_first_valid(sources: Sequence[Path], path: Path, tables: Tables) -> None:
+    """Copies the first of these files that is a database of this version, if any.
 
     The copy appears as a whole, by a hard link, and never replaces a file of another program.
     """
@@ -419,7 +410,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
                 closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
                 closing(sqlite3.connect(temporary)) as copy,
             ):
-                if original.execute("PRAGMA user_version").fetchone()[0] != VERSION:
+                if original.execute("PRAGMA user_version").fetchone()[0] != tables.version:
                     continue
                 original.backup(copy)
             with suppress(FileExistsError):
@@ -445,18 +436,19 @@ def _refuse_links(path: Path) -> None:
             raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
 
 
-def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
+def _fault_of(path: Path, tables: Tables, *, thorough: bool) -> sqlite3.Error | None:
     """Returns what is wrong with a file that is open here, as another program sees it.
 
     Args:
         path: the file.
+        tables: what it holds.
         thorough: whether all of it is read; else only where its tables begin.
     """
     # rw and not rwc: a file that was just deleted is not created again.
     address = f"{path.absolute().as_uri()}?mode=rw"
     try:
         with closing(sqlite3.connect(address, uri=True, timeout=_SHORT_MS / 1000)) as connection:
-            connection.execute(_FIRST_ROWS).fetchall()
+            connection.execute(tables.first_rows).fetchall()
             if not thorough:
                 return None
             found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
@@ -465,10 +457,10 @@ def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
     return None if found == "ok" else sqlite3.DatabaseError(found)
 
 
-def _in_memory() -> OpenDatabase:
+def _in_memory(tables: Tables) -> OpenDatabase:
     """Returns an empty database in memory."""
-    connection = _connect(":memory:")
-    connection.executescript(_TABLES)
+    connection = _connect(":memory:", tables)
+    connection.executescript(tables.statements)
     return OpenDatabase(connection, None)
 
 
@@ -512,7 +504,7 @@ def _identities(path: Path) -> tuple[tuple[int, int] | None, ...]:
     return tuple(found)
 
 
-def _connect_and_check(path: Path) -> sqlite3.Connection:
+def _connect_and_check(path: Path, tables: Tables) -> sqlite3.Connection:
     """Connects to a file that can be written and has the tables of this version.
 
     Raises:
@@ -521,9 +513,9 @@ def _connect_and_check(path: Path) -> sqlite3.Connection:
         sqlite3.Error: it is busy, or cannot be opened or written.
     """
     for _ in range(2):
-        connection = _connect(str(path))
+        connection = _connect(str(path), tables)
         try:
-            other = _create_or_compare_tables(connection)
+            other = _create_or_compare_tables(connection, tables)
             if other is None:
                 return connection
             in_use = _is_used_elsewhere(connection)
@@ -541,30 +533,35 @@ def _connect_and_check(path: Path) -> sqlite3.Connection:
     raise sqlite3.OperationalError("another program replaces it again and again")
 
 
-def _connect(target: str) -> sqlite3.Connection:
-    return sqlite3.connect(target, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+def _connect(target: str, tables: Tables) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        target, timeout=BUSY_S, isolation_level=None, check_same_thread=False
+    )
+    for pragma in tables.pragmas:
+        connection.execute(f"PRAGMA {pragma}")
+    return connection
 
 
-def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
+def _create_or_compare_tables(connection: sqlite3.Connection, tables: Tables) -> str | None:
     """Creates the tables of a new database; returns how an old one is of another version."""
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
     connection.execute("BEGIN IMMEDIATE")
     version = connection.execute("PRAGMA user_version").fetchone()[0]
-    tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-    if version == 0 and tables == 0:
-        for statement in _TABLES.split(";"):
+    declared = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    if version == 0 and declared == 0:
+        for statement in tables.statements.split(";"):
             connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {VERSION:d}")
+        connection.execute(f"PRAGMA user_version = {tables.version:d}")
     connection.execute("COMMIT")
-    if tables and version != VERSION:
-        return f"it is of version {version}, and this program needs {VERSION}"
+    if declared and version != tables.version:
+        return f"it is of version {version}, and this program needs {tables.version}"
     # SQLite keeps the statement that declared a table; tables of its own are named sqlite_*.
-    declared = "SELECT sql FROM sqlite_master WHERE type = 'table' AND name NOT GLOB 'sqlite_*'"
-    statements = [str(sql) for (sql,) in connection.execute(declared).fetchall()]
-    if tables and _without_spacing(statements) != _without_spacing(_TABLES.split(";")):
+    names = "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL AND name NOT GLOB 'sqlite_*'"
+    statements = [str(sql) for (sql,) in connection.execute(names).fetchall()]
+    if declared and _without_spacing(statements) != _without_spacing(tables.statements.split(";")):
         return "its tables are not those of this version"
-    connection.execute(_FIRST_ROWS).fetchall()
+    connection.execute(tables.first_rows).fetchall()
     return None
 
 

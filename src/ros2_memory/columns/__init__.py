@@ -1,0 +1,1 @@
+"""The store of columns: closed bags decoded once, and scanned by questions. Derived, disposable."""
