@@ -23,6 +23,7 @@ from rosbags.typesys.store import Typestore
 
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.storage.base import SEQUENCE, Definition, Field
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
@@ -72,12 +73,14 @@ class MessageType(NamedTuple):
         fieldless: whether the definition has no field, so that any payload of more than a byte
             contradicts it.
         deserialize: decodes a payload.
+        fields: the definitions again, from the root down, for readers that do not know rosbags.
     """
 
     name: str
     definitions: Typesdict
     fieldless: bool
     deserialize: Callable[[bytes], object]
+    fields: Definition
 
 
 class _UnusableError(Exception):
@@ -139,7 +142,8 @@ class Typestores:
         def deserialize(payload: bytes) -> object:
             return store.deserialize_cdr(payload, root)
 
-        return MessageType(root, definitions, not definitions[root][1], deserialize)
+        fields = definition_of(definitions, root)
+        return MessageType(root, definitions, not definitions[root][1], deserialize, fields)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""
@@ -323,6 +327,33 @@ def _plain_idl(text: str) -> str:
             "its IDL contains a shift or a sequence of sequences, which is not supported"
         )
     return plain
+
+
+def definition_of(definitions: Typesdict, root: str) -> Definition:
+    """Returns a type and its nested types as the port of bag readers describes them.
+
+    Args:
+        definitions: those of the type and of its nested types; none contains itself.
+        root: the name of the type.
+    """
+    known: dict[str, Definition] = {}
+
+    def described(name: str, field: FieldDesc) -> Field:
+        if field[0] == Nodetype.BASE:
+            return Field(name, str(field[1][0]))
+        if field[0] == Nodetype.NAME:
+            return Field(name, of(str(field[1])))
+        element, length = field[1]
+        stated = length if field[0] == Nodetype.ARRAY else SEQUENCE
+        return Field(name, described(name, element).kind, stated)
+
+    def of(name: str) -> Definition:
+        if name not in known:
+            fields = definitions[name][1]
+            known[name] = Definition(name, tuple(described(*field) for field in fields))
+        return known[name]
+
+    return of(root)
 
 
 def _nested_type(field: FieldDesc) -> str | None:

@@ -15,10 +15,13 @@ import os
 import stat
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from ros2_memory.bag_dir.handover_file import (
     Handover,
@@ -40,7 +43,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.handover_file import Exclusion, FileRule
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import CdrLayout, Channel, Closing, Record
+    from ros2_memory.storage.base import Batch, CdrLayout, Channel, Closing, Definition, Record
 
 _MAX_CACHED_SIDECARS: Final = 4096
 _NO_SIDECAR: Final = HandoverReading(Handover(), None)
@@ -125,6 +128,32 @@ class BagDirReader(BagReader):
         # goes on behind it, and so do `filter` and `chain`.
         return chain.from_iterable(opened())
 
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        """Yields the messages that count in this recording, many at once.
+
+        Raises:
+            BagError: as the adapter, or the path leads out of the bag directory.
+        """
+
+        def opened() -> Iterator[Iterator[Batch]]:
+            found = self._located(path)
+            rule = self._rule(found, topics, window)
+            if rule is None:
+                yield self._reader.batches(found, topics, window, bare=bare)
+            elif not rule.hides_all:
+                # Which messages count is known by their publish times and payloads.
+                batches = self._reader.batches(found, topics, window)
+                yield map(partial(_counted_in, rule), batches)
+
+        return chain.from_iterable(opened())
+
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """Returns the latest message that counts in this recording.
 
@@ -162,6 +191,10 @@ class BagDirReader(BagReader):
     def decode(self, record: Record) -> object:
         """Decodes as the adapter does."""
         return self._reader.decode(record)
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns what the adapter returns."""
+        return self._reader.definition(channel)
 
     def layout(self, record: Record) -> CdrLayout | None:
         """Returns what the adapter returns."""
@@ -268,6 +301,12 @@ class BagDirReader(BagReader):
         if first is None or last is None:
             return None
         return replace(topic, count=topic.count - lost, first=first, last=last)
+
+
+def _counted_in(rule: FileRule, batch: Batch) -> Batch:
+    """Returns the messages of a batch that count."""
+    counts = [rule.counts(batch.record(nth)) for nth in range(batch.sizes.size)]
+    return batch if all(counts) else batch.taken(np.array(counts, np.bool_))
 
 
 def _united(exclusions: Iterable[Exclusion], span: TimeWindow) -> list[TimeWindow]:

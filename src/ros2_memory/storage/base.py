@@ -14,9 +14,12 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
 
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
+from ros2_memory.core.errors import BagError
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
@@ -27,6 +30,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
 
+T = TypeVar("T")
+IntArray: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
+Mask: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
 RELATCHED_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
@@ -115,6 +121,81 @@ class CdrLayout:
     times: tuple[int, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """Undecoded messages of one channel that lie in one buffer.
+
+    Attributes:
+        channel: their channel.
+        log_times: in ns, in any order.
+        publish_times: in ns; equal to the log times where a format keeps one time only.
+        places: the order in the file, which breaks ties of log times; no two messages of a file
+            have the same.
+        buffer: holds the payloads, and often those of other batches and what lies between them.
+        starts: where each payload begins in the buffer.
+        sizes: the bytes of each payload, with the 4 of the encapsulation header of CDR.
+    """
+
+    channel: Channel
+    log_times: IntArray
+    publish_times: IntArray
+    places: IntArray
+    buffer: bytes
+    starts: IntArray
+    sizes: IntArray
+
+    def payload(self, nth: int) -> bytes:
+        """Returns a copy of one payload."""
+        start = int(self.starts[nth])
+        return self.buffer[start : start + int(self.sizes[nth])]
+
+    def record(self, nth: int) -> Record:
+        """Returns one message, as `BagReader.records` would yield it."""
+        log_time, publish_time = int(self.log_times[nth]), int(self.publish_times[nth])
+        return Record(self.channel, log_time, publish_time, self.payload(nth))
+
+    def taken(self, rows: IntArray | Mask) -> Batch:
+        """Returns some of the messages, by their positions or by a mask, in the same buffer."""
+        return replace(
+            self,
+            log_times=self.log_times[rows],
+            publish_times=self.publish_times[rows],
+            places=self.places[rows],
+            starts=self.starts[rows],
+            sizes=self.sizes[rows],
+        )
+
+
+SEQUENCE: Final = -1
+"""The `length` of a field that is a sequence: each message states its own."""
+
+
+class Field(NamedTuple):
+    """A field of a message type.
+
+    Attributes:
+        name: as in the definition.
+        kind: a primitive type of ROS (`float64`, `string`), or that of a nested message.
+        length: None for a single value; of a fixed array its elements; else `SEQUENCE`.
+    """
+
+    name: str
+    kind: str | Definition
+    length: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Definition:
+    """The fields of a message type, with those of nested types, as its payloads have them.
+
+    Nested types that are the same are the same object: spelled out, a definition of some lines can
+    have more fields than there is memory for.
+    """
+
+    type: str
+    fields: tuple[Field, ...]
+
+
 class BagReader(ABC):
     """Reads bag files of the kinds that `reads` accepts."""
 
@@ -179,6 +260,49 @@ class BagReader(ABC):
         """
         return next(self.records(path, [topic], window, newest_first=True), None)
 
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        """Yields the messages of `records(path, topics, window)`, many at once, in any order.
+
+        Those of one buffer follow each other, one batch for each channel. No buffer has more than
+        64 MiB or one chunk, and this keeps none of them. Lazy: nothing is opened before the
+        first item is requested.
+
+        Args:
+            path: the file.
+            topics: as for `records`.
+            window: as for `records`.
+            bare: topics whose payloads are not needed. Where that saves reading a chunk, their
+                messages come as if their payloads were empty and published when they were logged;
+                then their times are those of the file's indexes, which nothing was compared with.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: as by `records`: with `lost`, the iterator continues behind it. Where indexes
+                are found to contradict the messages (`BagContradictionError`), the messages that
+                were not yielded yet follow, and none is lost.
+        """
+        del bare
+
+        def found() -> Iterator[Record | BagError]:
+            records = iter(self.records(path, topics, window))
+            while True:
+                try:
+                    yield next(records)
+                except StopIteration:
+                    return
+                except BagError as error:
+                    yield error
+
+        # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+        return map(_unless_error, batched(enumerate(found())))
+
     @abstractmethod
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """Returns the log times of `records(path, [topic], window)`, without the payloads.
@@ -222,10 +346,71 @@ class BagReader(ABC):
             UndecodableError: no definition, a foreign encoding, or bytes that do not fit it.
         """
 
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of a channel's messages; None if it is not CDR or has no definition.
+
+        It is the same object for the same channel while the reader remembers it.
+        """
+        del channel
+        return None
+
     def layout(self, record: Record) -> CdrLayout | None:
         """Returns the offsets of this message's numbers; None if it must be decoded."""
         del record
         return None
+
+
+BATCH_BYTES: Final = 16 << 20
+"""Payloads are joined in one buffer up to this size; a larger payload has one of its own."""
+
+
+def batched(items: Iterable[tuple[int, Record | T]]) -> Iterator[Batch | T]:
+    """Yields messages in batches, with their payloads copied into common buffers.
+
+    Args:
+        items: a place and a message, or a place and an error, which is passed on behind the
+            messages before it.
+    """
+    waiting: list[tuple[int, Record]] = []
+    size = 0
+    for place, item in items:
+        if not isinstance(item, Record):
+            yield from _joined(waiting)
+            waiting, size = [], 0
+            yield item
+            continue
+        if waiting and size + len(item.payload) > BATCH_BYTES:
+            yield from _joined(waiting)
+            waiting, size = [], 0
+        waiting.append((place, item))
+        size += len(item.payload) + MESSAGE_BYTES
+    yield from _joined(waiting)
+
+
+MESSAGE_BYTES: Final = 200
+"""What a waiting message takes besides its payload, about."""
+
+
+def _joined(waiting: list[tuple[int, Record]]) -> Iterator[Batch]:
+    """Yields a batch for each channel."""
+    buffer = b"".join([record.payload for _, record in waiting])
+    sizes = np.array([len(record.payload) for _, record in waiting], np.int64)
+    starts = np.cumsum(sizes) - sizes
+    channels: dict[int, tuple[Channel, list[int]]] = {}
+    for nth, (_, record) in enumerate(waiting):
+        channels.setdefault(id(record.channel), (record.channel, []))[1].append(nth)
+    log_times = np.array([record.log_time for _, record in waiting], np.int64)
+    publish_times = np.array([record.publish_time for _, record in waiting], np.int64)
+    places = np.array([place for place, _ in waiting], np.int64)
+    for channel, rows in channels.values():
+        whole = Batch(channel, log_times, publish_times, places, buffer, starts, sizes)
+        yield whole.taken(np.array(rows, np.int64))
+
+
+def _unless_error(item: T | BagError) -> T:
+    if isinstance(item, BagError):
+        raise item
+    return item
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import CdrLayout, Channel, Record
+    from ros2_memory.storage.base import CdrLayout, Channel, Definition, Record
     from ros2_memory.typestore import MessageType
 
 _MAX_KNOWN = 10_000
@@ -41,6 +41,7 @@ class Decoding:
         # By identity, since hashing a channel hashes its definition; the channel is kept, so that
         # its identity is not given to another.
         self._known: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
+        self._definitions: dict[int, tuple[Channel, Definition | None]] = {}
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded, or None."""
@@ -74,6 +75,21 @@ class Decoding:
         if isinstance(found, str):
             return None
         return layout_of(found.definitions, found.name, record.payload)
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of a channel's messages; None if they are not CDR of a known type."""
+        known = self._definitions.get(id(channel))
+        if known is not None:
+            return known[1]
+        schema = channel.schema
+        found: Definition | None = None
+        if channel.encoding == "cdr":
+            kind = self._typestores.lookup(schema.name, schema.encoding, schema.text)
+            found = None if isinstance(kind, str) else kind.fields
+        if len(self._definitions) >= _MAX_KNOWN:
+            self._definitions.clear()
+        self._definitions[id(channel)] = (channel, found)
+        return found
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
         known = self._known.get(id(channel))

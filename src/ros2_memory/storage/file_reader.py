@@ -6,9 +6,10 @@ from abc import abstractmethod
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.base import BagReader, batched
 from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.errors import raise_if_lost, reading
+from ros2_memory.storage.mcap.bag_file import McapBags
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -18,9 +19,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import CdrLayout, Channel, Record
+    from ros2_memory.storage.base import Batch, CdrLayout, Channel, Definition, Record
     from ros2_memory.storage.errors import LostError
-    from ros2_memory.storage.mcap.bag_file import McapBags
     from ros2_memory.storage.sqlite_bag import SqliteBags
 
 
@@ -81,6 +81,27 @@ class FileReader(BagReader):
         # Mapped outside of the generator: one that has raised could not go on behind lost messages.
         return map(partial(raise_if_lost, path), found())
 
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        """Yields the messages of `topics` inside the window, many at once."""
+
+        def found() -> Iterator[Batch | LostError]:
+            with reading(path), self._open(path) as opened:
+                bags, here = opened.bags, opened.path
+                if isinstance(bags, McapBags):
+                    yield from bags.batches(here, topics, window, bare)
+                else:
+                    records = bags.records(here, topics, window, newest_first=False)
+                    yield from batched(enumerate(records))
+
+        return map(partial(raise_if_lost, path), found())
+
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """Returns the latest message of the topic inside the window."""
         with reading(path), self._open(path) as opened:
@@ -108,6 +129,10 @@ class FileReader(BagReader):
     def decode(self, record: Record) -> object:
         """Decodes the message of a record."""
         return self._decoding.decode(record)
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of the channel's messages, or None."""
+        return self._decoding.definition(channel)
 
     def layout(self, record: Record) -> CdrLayout | None:
         """Returns where the numbers of a record lie, or None."""

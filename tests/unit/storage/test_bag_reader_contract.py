@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -25,9 +27,9 @@ from tests.support.examples import examples
 from tests.support.reader_cases import ALL, FILES, Shelf
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.base import BagReader, Batch
 
 on_every_shelf = pytest.mark.parametrize("shelf", ALL, ids=str)
 on_every_file = pytest.mark.parametrize("shelf", FILES, ids=str)
@@ -72,6 +74,17 @@ def read(
     return [seen(r) for r in reader.records(path, topics, span, newest_first=newest_first)]
 
 
+def batched(batches: Iterable[Batch]) -> list[Record]:
+    """The messages of batches, by log time, ties by place."""
+    found = [
+        (int(batch.log_times[nth]), int(batch.places[nth]), batch.record(nth))
+        for batch in batches
+        for nth in range(batch.sizes.size)
+    ]
+    assert len({place for _, place, _ in found}) == len(found)
+    return [record for _, _, record in sorted(found, key=itemgetter(0, 1))]
+
+
 TOPICS = ("/a", "/b", "/c")
 # Few distinct times, so that ties are common; drawn out of order.
 _times = st.one_of(st.integers(0, 12), st.integers(10**18, 10**18 + 3))
@@ -108,6 +121,37 @@ def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
                 newest = reader.newest(path, topic, span)
                 last = expected(messages, [topic], span)[-1:]
                 assert [seen(newest)] == last if newest is not None else not last
+
+
+@on_every_shelf
+@settings(max_examples=examples(30))
+@given(messages=_messages(), topics=_some_topics, window=_windows, bare=_some_topics)
+def test_batches_hold_the_messages_of_the_records_and_their_order(
+    shelf: Shelf, messages: list[Msg], topics: set[str], window: TimeWindow, bare: set[str]
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        reader, path = _stocked(shelf, folder, messages)
+        for span in (window, TimeWindow.everything()):
+            whole = batched(reader.batches(path, topics, span))
+            assert whole == list(reader.records(path, topics, span))
+            without = batched(reader.batches(path, topics, span, bare=bare))
+            assert [record[:2] for record in without] == [record[:2] for record in whole]
+            kept = [record for record in whole if record.channel.topic not in bare]
+            assert [each for each in without if each.channel.topic not in bare] == kept
+
+
+@on_every_shelf
+def test_batches_of_one_buffer_follow_each_other_and_lie_inside_of_it(
+    shelf: Shelf, tmp_path: Path
+) -> None:
+    messages = [text(time, f"{time:0100d}", TOPICS[time % 3]) for time in range(60)]
+    reader, path = _stocked(shelf, str(tmp_path), messages)
+    batches = list(reader.batches(path, TOPICS, TimeWindow.everything()))
+    for batch in batches:
+        assert batch.starts.min() >= 0
+        assert (batch.starts + batch.sizes).max() <= len(batch.buffer)
+    buffers = [id(batch.buffer) for batch in batches]
+    assert [key for key, _ in groupby(buffers)] == list(dict.fromkeys(buffers))
 
 
 @on_every_shelf
@@ -267,8 +311,10 @@ def test_a_bag_that_is_gone_has_vanished_for_every_question(shelf: Shelf, tmp_pa
     stocked.remove()
     everything = TimeWindow.everything()
     lazy = reader.records(path, ["/chatter"], everything)
+    lazy_batches = reader.batches(path, ["/chatter"], everything)
     questions = (
         lambda: next(lazy),
+        lambda: next(lazy_batches),
         lambda: reader.summarize(path),
         lambda: reader.closing(path),
         lambda: reader.channels(path),
@@ -292,6 +338,7 @@ def test_what_is_no_bag_counts_as_closed_and_its_fault_is_reported(
         lambda: stocked.reader.summarize(stocked.path),
         lambda: stocked.reader.channels(stocked.path),
         lambda: list(stocked.reader.records(stocked.path, ["/chatter"], everything)),
+        lambda: list(stocked.reader.batches(stocked.path, ["/chatter"], everything)),
         lambda: stocked.reader.log_times(stocked.path, "/chatter", everything),
     )
     for question in questions:

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_left
+from contextlib import suppress
 from functools import lru_cache, partial
 from io import BytesIO
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -23,7 +24,15 @@ from mcap.records import Header
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import Channel, ChannelTotal, Closing, Record, summarize_channels
+from ros2_memory.storage.base import (
+    Batch,
+    Channel,
+    ChannelTotal,
+    Closing,
+    Record,
+    batched,
+    summarize_channels,
+)
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
@@ -34,6 +43,14 @@ from ros2_memory.storage.errors import (
     reason_of,
 )
 from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.mcap.bulk import (
+    ReadChunks,
+    bare_batches,
+    batches_of,
+    batches_of_chunk,
+    loose_place,
+    read_groups,
+)
 from ros2_memory.storage.mcap.chunk import (
     NO_MESSAGES,
     NOT_THERE,
@@ -88,6 +105,14 @@ class _ContradictedError(UnreadableError):
     def __init__(self, reason: str, chunk: Chunk | None = None) -> None:
         super().__init__(reason)
         self.chunk = chunk
+
+
+class _Divided(NamedTuple):
+    """Chunks that are read in groups; one by one, for want of indexes; and by indexes alone."""
+
+    together: list[Chunk]
+    alone: list[Chunk]
+    unread: list[Chunk]
 
 
 class McapBags:
@@ -166,6 +191,146 @@ class McapBags:
                     yield LostError(str(error), *overlooked)
                 runs = self._runs(file, index, topics, left, newest_first=newest_first)
                 yield from merged(runs, newest_first=newest_first)
+
+    def batches(
+        self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str]
+    ) -> Iterator[Batch | LostError]:
+        """Yields the messages of `records`, many at once; see `BagReader.batches`.
+
+        An error is yielded in place of the messages of a damaged chunk.
+        """
+        if window.empty:
+            return
+        with OpenFile(path) as file:
+            index = self._index(file)
+            if index.contradiction:
+                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
+            wanted = _wanted(index, topics)
+            read = {number for number, channel in wanted.items() if channel.topic not in bare}
+            passed: dict[int, Chunk] = {}
+            try:
+                chunks = self._divided(file, index, window, read, wanted)
+                yield from self._batches(file, chunks, wanted, window, passed)
+                yield from self._loose_batches(file, index, wanted, window)
+            except _ContradictedError as error:
+                index = self._distrust(file, error)
+                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
+                wanted = _wanted(index, topics)
+                for chunk in index.chunks:
+                    if _overlaps(chunk, window):
+                        before = passed.get(chunk.offset)
+                        yield from self._batches_of_chunk(file, chunk, wanted, window, before)
+
+    def _divided(
+        self,
+        file: OpenFile,
+        index: McapIndex,
+        window: TimeWindow,
+        read: Collection[int],
+        wanted: Collection[int],
+    ) -> _Divided:
+        """Divides the chunks with wanted messages by how they are read.
+
+        Raises:
+            _ContradictedError: a chunk index names other channels than its chunk has.
+        """
+        divided = _Divided([], [], [])
+        for chunk in index.chunks if wanted else ():
+            if not _overlaps(chunk, window):
+                continue
+            if chunk.index_places is None:
+                divided.alone.append(chunk)
+            elif not chunk.channels.isdisjoint(read) or self._has_any(file, chunk, read):
+                divided.together.append(chunk)
+            elif not chunk.channels.isdisjoint(wanted):
+                divided.unread.append(chunk)
+        return divided
+
+    def _batches(
+        self,
+        file: OpenFile,
+        chunks: _Divided,
+        wanted: dict[int, Channel],
+        window: TimeWindow,
+        passed: dict[int, Chunk],
+    ) -> Iterator[Batch | LostError]:
+        """Yields the messages of chunks, and adds these to `passed`.
+
+        Raises:
+            _ContradictedError: the indexes of a chunk do not agree with its records.
+        """
+        for group in read_groups(file, chunks.together, self._max_chunk_bytes):
+            yield from self._batches_of_group(file, group, wanted, window, passed)
+            del group  # before the next is read
+        for chunk in chunks.alone:
+            yield from self._batches_of_chunk(file, chunk, wanted, window, None)
+        try:
+            yield from bare_batches(file, chunks.unread, wanted, window)
+        except UnreadableError as error:
+            raise _ContradictedError(reason_of(error)) from error
+        passed.update({chunk.offset: chunk for chunk in chunks.unread})
+
+    def _loose_batches(
+        self, file: OpenFile, index: McapIndex, wanted: dict[int, Channel], window: TimeWindow
+    ) -> Iterator[Batch | LostError]:
+        """Yields the messages outside chunks."""
+        loose = [column for channel, column in index.loose.items() if channel in wanted]
+        column = joined([part.between(window.start, window.stop) for part in loose])
+        fetch = _fetch_loose(file, wanted, self._max_chunk_bytes)
+        pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
+        return batched((loose_place(place), fetch(place, time)) for place, time in pairs)
+
+    def _batches_of_group(
+        self,
+        file: OpenFile,
+        group: ReadChunks,
+        wanted: dict[int, Channel],
+        window: TimeWindow,
+        passed: dict[int, Chunk],
+    ) -> Iterator[Batch | LostError]:
+        """Yields the messages of chunks that were read together; if that failed, one by one."""
+        if group.buffer is not None:
+            with suppress(UnreadableError, ValueError, IndexError):
+                batches = batches_of(group, wanted, window, self._max_chunk_bytes)
+                passed.update({chunk.offset: chunk for chunk in group.chunks})
+                yield from batches
+                return
+        for chunk in group.chunks:
+            yield from self._batches_of_chunk(file, chunk, wanted, window, None)
+            passed[chunk.offset] = chunk
+
+    def _batches_of_chunk(
+        self,
+        file: OpenFile,
+        chunk: Chunk,
+        wanted: dict[int, Channel],
+        window: TimeWindow,
+        before: Chunk | None,
+    ) -> Iterator[Batch | LostError]:
+        """Yields the messages of one chunk, but for those that `before` had in its indexes.
+
+        Raises:
+            _ContradictedError: the indexes of the chunk do not agree with its records; then nothing
+                was yielded.
+        """
+        if not self._has_any(file, chunk, wanted):
+            return
+        try:
+            with as_unreadable():
+                data = self._chunk_data(file, chunk)
+        except UnreadableError as error:
+            lost = self._lost(file, chunk, wanted, window, str(error))
+            if lost is not None:
+                yield lost
+            return
+        columns = self._chunk_columns(file, chunk, wanted, data)
+        column = joined([each.between(window.start, window.stop) for each in columns])
+        if before is not None:
+            known = joined(list(chunk_columns(file, before, wanted).values()))
+            new = ~np.isin(column.places, known.places)
+            column = Column(column.times[new], column.places[new])
+        if column.times.size:
+            yield from batches_of_chunk(chunk, data, column, wanted, self._max_chunk_bytes)
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """Returns the latest message of the topic inside the window.

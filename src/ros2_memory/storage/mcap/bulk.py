@@ -1,0 +1,388 @@
+"""Reads the messages of many chunks at once, with numpy, as `BagReader.batches` yields them.
+
+The message indexes of all chunks of a group are read, compared with the records and cut into
+channels by a handful of array operations: chunk by chunk and channel by channel, a bag of 10 s has
+some 200 indexes of a few messages each, and takes three times as long. Whatever does not fit raises
+`UnreadableError`; `McapBags` then reads the same chunks one by one, and finds out which is damaged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.storage.base import BATCH_BYTES, Batch
+from ros2_memory.storage.errors import MAX_CHUNK_MESSAGES, UnreadableError
+from ros2_memory.storage.mcap.chunk import (
+    NOT_THERE,
+    chunk_head,
+    decompressed_chunk,
+)
+from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.storage.base import Channel, IntArray
+    from ros2_memory.storage.file_io import OpenFile
+    from ros2_memory.storage.mcap.chunk import Column
+    from ros2_memory.storage.mcap.summary import Chunk
+
+MAX_GROUP_CHUNKS: Final = 4096
+_OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
+_OUTSIDE: Final = "damaged: a chunk holds messages outside its stated times"
+_TWICE: Final = "damaged: a message index holds a message twice"
+
+_EVERY_BYTE: Final = (1,)
+_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
+_INDEX: Final = np.dtype(
+    [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
+)
+_PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
+_MESSAGE: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<i8"),
+        ("publish_time", "<i8"),
+    ],
+    align=False,
+)
+_MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
+_CHUNK_STEP: Final = 6
+_PLACE_BITS: Final = 29
+_LOOSE: Final = -(1 << 62)
+
+
+def place_of(chunk: Chunk) -> int:
+    """Returns what is added to offsets in a chunk, so that places are in the order of the file.
+
+    Two chunks with messages begin more than 64 bytes apart; a chunk has at most 512 MiB.
+    """
+    return chunk.offset >> _CHUNK_STEP << _PLACE_BITS
+
+
+def loose_place(offset: int) -> int:
+    """Returns the place of a message outside chunks, which comes before all others of its time."""
+    return _LOOSE + offset
+
+
+class ReadChunks(NamedTuple):
+    """Chunks that were read together.
+
+    Attributes:
+        chunks: at least one.
+        buffer: their decompressed records; None if one of them cannot be read.
+        sizes: how many bytes of the buffer each chunk has.
+        indexes: the bytes of the message indexes behind each.
+    """
+
+    chunks: Sequence[Chunk]
+    buffer: bytes | None
+    sizes: Sequence[int] = ()
+    indexes: Sequence[bytes] = ()
+
+
+def read_groups(
+    file: OpenFile, chunks: Sequence[Chunk], max_chunk_bytes: int
+) -> Iterator[ReadChunks]:
+    """Yields chunks, decompressed in groups of up to `BATCH_BYTES`; a larger one comes alone.
+
+    Raises:
+        OSError, MemoryError: the disk or the machine fails.
+    """
+    whole = _at_once(file, chunks)
+    begin = 0
+    while begin < len(chunks):
+        parts: list[bytes] = []
+        indexes: list[bytes] = []
+        left = BATCH_BYTES
+        end = begin
+        buffer: bytes | None = None
+        try:
+            while end < len(chunks) and left > 0 and len(parts) < MAX_GROUP_CHUNKS:
+                chunk = chunks[end]
+                body, index = _bytes_of(file, chunk, whole, chunks[0].offset)
+                if parts and CHUNK_TIMES.unpack_from(body)[2] > left:
+                    break
+                end += 1
+                head = chunk_head(body)
+                compressed = body[head.data_at : head.data_at + head.data_size]
+                parts.append(decompressed_chunk(head, compressed, max_chunk_bytes))
+                indexes.append(index)
+                left -= len(parts[-1])
+            del body
+            buffer = parts[0] if len(parts) == 1 else b"".join(parts)
+        except (OSError, MemoryError):
+            raise
+        except Exception:  # noqa: BLE001, S110 - whoever reads them one by one finds the reason
+            pass
+        sizes = [len(part) for part in parts]
+        parts.clear()
+        yield ReadChunks(chunks[begin : max(end, begin + 1)], buffer, sizes, indexes)
+        del buffer
+        begin = max(end, begin + 1)
+
+
+_AT_ONCE_BYTES: Final = 4 << 20
+
+
+def _at_once(file: OpenFile, chunks: Sequence[Chunk]) -> bytes:
+    """Returns the bytes of all chunks if they are few and follow each other; else nothing."""
+    if len(chunks) < 2:
+        return b""
+    first, last = chunks[0], chunks[-1]
+    span = last.offset + last.length + last.index_length - first.offset
+    if 0 < span <= _AT_ONCE_BYTES:
+        return file.read(first.offset, span)
+    return b""
+
+
+def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[bytes, bytes]:
+    """Returns the body of a chunk's record, and the message indexes behind it."""
+    size = chunk.length + chunk.index_length
+    at = chunk.offset - base
+    if not 0 <= at <= at + size <= len(whole):
+        whole, at = file.read(chunk.offset, size), 0
+    end = at + chunk.length
+    return whole[at + RECORD.size : end], whole[end : at + size]
+
+
+class _Pairs(NamedTuple):
+    """What message indexes hold: for each message its channel, log time, offset and chunk."""
+
+    channels: IntArray
+    times: IntArray
+    offsets: IntArray
+    chunks: IntArray
+
+
+def _pairs(chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: IntArray) -> _Pairs:
+    """Returns the messages of the `wanted` channels (ascending) by the indexes of these chunks.
+
+    Raises:
+        UnreadableError: the indexes are not those that the chunk indexes name.
+    """
+    region = b"".join(indexes)
+    stated = np.frombuffer(b"".join([chunk.index_places or b"" for chunk in chunks]), _OFFSET)
+    if not stated.size:
+        raise UnreadableError(_OTHER_INDEX)
+    number = np.repeat(
+        np.arange(len(chunks)), [len(chunk.index_places or b"") // 10 for chunk in chunks]
+    )
+    ends = np.cumsum([len(index) for index in indexes])
+    begins = ends - [len(index) for index in indexes]
+    behind = np.array([chunk.offset + chunk.length for chunk in chunks])
+    at = stated["at"] - (behind - begins)[number]
+    if at.min() < 0 or at.max() + _INDEX.itemsize > len(region):
+        raise UnreadableError(_OTHER_INDEX)
+    heads = np.ndarray(len(region) - _INDEX.itemsize + 1, _INDEX, region, 0, _EVERY_BYTE)[at]
+    sizes = heads["size"].astype(np.int64)
+    after = at + _INDEX.itemsize + sizes
+    order = np.argsort(at)
+    if (
+        (heads["opcode"] != Opcode.MESSAGE_INDEX).any()
+        or (heads["channel"] != stated["channel"]).any()
+        or (heads["length"] != sizes + 6).any()
+        or (sizes % _PAIR.itemsize).any()
+        or sizes.max() > MAX_CHUNK_MESSAGES * _PAIR.itemsize
+        or (at < begins[number]).any()
+        or (after > ends[number]).any()
+        # Together they fill what lies behind the chunks: there is no other index.
+        or at[order[0]] != 0
+        or after[order[-1]] != len(region)
+        or (at[order[1:]] != after[order[:-1]]).any()
+    ):
+        raise UnreadableError(_OTHER_INDEX)
+    channels = heads["channel"].astype(np.int64)
+    kept = np.isin(channels, wanted, kind="sort") & (sizes > 0)
+    counts = sizes[kept] // _PAIR.itemsize
+    total = int(counts.sum())
+    before = np.cumsum(counts) - counts
+    pairs_at = np.repeat(at[kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
+    pairs_at += np.arange(total) * _PAIR.itemsize
+    pairs = np.ndarray(len(region) - _PAIR.itemsize + 1, _PAIR, region, 0, _EVERY_BYTE)[pairs_at]
+    times = np.ascontiguousarray(pairs["time"])
+    chunk_of = np.repeat(number[kept], counts)
+    starts = np.array([chunk.start for chunk in chunks])[chunk_of]
+    stops = np.array([chunk.end for chunk in chunks])[chunk_of]
+    if total and ((times < starts) | (times > stops) | (times < 0) | (times >= MAX_NS)).any():
+        raise UnreadableError(_OUTSIDE)
+    return _Pairs(
+        np.repeat(channels[kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
+    )
+
+
+def batches_of(
+    content: ReadChunks, channels: Mapping[int, Channel], window: TimeWindow, max_bytes: int
+) -> Sequence[Batch]:
+    """Returns the messages of some channels in decompressed chunks, compared with the records.
+
+    Args:
+        content: the chunks.
+        channels: the wanted channels by their number.
+        window: of log time.
+        max_bytes: the size up to which compressed messages are read.
+
+    Raises:
+        UnreadableError: the indexes do not agree with the records, or messages end past their
+            chunk.
+    """
+    buffer = content.buffer or b""
+    pairs = _pairs(content.chunks, content.indexes, np.array(sorted(channels), np.int64))
+    if not pairs.times.size:
+        return ()
+    sizes = np.array(content.sizes)
+    ends = np.cumsum(sizes)
+    begins = ends - sizes
+    begin, end = begins[pairs.chunks], ends[pairs.chunks]
+    at = pairs.offsets + begin
+    if (
+        pairs.offsets.min() < 0
+        or int((at - end).max()) > -MESSAGE.size
+        or len(buffer) < MESSAGE.size
+    ):
+        raise UnreadableError(NOT_THERE)
+    views = np.ndarray(len(buffer) - MESSAGE.size + 1, _MESSAGE, buffer, 0, _EVERY_BYTE)
+    heads = views[at]
+    stops = at + RECORD.size + heads["length"]
+    if (
+        (heads["opcode"] != Opcode.MESSAGE).any()
+        or (heads["channel"] != pairs.channels).any()
+        or (heads["log_time"] != pairs.times).any()
+        or (stops > end).any()
+        or (stops < at + MESSAGE.size).any()
+    ):
+        raise UnreadableError(NOT_THERE)
+    in_file = np.sort(at)
+    if (in_file[1:] == in_file[:-1]).any():
+        raise UnreadableError(_TWICE)
+    order = _in_window(pairs, window)
+    at, of = at[order], pairs.channels[order]
+    steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]
+    published = _published(heads["publish_time"][order], pairs.times[order])
+    times, places = pairs.times[order], pairs.offsets[order] + steps
+    starts = at + MESSAGE.size
+    lengths = stops[order] - starts
+    bounds = np.flatnonzero(of[1:] != of[:-1]) + 1
+    edges = [0, *bounds.tolist(), of.size] if of.size else []
+    found = []
+    for first, last in pairwise(edges):
+        rows = slice(first, last)
+        batch = Batch(
+            channels[int(of[first])],
+            times[rows],
+            published[rows],
+            places[rows],
+            buffer,
+            starts[rows],
+            lengths[rows],
+        )
+        found += list(_decompressed(batch, max_bytes))
+    return found
+
+
+def _in_window(pairs: _Pairs, window: TimeWindow) -> IntArray:
+    """Returns the positions of the messages inside a window, channel by channel."""
+    order: IntArray = np.argsort(pairs.channels, kind="stable")
+    inside = (pairs.times >= window.start) & (pairs.times < window.stop)
+    return order if inside.all() else order[inside[order]]
+
+
+def _published(stated: IntArray, logged: IntArray) -> IntArray:
+    # An unsigned time past the signed range has become negative.
+    impossible = (stated < 0) | (stated == MAX_NS)
+    return np.where(impossible, logged, stated) if impossible.any() else stated
+
+
+def batches_of_chunk(
+    chunk: Chunk, data: bytes, column: Column, channels: Mapping[int, Channel], max_bytes: int
+) -> Iterator[Batch]:
+    """Yields some messages of one decompressed chunk, whose indexes may be missing.
+
+    Raises:
+        UnreadableError: a message is not there, or ends past the chunk.
+    """
+    times, offsets = column
+    if offsets.min() < 0 or int(offsets.max()) > len(data) - MESSAGE.size:
+        raise UnreadableError(NOT_THERE)
+    heads = np.ndarray(len(data) - MESSAGE.size + 1, _MESSAGE, data, 0, _EVERY_BYTE)[offsets]
+    numbers = heads["channel"]
+    ends = offsets + RECORD.size + heads["length"]
+    if (
+        (heads["opcode"] != Opcode.MESSAGE).any()
+        or (heads["log_time"] != times).any()
+        or (heads["length"] < 0).any()
+        or (ends > len(data)).any()
+        or not set(np.unique(numbers).tolist()) <= channels.keys()
+    ):
+        raise UnreadableError(NOT_THERE)
+    published = _published(np.ascontiguousarray(heads["publish_time"]), times)
+    starts = offsets + MESSAGE.size
+    sizes = np.maximum(ends - starts, 0)
+    places = offsets + place_of(chunk)
+    for number in np.unique(numbers).tolist():
+        channel = channels[number]
+        whole = Batch(channel, times, published, places, data, starts, sizes)
+        yield from _decompressed(whole.taken(numbers == number), max_bytes)
+
+
+def _decompressed(batch: Batch, max_bytes: int) -> Iterator[Batch]:
+    """Yields a batch; or several where rosbag2 compressed each message."""
+    long = batch.sizes >= len(FRAME_MAGIC)
+    if batch.channel.encoding != "cdr" or not long.any():
+        yield batch
+        return
+    views = np.ndarray(len(batch.buffer) - 3, "<u4", batch.buffer, 0, _EVERY_BYTE)
+    compressed = np.zeros(long.size, np.bool_)
+    compressed[long] = views[batch.starts[long]] == _MAGIC
+    if not compressed.any():
+        yield batch
+        return
+    begin, size = 0, 0
+    payloads: list[bytes] = []
+    for nth in range(long.size):
+        payload = batch.payload(nth)
+        if compressed[nth]:
+            payload = uncompressed_payload(batch.channel, payload, max_bytes)
+        payloads.append(payload)
+        size += len(payload)
+        if size >= BATCH_BYTES or nth == long.size - 1:
+            yield _with_payloads(batch.taken(np.arange(begin, nth + 1)), payloads)
+            begin, size, payloads = nth + 1, 0, []
+
+
+def _with_payloads(batch: Batch, payloads: Sequence[bytes]) -> Batch:
+    sizes = np.array([len(payload) for payload in payloads], np.int64)
+    return replace(batch, buffer=b"".join(payloads), starts=np.cumsum(sizes) - sizes, sizes=sizes)
+
+
+def bare_batches(
+    file: OpenFile, chunks: Sequence[Chunk], channels: Mapping[int, Channel], window: TimeWindow
+) -> Iterator[Batch]:
+    """Yields messages of chunks that are not read, by their message indexes alone.
+
+    Raises:
+        UnreadableError: the indexes are not those that the chunk indexes name.
+    """
+    for begin in range(0, len(chunks), MAX_GROUP_CHUNKS):
+        group = chunks[begin : begin + MAX_GROUP_CHUNKS]
+        indexes = [file.read(chunk.offset + chunk.length, chunk.index_length) for chunk in group]
+        pairs = _pairs(group, indexes, np.array(sorted(channels), np.int64))
+        order = _in_window(pairs, window)
+        steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
+        of, times, places = pairs.channels[order], pairs.times[order], pairs.offsets[order] + steps
+        for number in np.unique(of).tolist():
+            rows = of == number
+            none = np.zeros(int(rows.sum()), np.int64)
+            logged = times[rows]
+            yield Batch(channels[number], logged, logged, places[rows], b"", none, none)
