@@ -1,0 +1,1 @@
+"""Whole bags as columns: what every message of a topic says, in arrays."""

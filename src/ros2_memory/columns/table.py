@@ -1,0 +1,292 @@
+"""The messages of a topic as columns.
+
+What a type's columns are follows from its definition alone, so that tables of any bags of one
+topic, type and definition can be joined:
+
+- a number or a boolean: a column of its own type. A string: `Texts`. A time or duration
+  (builtin_interfaces): one int64 column of ns;
+- a nested message: the columns of its fields, by dot-path (`pose.pose.position.x`);
+- a fixed array of at most `MAX_NUMBERS` numbers: a column for each (`bbox.0` .. `bbox.3`);
+- a longer fixed array: `<path>.length` and, up to `MAX_RANGED_BYTES`, `<path>.least` and
+  `<path>.greatest`;
+- a sequence of numbers: `<path>.length`, `<path>.least`, `<path>.greatest`, and `Elements` with the
+  column "" that hold the numbers of those rows that have at most `MAX_NUMBERS`; of rows that have
+  more there are no elements (`left_out` then names the path);
+- a sequence or an array of messages: `Elements` with the columns of the message; of strings, times
+  and durations: `Elements` with the column "".
+
+`length` is uint32. `least` and `greatest` are float64, over finite values: NaN where there is none,
+and where a sequence takes more than `MAX_RANGED_BYTES`.
+"""
+
+from __future__ import annotations
+
+from collections import ChainMap
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ros2_memory.storage.base import Channel, IntArray
+
+Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.generic[object]]]"
+
+MAX_NUMBERS: Final = 9
+"""Longer arrays of numbers (covariances of poses, scans, images) are no columns."""
+MAX_RANGED_BYTES: Final = 4096
+"""Of longer arrays the least and the greatest number are not looked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """What is known of a column without reading its values.
+
+    Attributes:
+        least: the least value that is not NaN, exact; None of texts and where there is none.
+            Infinities count; False is 0.
+        greatest: the greatest likewise.
+        nulls: how many values are NaN.
+        words: of texts, the casefolded distinct ones, joined by newlines: what is not in it is in
+            no text. None of numbers, and of texts that are too many or too long to be kept here:
+            any may be there.
+    """
+
+    least: float | None = None
+    greatest: float | None = None
+    nulls: int = 0
+    words: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texts:
+    """A column of strings: `words[code]` for each row.
+
+    Attributes:
+        codes: uint32.
+        words: each once, in the order of their first rows.
+    """
+
+    codes: np.ndarray[tuple[int], np.dtype[np.uint32]]
+    words: tuple[str, ...]
+
+    @classmethod
+    def of(cls, values: Sequence[str]) -> Texts:
+        """Returns the column of these strings."""
+        known: dict[str, int] = {}
+        codes = [known.setdefault(value, len(known)) for value in values]
+        return cls(np.array(codes, np.uint32), tuple(known))
+
+    def __len__(self) -> int:
+        """Returns the number of rows."""
+        return self.codes.size
+
+    def values(self) -> list[str]:
+        """Returns the string of each row."""
+        words = self.words
+        return [words[code] for code in self.codes.tolist()]
+
+    def rows(self, positions: IntArray) -> Texts:
+        """Returns some rows, with the words that they have."""
+        codes = self.codes[positions]
+        if len(self.words) <= 1:
+            return Texts(codes, self.words if codes.size else ())
+        used, first, nth = np.unique(codes, return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        new = np.empty(used.size, np.uint32)
+        new[order] = np.arange(used.size, dtype=np.uint32)
+        return Texts(new[nth], tuple(self.words[code] for code in used[order].tolist()))
+
+
+Column: TypeAlias = "Numbers | Texts"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Elements:
+    """The elements of a sequence, of all rows of a table (or of all elements around them).
+
+    Attributes:
+        owners: for each element the row that it belongs to, ascending; the elements of one row are
+            in the order of the message.
+        columns: by the dot-path inside the element; "" where an element is no message.
+        elements: the sequences inside the element.
+    """
+
+    owners: IntArray
+    columns: Mapping[str, Column]
+    elements: Mapping[str, Elements] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Returns the number of elements, of all rows."""
+        return self.owners.size
+
+    def rows(self, positions: IntArray) -> Elements:
+        """Returns the elements of some rows, which become the rows 0, 1, 2 and so on."""
+        first = np.searchsorted(self.owners, positions, "left")
+        counts = np.searchsorted(self.owners, positions, "right") - first
+        before = np.cumsum(counts) - counts
+        own = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
+        return Elements(
+            np.repeat(np.arange(positions.size), counts),
+            {path: _rows(column, own) for path, column in self.columns.items()},
+            {path: inner.rows(own) for path, inner in self.elements.items()},
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """The messages of one topic under one type in a bag, or in a part of it.
+
+    Ordered by log time, ties by place. Messages that cannot be decoded have no row.
+
+    Attributes:
+        channel: the first channel of this topic, type and definition.
+        log_times: ns.
+        publish_times: ns; those of a table without columns may be the log times.
+        places: the order in the file.
+        columns: by the dot-path of the field.
+        elements: by the dot-path of the sequence.
+        left_out: which fields have no column (or not in all rows), by dot-path, and why; "" stands
+            for the whole message, whose times are all there is.
+        payload_hashes: CRC-32 of each payload, where it was asked for.
+        undecodable: messages that have no row, because they cannot be decoded.
+        undecodable_reason: why the first of them cannot be.
+    """
+
+    channel: Channel
+    log_times: IntArray
+    publish_times: IntArray
+    places: IntArray
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    elements: Mapping[str, Elements] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    payload_hashes: IntArray | None = None
+    undecodable: int = 0
+    undecodable_reason: str = ""
+
+    def __len__(self) -> int:
+        """Returns the number of messages."""
+        return self.log_times.size
+
+    def error(self, path: str) -> float:
+        """Returns the greatest absolute error of a column's values: 0.0, they are as decoded.
+
+        Args:
+            path: the column; of elements `<sequence>.<column>`.
+        """
+        del path
+        return 0.0
+
+    def zone(self, path: str) -> Zone | None:
+        """Returns what is known of a column without reading it: None, decoded ones are read."""
+        del path
+        return None
+
+    def rows(self, positions: IntArray) -> Table:
+        """Returns some rows, in the order given."""
+        hashes = self.payload_hashes
+        return replace(
+            self,
+            log_times=self.log_times[positions],
+            publish_times=self.publish_times[positions],
+            places=self.places[positions],
+            columns={path: _rows(column, positions) for path, column in self.columns.items()},
+            elements={path: inner.rows(positions) for path, inner in self.elements.items()},
+            payload_hashes=None if hashes is None else hashes[positions],
+        )
+
+    def sorted(self) -> Table:
+        """Returns the rows by log time, ties by place."""
+        order = order_of(self.log_times, self.places)
+        return self if order is None else self.rows(order)
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 24 * len(self) + _bytes(self.columns, self.elements)
+
+
+def order_of(log_times: IntArray, places: IntArray) -> IntArray | None:
+    """Returns the positions by log time, ties by place; None if that is the order already."""
+    later = log_times[1:] > log_times[:-1]
+    if later.all():
+        return None
+    tied = (log_times[1:] == log_times[:-1]) & (places[1:] > places[:-1])
+    return None if (later | tied).all() else np.lexsort((places, log_times))
+
+
+def joined(tables: Sequence[Table]) -> Table:
+    """Returns the rows of tables of one topic, type and definition as one table.
+
+    Tables without columns can be joined with each other only.
+
+    Args:
+        tables: at least one.
+    """
+    first = tables[0]
+    if len(tables) == 1:
+        return first
+    hashes = [table.payload_hashes for table in tables if table.payload_hashes is not None]
+    reasons = [table.undecodable_reason for table in tables if table.undecodable]
+    return Table(
+        first.channel,
+        np.concatenate([table.log_times for table in tables]),
+        np.concatenate([table.publish_times for table in tables]),
+        np.concatenate([table.places for table in tables]),
+        _joined_columns([table.columns for table in tables]),
+        _joined_elements([table.elements for table in tables], [len(table) for table in tables]),
+        dict(ChainMap(*(dict(table.left_out) for table in tables))),
+        np.concatenate(hashes) if len(hashes) == len(tables) else None,
+        sum(table.undecodable for table in tables),
+        reasons[0] if reasons else "",
+    ).sorted()
+
+
+def _rows(column: Column, positions: IntArray) -> Column:
+    return column.rows(positions) if isinstance(column, Texts) else column[positions]
+
+
+def _joined_columns(parts: Sequence[Mapping[str, Column]]) -> dict[str, Column]:
+    return {path: _joined_column([part[path] for part in parts]) for path in parts[0]}
+
+
+def _joined_column(parts: Sequence[Column]) -> Column:
+    texts = [part for part in parts if isinstance(part, Texts)]
+    if len(texts) < len(parts):
+        return np.concatenate([part for part in parts if not isinstance(part, Texts)])
+    known: dict[str, int] = {}
+    codes = []
+    for part in texts:
+        new = [known.setdefault(word, len(known)) for word in part.words]
+        codes.append(np.array(new, np.uint32)[part.codes])
+    return Texts(np.concatenate(codes), tuple(known))
+
+
+def _joined_elements(
+    parts: Sequence[Mapping[str, Elements]], counts: Sequence[int]
+) -> dict[str, Elements]:
+    """Returns sequences of several parts as one; `counts` are the rows of each part."""
+    before = [sum(counts[:nth]) for nth in range(len(counts))]
+    found: dict[str, Elements] = {}
+    for path in parts[0]:
+        inner = [part[path] for part in parts]
+        found[path] = Elements(
+            np.concatenate([each.owners + rows for each, rows in zip(inner, before, strict=True)]),
+            _joined_columns([each.columns for each in inner]),
+            _joined_elements([each.elements for each in inner], [len(each) for each in inner]),
+        )
+    return found
+
+
+def _bytes(columns: Mapping[str, Column], elements: Mapping[str, Elements]) -> int:
+    size = 0
+    for column in columns.values():
+        if isinstance(column, Texts):
+            size += column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
+        else:
+            size += column.nbytes
+    for inner in elements.values():
+        size += inner.owners.nbytes + _bytes(inner.columns, inner.elements)
+    return size
