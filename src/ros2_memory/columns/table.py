@@ -40,6 +40,26 @@ MAX_RANGED_BYTES: Final = 4096
 """Of longer arrays the least and the greatest number are not looked for."""
 
 
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """What is known of a column without reading its values.
+
+    Attributes:
+        least: the least value that is not NaN, exact; None of texts and where there is none.
+            Infinities count; False is 0.
+        greatest: the greatest likewise.
+        nulls: how many values are NaN.
+        words: of texts, the casefolded distinct ones, joined by newlines: what is not in it is in
+            no text. None of numbers, and of texts that are too many or too long to be kept here:
+            any may be there.
+    """
+
+    least: float | None = None
+    greatest: float | None = None
+    nulls: int = 0
+    words: str | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Texts:
     """A column of strings: `words[code]` for each row.
@@ -149,6 +169,20 @@ class Table:
     def __len__(self) -> int:
         """Returns the number of messages."""
         return self.log_times.size
+
+    def error(self, path: str) -> float:
+        """Returns the greatest absolute error of a column's values: 0.0, they are as decoded.
+
+        Args:
+            path: the column; of elements `<sequence>.<column>`.
+        """
+        del path
+        return 0.0
+
+    def zone(self, path: str) -> Zone | None:
+        """Returns what is known of a column without reading it: None, decoded ones are read."""
+        del path
+        return None
 
     def rows(self, positions: IntArray) -> Table:
         """Returns some rows, in the order given."""

@@ -1,0 +1,130 @@
+"""How exactly a column of floats is stored: by the name and the message type of its field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from ros2_memory.storage.base import Definition
+
+MOST_RELATIVE: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What the values of a column of floats are rounded to. Other columns are always exact.
+
+    Attributes:
+        per_unit: the values become whole multiples of `1 / per_unit`, so that at most half of that
+            is lost; 0 where no step is absolute.
+        relative: each value may change by a millionth (`MOST_RELATIVE`) of itself.
+    """
+
+    per_unit: int = 0
+    relative: bool = False
+
+    def __str__(self) -> str:
+        """Returns how a layout writes it: `1/10000`, `relative`, `exact`."""
+        if self.per_unit:
+            return f"1/{self.per_unit}"
+        return "relative" if self.relative else "exact"
+
+    @classmethod
+    def parse(cls, text: str) -> Step:
+        """Returns the step that was written so.
+
+        Raises:
+            ValueError: no step is written so.
+        """
+        if text == "relative":
+            return RELATIVE
+        if text == "exact":
+            return EXACT
+        if not text.startswith("1/"):
+            raise ValueError(f"no step is written {text!r}")
+        return cls(per_unit=int(text[2:]))
+
+
+EXACT: Final = Step()
+RELATIVE: Final = Step(relative=True)
+METRES: Final = Step(per_unit=10_000)
+"""0.1 mm."""
+RADIANS: Final = Step(per_unit=10_000)
+"""0.1 mrad."""
+QUATERNION: Final = Step(per_unit=20_000)
+"""5e-5. A component then changes by at most 2.5e-5, so a unit quaternion by at most 5e-5, and the
+rotation by twice that (its angle is twice that of the quaternion): 0.1 mrad."""
+DEGREES: Final = Step(per_unit=1_000_000_000)
+"""1e-9 degree: 0.1 mm on the ground."""
+
+_OF_ARRAYS: Final = frozenset({"", "least", "greatest"})
+_POINTS: Final = frozenset({"geometry_msgs/msg/Point", "geometry_msgs/msg/Point32"})
+_POSES_2D: Final = frozenset({"geometry_msgs/msg/Pose2D", "vision_msgs/msg/Point2D"})
+_VECTOR: Final = "geometry_msgs/msg/Vector3"
+_QUATERNION: Final = "geometry_msgs/msg/Quaternion"
+_JOINTS: Final = {
+    "sensor_msgs/msg/JointState": frozenset({"position"}),
+    "trajectory_msgs/msg/JointTrajectoryPoint": frozenset({"positions"}),
+}
+_ROTATIONS: Final = frozenset({"orientation", "rotation", "quaternion"})
+_PLACES: Final = frozenset(
+    {"position", "translation", "point", "points", "location", "origin", "center", "centroid"}
+)
+_GLOBE: Final = frozenset({"latitude", "longitude"})
+_ON_THE_GLOBE: Final = frozenset({"sensor_msgs/msg/NavSatFix", "geographic_msgs/msg/GeoPoint"})
+_ANGLES: Final = frozenset({"roll", "pitch", "yaw", "theta", "heading", "azimuth", "angle"})
+_ENDS_OF_ANGLES: Final = ("_angle", "_yaw", "_heading")
+
+
+def step_of(path: str, definition: Definition | None = None) -> Step:
+    """Returns how exactly a column of floats is stored.
+
+    Args:
+        path: the field, as `pose.pose.position.x`; of elements `<sequence>.<field>`.
+        definition: that of the topic. Without it the field's name and that of the message around it
+            decide.
+
+    Returns:
+        0.1 mm for coordinates of points and for vectors that are named as positions are, 0.1 mrad
+        for angles and joints, what keeps rotations within 0.1 mrad for quaternions, 1e-9 degree for
+        latitude and longitude and 0.1 mm for the altitude beside them; otherwise, and so for
+        velocities, a millionth of the value.
+    """
+    around, _, name = path.rpartition(".")
+    if name.isdigit() or name in _OF_ARRAYS:
+        around, _, name = around.rpartition(".")
+    owner = _type_at(around, definition)
+    if owner in _JOINTS and name in _JOINTS[owner]:
+        return RADIANS
+    if name in "xyz":
+        return _axis(name, owner, around.rpartition(".")[2])
+    if name == "w" and _is_rotation(owner, around.rpartition(".")[2]):
+        return QUATERNION
+    if name in _GLOBE:
+        return DEGREES
+    if owner in _ON_THE_GLOBE and name == "altitude":
+        return METRES
+    return RADIANS if name in _ANGLES or name.endswith(_ENDS_OF_ANGLES) else RELATIVE
+
+
+def _type_at(path: str, definition: Definition | None) -> str:
+    """The type of the message at a path; empty where it is not known."""
+    for name in path.split(".") if path else ():
+        if definition is None:
+            break
+        fields = {field.name: field.kind for field in definition.fields}
+        kind = fields.get(name)
+        definition = kind if isinstance(kind, Definition) else None
+    return definition.type if definition is not None else ""
+
+
+def _axis(name: str, owner: str, field: str) -> Step:
+    if _is_rotation(owner, field):
+        return QUATERNION
+    if owner in _POINTS or (owner in _POSES_2D and name != "z"):
+        return METRES
+    return METRES if owner in {_VECTOR, ""} and field in _PLACES else RELATIVE
+
+
+def _is_rotation(owner: str, field: str) -> bool:
+    return owner == _QUATERNION or (not owner and field in _ROTATIONS)
