@@ -211,12 +211,14 @@ class Entry(NamedTuple):
     table: Table
 
 
-def pack_tables(entries: Iterable[Entry], *, published: bool = True, places: bool = True) -> bytes:
+def pack_tables(entries: Iterable[Entry], *, places: bool = True) -> bytes:
     """Returns the tables as one compressed blob.
+
+    Publish times are packed where there are hashes: they tell copies of a message. Elsewhere they
+    come back as log times.
 
     Args:
         entries: the tables, in any order.
-        published: whether publish times are packed; without them they come back as log times.
         places: whether places are packed; without them they come back as 0, 1, 2.
 
     Raises:
@@ -226,6 +228,7 @@ def pack_tables(entries: Iterable[Entry], *, published: bool = True, places: boo
     packs: list[Packed] = []
     for topic, layout, table in entries:
         hashes = table.payload_hashes
+        published = hashes is not None
         flags = _PUBLISHED * published | _PLACES * places | _HASHES * (hashes is not None)
         counts: list[int] = []
         before = len(packs)
@@ -434,6 +437,7 @@ class Lazily(Mapping[str, V]):
 class StoredTable(Table):
     """A table of a blob. Its columns are unpacked when they are first asked for, by any thread."""
 
+    number: int = 0
     known: Callable[[str], Packed] | None = None
 
     def error(self, path: str) -> float:
@@ -491,23 +495,32 @@ def _table(
         publish_times=publish_times,
         places=places,
         columns=Lazily(layout.columns, column),
-        elements=_lazy_elements(layout, "", column),
+        elements=lazy_elements(layout, "", column),
         left_out=layout.left_out,
         payload_hashes=hashes,
+        number=head.topic,
         known=known,
     )
 
 
-def _lazy_elements(
+def lazy_elements(
     layout: Layout, around: str, column: Callable[[str], Column]
 ) -> Mapping[str, Elements]:
+    """Returns the sequences of a layout, of which columns are unpacked by their path.
+
+    Args:
+        layout: of a table, or of a sequence in it.
+        around: the path of that sequence and a dot; empty for a table.
+        column: unpacks a column by its path in the table; owners by their sequence's and `#`.
+    """
+
     def elements(path: str) -> Elements:
         whole = f"{around}{path}"
         inner = layout.sequences[path]
         return Elements(
             cast("IntArray", column(f"{whole}#")),
             Lazily(inner.columns, lambda name: column(f"{whole}.{name}")),
-            _lazy_elements(inner, f"{whole}.", column),
+            lazy_elements(inner, f"{whole}.", column),
         )
 
     return Lazily(layout.sequences, elements)

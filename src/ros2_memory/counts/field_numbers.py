@@ -19,12 +19,12 @@ from ros2_memory.analysis.bulk_decode import BulkDecoder
 from ros2_memory.analysis.field_ranges import FieldRangesBuilder
 from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column
+from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.counts.segment_fold import Digested, SegmentFold
 from ros2_memory.history.bag_groups import DigestKind, store_shared
-from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.insights.field_extremes import numbers_in
 
 if TYPE_CHECKING:

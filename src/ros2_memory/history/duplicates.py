@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.spans import lies_inside, united
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.columns.copies import COPY_HORIZON_NS, overlap_spans
+from ros2_memory.core.spans import lies_inside
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile
     from ros2_memory.storage.base import Record
 
-COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 _LONGEST_ROW_NS: Final[Ns] = 3 * COPY_HORIZON_NS
 """Bounds memory for a topic whose messages are all alike, their publish times too."""
 
@@ -68,21 +68,6 @@ def bag_overlaps(bags: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
     merged.
     """
     return overlap_spans((each.first, each.last, each.bag.recording) for each in bags)
-
-
-def overlap_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
-    """Returns the same for first and last log times (inclusive) and recordings."""
-    spans: list[tuple[Ns, Ns]] = []
-    open_ones: list[tuple[Ns, Path]] = []
-    for first, last, recording in sorted(held, key=lambda each: each[0]):
-        open_ones = [each for each in open_ones if each[0] + COPY_HORIZON_NS >= first]
-        spans.extend(
-            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
-            for other, folder in open_ones
-            if folder != recording
-        )
-        open_ones.append((last, recording))
-    return united(spans)
 
 
 def deduplicate_forward(

@@ -14,11 +14,11 @@ from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
+from ros2_memory.columns.copies import COPY_HORIZON_NS, overlap_spans
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import Spans, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
-    COPY_HORIZON_NS,
     BagSpan,
     Copy,
     StoredMessage,
@@ -26,7 +26,6 @@ from ros2_memory.history.duplicates import (
     copy_key,
     deduplicate_backward,
     deduplicate_forward,
-    overlap_spans,
 )
 
 if TYPE_CHECKING:

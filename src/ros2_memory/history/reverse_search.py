@@ -24,6 +24,7 @@ from ros2_memory.analysis.conditions import (
 )
 from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
+from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import (
     BagError,
     InvalidArgumentsError,
@@ -35,7 +36,6 @@ from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.history.transforms import connects
 from ros2_memory.messages.detections import detections_of

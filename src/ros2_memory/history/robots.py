@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
+from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
-from ros2_memory.history.duplicates import COPY_HORIZON_NS, copy_key
+from ros2_memory.history.duplicates import copy_key
 from ros2_memory.history.merged_stream import bag_span_of
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import View

@@ -147,6 +147,15 @@ class Segment:
         return frozenset(map(_folder_of, self.bags))
 
     @cached_property
+    def folder_spans(self) -> dict[str, Span]:
+        """By folder, the log times of the first and last message (inclusive) of its bags."""
+        spans: dict[str, Span] = {}
+        for bag in self.bags:
+            folder = _folder_of(bag)
+            spans[folder] = wider(spans.get(folder), (bag.start, bag.end))
+        return spans
+
+    @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
         counts = np.zeros(len(self.bags), np.int64)

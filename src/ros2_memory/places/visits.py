@@ -18,6 +18,7 @@ from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.dwell import FLICKER_NS, Approach, DwellBuilder, Unread
 from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -37,7 +38,6 @@ from ros2_memory.history.driven_path import (
     positions_of,
     resolve_path_topic,
 )
-from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.robots import note_robots

@@ -1,0 +1,152 @@
+"""Copies: messages that a message of another recording repeats, of which one counts.
+
+Recordings overlap for some seconds while one takes over from the other. A message that is in both
+has the same publish time and payload in each, and log times that differ by little
+(`COPY_HORIZON_NS` at most); it counts once, at its earliest log time. Where one recording has it n
+times and another m times, it counts max(n, m) times. Inside one recording nothing is a copy,
+however alike two messages are.
+
+A latched message is received again by each new recording: it counts at its earliest log time,
+however long ago that is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.core.spans import united
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.storage.base import RELATCHED_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.storage.base import IntArray
+
+COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identities:
+    """What tells messages apart, of messages of one topic.
+
+    Attributes:
+        log_times: ns.
+        publish_times: ns.
+        hashes: of the payloads.
+        recordings: a number for the recording of each.
+    """
+
+    log_times: IntArray
+    publish_times: IntArray
+    hashes: IntArray
+    recordings: IntArray
+
+    def rows(self, positions: IntArray) -> Identities:
+        """Returns some of them."""
+        return Identities(
+            self.log_times[positions],
+            self.publish_times[positions],
+            self.hashes[positions],
+            self.recordings[positions],
+        )
+
+
+def joined_identities(parts: Sequence[Identities]) -> Identities:
+    """Returns all messages of several parts, in this order."""
+    return Identities(
+        np.concatenate([part.log_times for part in parts]),
+        np.concatenate([part.publish_times for part in parts]),
+        np.concatenate([part.hashes for part in parts]),
+        np.concatenate([part.recordings for part in parts]),
+    )
+
+
+def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
+    """Returns the half-open spans in which different recordings can hold copies.
+
+    That is the time that both hold, widened by the horizon at both ends; spans that touch are
+    merged.
+
+    Args:
+        held: first and last log times (inclusive) of files or recordings, and their recording.
+    """
+    spans: list[tuple[Ns, Ns]] = []
+    open_ones: list[tuple[Ns, object]] = []
+    for first, last, recording in sorted(held, key=lambda span: span[0]):
+        open_ones = [one for one in open_ones if one[0] + COPY_HORIZON_NS >= first]
+        spans.extend(
+            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
+            for other, folder in open_ones
+            if folder != recording
+        )
+        open_ones.append((last, recording))
+    return united(spans)
+
+
+def copies_among(messages: Identities) -> NDArray[np.bool_]:
+    """Returns which of the messages repeat an earlier one of another recording."""
+    copies = np.zeros(messages.log_times.size, np.bool_)
+    suspects = _shared_by_recordings(messages)
+    order = suspects[np.argsort(messages.log_times[suspects], kind="stable")]
+    counts: dict[tuple[int, int], dict[int, int]] = {}
+    recent: deque[tuple[Ns, tuple[int, int]]] = deque()
+    some = messages.rows(order)
+    rows = zip(
+        order.tolist(),
+        some.log_times.tolist(),
+        some.publish_times.tolist(),
+        some.hashes.tolist(),
+        some.recordings.tolist(),
+        strict=True,
+    )
+    for row, time, published, payload, recording in rows:
+        while recent and recent[0][0] < time - COPY_HORIZON_NS:
+            counts.pop(recent.popleft()[1], None)
+        key = (published, payload)
+        by_recording = counts.setdefault(key, {})
+        most = max(by_recording.values(), default=0)
+        by_recording[recording] = by_recording.get(recording, 0) + 1
+        if by_recording[recording] > most:
+            recent.append((time, key))
+        else:
+            copies[row] = True
+    return copies
+
+
+def relatched_among(messages: Identities) -> NDArray[np.bool_]:
+    """Returns which messages were received again: late, and before by another recording."""
+    order = np.lexsort(
+        (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)
+    )
+    some = messages.rows(order)
+    is_first = np.ones(order.size, np.bool_)
+    is_first[1:] = (np.diff(some.publish_times) != 0) | (np.diff(some.hashes) != 0)
+    first = np.maximum.accumulate(np.where(is_first, np.arange(order.size), 0))
+    late = some.log_times - some.publish_times > RELATCHED_NS
+    again = (
+        late
+        & (some.log_times > some.log_times[first])
+        & (some.recordings != some.recordings[first])
+    )
+    found = np.zeros(order.size, np.bool_)
+    found[order] = again
+    return found
+
+
+def _shared_by_recordings(messages: Identities) -> IntArray:
+    """Returns the rows whose publish time and payload several recordings have."""
+    order = np.lexsort((messages.recordings, messages.hashes, messages.publish_times))
+    some = messages.rows(order)
+    same = (np.diff(some.publish_times) == 0) & (np.diff(some.hashes) == 0)
+    group = np.concatenate(([0], np.cumsum(~same))) if order.size else order
+    other = same & (np.diff(some.recordings) != 0)
+    shared = np.zeros(int(group[-1]) + 1 if order.size else 0, np.bool_)
+    shared[group[1:][other]] = True
+    return order[shared[group]] if order.size else order

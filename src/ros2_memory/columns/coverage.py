@@ -1,0 +1,181 @@
+"""Which bags of a timeline are stored, and under which numbers.
+
+A week is 60,000 bags, and another one closes every ten seconds: what is known of a segment of the
+timeline serves every later timeline that still has it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+from threading import Lock
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.columns.copies import overlap_spans
+from ros2_memory.columns.store import BagKey, relative
+from ros2_memory.core.model import BagState, TimeWindow
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.store import ColumnStore, State, StoredBag
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.index.segment import Segment
+    from ros2_memory.index.timeline import Timeline
+    from ros2_memory.storage.base import IntArray
+
+_FEW: Final = 8
+"""Segments that are looked up one by one; for more of them all stored bags are read at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoveredSegment:
+    """The bags of a segment, each with its number in the store.
+
+    Attributes:
+        segment: of the timeline.
+        numbers: of its bags; -1 of those that are not stored.
+        hashed: of which bags copies can be recognised.
+        missing: the bags that are not stored.
+    """
+
+    segment: Segment
+    numbers: IntArray
+    hashed: NDArray[np.bool_]
+    missing: tuple[BagFile, ...]
+
+
+class Coverage:
+    """The bags of one timeline, by their numbers in the store. Immutable.
+
+    Attributes:
+        state: of the store.
+        missing: the bags that are not stored, in order of time.
+    """
+
+    def __init__(self, state: State, segments: Sequence[CoveredSegment]) -> None:
+        self.state = state
+        self.segments = tuple(segments)
+        self.missing = tuple(chain.from_iterable(each.missing for each in segments))
+        numbers = [each.numbers for each in segments]
+        begins = np.cumsum([0, *map(len, numbers)])
+        everything = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
+        order = np.argsort(everything, kind="stable")
+        self._begins: IntArray = begins
+        self._order: IntArray = order[np.searchsorted(everything[order], 0) :]
+        self._numbers: IntArray = everything[self._order]
+        hashed = [each.hashed for each in segments]
+        self._hashed = (np.concatenate(hashed) if hashed else np.empty(0, np.bool_))[self._order]
+
+    def positions(self, numbers: IntArray) -> IntArray:
+        """Returns where these bags are among those that are stored; -1 of others."""
+        if not self._numbers.size:
+            return np.full(numbers.shape, -1)
+        at = np.minimum(np.searchsorted(self._numbers, numbers), self._numbers.size - 1)
+        return np.where(self._numbers[at] == numbers, at, -1)
+
+    def bag(self, number: int) -> BagFile | None:
+        """Returns the bag of a number; None where it is none of the timeline."""
+        [at] = self.positions(np.array([number])).tolist()
+        if at < 0:
+            return None
+        nth = int(self._order[at])
+        segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
+        return self.segments[segment].segment.bags[nth - int(self._begins[segment])]
+
+    def unhashed(self) -> list[BagFile]:
+        """Returns the stored bags of which copies cannot be recognised."""
+        return [
+            each.segment.bags[nth]
+            for each in self.segments
+            for nth in np.flatnonzero((each.numbers >= 0) & ~each.hashed).tolist()
+        ]
+
+
+class Covering:
+    """Finds out which bags are stored. Thread-safe.
+
+    Args:
+        store: the store.
+        bag_dir: the bag directory.
+    """
+
+    def __init__(self, store: ColumnStore, bag_dir: Path) -> None:
+        self.store = store
+        self._bag_dir = bag_dir
+        self._lock = Lock()
+        self._known: dict[int, CoveredSegment] = {}
+        self._of: tuple[Timeline, Coverage] | None = None
+
+    def of(self, timeline: Timeline) -> Coverage:
+        """Returns the coverage of a timeline, as the store is now."""
+        state = self.store.state()
+        with self._lock:
+            if self._of is not None:
+                known, coverage = self._of
+                if known is timeline and coverage.state == state:
+                    return coverage
+                if coverage.state.deletion != state.deletion:
+                    self._known = {}
+            segments = self._covered(timeline, state)
+            # By identity: a segment is immutable, and lives as long as its entry here.
+            self._known = {id(each.segment): each for each in segments}
+            self._of = timeline, Coverage(state, segments)
+            return self._of[1]
+
+    def _covered(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
+        grown = self._of is None or self._of[1].state.bag != state.bag
+        known = {
+            nth: each
+            for nth, segment in enumerate(timeline.segments)
+            if (each := self._known.get(id(segment))) is not None
+            and each.segment is segment
+            and not (grown and each.missing)
+        }
+        unknown = [nth for nth in range(len(timeline.segments)) if nth not in known]
+        stored: Mapping[str, StoredBag] = {}
+        root = str(self._bag_dir)
+        if len(unknown) > _FEW:
+            stored = self.store.bags()
+        elif unknown:
+            bags = chain.from_iterable(timeline.segments[nth].bags for nth in unknown)
+            stored = self.store.bags([relative(bag.file, root) for bag in bags])
+        return [
+            known[nth] if nth in known else self._segment(segment, stored)
+            for nth, segment in enumerate(timeline.segments)
+        ]
+
+    def _segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
+        numbers, hashed = [], []
+        missing: list[BagFile] = []
+        for bag in segment.bags:
+            key = BagKey.of(bag, self._bag_dir)
+            found = stored.get(key.path)
+            if found is None or found.key != key or bag.state is not BagState.CLOSED:
+                missing.append(bag)
+                found = None
+            numbers.append(-1 if found is None else found.number)
+            hashed.append(found is not None and found.hashed)
+        return CoveredSegment(
+            segment, np.array(numbers, np.int64), np.array(hashed, np.bool_), tuple(missing)
+        )
+
+
+def shared_times(timeline: Timeline) -> list[TimeWindow]:
+    """Returns when bags of different recordings may hold copies of a message."""
+    coarse: dict[object, tuple[int, int]] = {}
+    for segment in timeline.segments:
+        for folder, span in segment.folder_spans.items():
+            before = coarse.get(folder, span)
+            coarse[folder] = (min(before[0], span[0]), max(before[1], span[1]))
+    found: list[TimeWindow] = []
+    for start, stop in overlap_spans((*span, folder) for folder, span in coarse.items()):
+        bags = timeline.overlapping(TimeWindow(start, stop))
+        spans = overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
+        found += [TimeWindow(*span) for span in spans]
+    return found

@@ -1,0 +1,445 @@
+"""Scans a topic: from the store where it has the rows, else from the bags, each message once.
+
+A scan yields `Rows`: a table, and which of its rows count. Rows of different tables may overlap in
+time where recordings do. Of a table that nothing needs not even the times are unpacked.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import OrderedDict, defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.columns.blob import unpack_tables
+from ros2_memory.columns.copies import (
+    COPY_HORIZON_NS,
+    Identities,
+    copies_among,
+    joined_identities,
+    relatched_among,
+)
+from ros2_memory.columns.coverage import Covering
+from ros2_memory.columns.pack import decompressed, unpack
+from ros2_memory.columns.parts import LOG_TIME, part_table
+from ros2_memory.columns.table import Texts
+from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.storage.base import RELATCHED_NS
+from ros2_memory.storage.cache import ByteLru
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.columns.coverage import Coverage
+    from ros2_memory.columns.pack import Packed
+    from ros2_memory.columns.store import ColumnStore, PartHead
+    from ros2_memory.columns.table import Column, Table
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.index.timeline import Timeline
+    from ros2_memory.storage.base import IntArray
+
+Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
+"""Decodes a topic of a bag, with hashes of payloads where the last argument is true."""
+
+_SLICE_NS: Final = 600 * NS_PER_S
+"""How much of overlapping recordings is compared at a time."""
+_HEAD_BYTES: Final = 400
+"""About how much memory what is known of a part takes."""
+_COLUMN_BYTES: Final = 300
+"""About how much memory what is known of a column takes."""
+_MOST_DECODED: Final = 16
+"""Bags whose tables a scan keeps, to compare them with others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a scan is of.
+
+    Attributes:
+        topic: its name.
+        window: of log time.
+        timeline: the bags.
+        decode: decodes a topic of a bag that is not stored.
+        shared: the half-open spans in which different recordings may hold copies, in order.
+        relatches: whether recordings may have received a message again, as of a latched topic.
+        check: is called before each table; raises where the call's time is over.
+    """
+
+    topic: str
+    window: TimeWindow
+    timeline: Timeline
+    decode: Decode
+    shared: Sequence[tuple[Ns, Ns]] = ()
+    relatches: bool = False
+    check: Callable[[], None] = lambda: None
+
+
+class _Source(NamedTuple):
+    """Where rows come from: a part, or a bag with its number in the store (-1: not stored)."""
+
+    first: Ns
+    last: Ns
+    part: PartHead | None
+    bag: BagFile | None = None
+    number: int = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Heads:
+    """The parts of a topic, in order of their first log times.
+
+    Attributes:
+        coverage: of the timeline that they were compared with.
+        heads: the parts.
+        firsts: their first log times.
+        lasts: their last ones.
+        live: of how many of its bags the rows of each count.
+    """
+
+    coverage: Coverage
+    heads: Sequence[PartHead]
+    firsts: IntArray
+    lasts: IntArray
+    live: IntArray
+
+    @classmethod
+    def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
+        """Returns the parts as of a coverage."""
+        live = np.zeros(len(heads), np.int64)
+        if heads:
+            sizes = np.cumsum([0, *(head.bags.size for head in heads)])
+            positions = coverage.positions(np.concatenate([head.bags for head in heads]))
+            live = np.add.reduceat(positions >= 0, sizes[:-1]).astype(np.int64)
+        return cls(
+            coverage,
+            heads,
+            np.array([head.first for head in heads], np.int64),
+            np.array([head.last for head in heads], np.int64),
+            live,
+        )
+
+    def within(self, window: TimeWindow) -> Iterator[PartHead]:
+        """Yields the parts that may have rows in a window."""
+        here = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
+        for nth in np.flatnonzero(here).tolist():
+            yield self.heads[nth]
+
+
+class Scanner:
+    """Scans topics of one bag directory. Thread-safe.
+
+    Args:
+        store: the store; None where nothing is stored.
+        bag_dir: the bag directory.
+        cache_mb: memory that unpacked columns may take between calls, in MiB.
+    """
+
+    def __init__(self, store: ColumnStore | None, bag_dir: Path, cache_mb: int = 48) -> None:
+        self.store = store
+        self._covering = None if store is None else Covering(store, bag_dir)
+        self._columns: ByteLru[Column] = ByteLru(cache_mb << 20)
+        self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
+        self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
+
+    def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
+        """Yields what counts of a topic in a window.
+
+        In the order of the first log time of each table, or with `newest_first` of the last, from
+        the newest on.
+
+        Raises:
+            QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
+        """
+        return _Scan(self, asked).rows(newest_first=newest_first)
+
+    def coverage(self, timeline: Timeline) -> Coverage | None:
+        """Returns which bags of a timeline are stored; None without a store."""
+        return None if self._covering is None else self._covering.of(timeline)
+
+    def parts(self, topic: str, window: TimeWindow, coverage: Coverage) -> Iterator[PartHead]:
+        """Yields the parts of a topic that may have rows in a window."""
+        if self.store is None:
+            return
+        state = coverage.state
+        known = self._heads.get(topic)
+        if known is None or known.coverage is not coverage:
+            heads: list[PartHead] = []
+            if known is not None and known.coverage.state.deletion == state.deletion:
+                heads = [*known.heads]
+            if known is None or known.coverage.state != state:
+                heads += self.store.parts(topic, max((head.number for head in heads), default=0))
+                heads.sort(key=lambda head: (head.first, head.number))
+            known = _Heads.of(heads, coverage)
+            self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
+        yield from known.within(window)
+
+    def part(self, head: PartHead, coverage: Coverage) -> PartUnit | None:
+        """Returns a part; None where no row of it counts.
+
+        Raises:
+            GoneError: it was deleted meanwhile.
+        """
+        assert self.store is not None  # noqa: S101 - there are no parts without one
+        offset = self.store.offset
+        found = {int(number): coverage.bag(int(number)) for number in head.bags}
+        bags = {number - offset: bag for number, bag in found.items() if bag is not None}
+        columns = self._known.get(head.number)
+        if columns is None:
+            columns = self.store.part_columns(head.number)
+            self._known.put(head.number, columns, _COLUMN_BYTES * len(columns))
+        if not bags:
+            return None
+        topic = self.store.topics().get(head.topic)
+        if not columns or topic is None:
+            raise GoneError
+        known = columns
+
+        def load(path: str) -> Column:
+            return self._column(head.number, path, known[path])
+
+        def integers(path: str) -> IntArray | None:
+            column = load(path) if path in known else None
+            return None if column is None else np.asarray(column, np.int64)
+
+        times = np.broadcast_to(np.int64(0), (known[LOG_TIME].count,))
+        return PartUnit(head, part_table(head.topic, topic, known, load, times), integers, bags)
+
+    def split(self, number: int, topic: str) -> list[Table] | None:
+        """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
+        assert self.store is not None  # noqa: S101 - there are no splits without one
+        topics = self.store.topics()
+        data = self.store.split_data(number)
+        if data is None:
+            return None
+        wanted = {key for key, known in topics.items() if known.channel.topic == topic}
+        return [*unpack_tables(data, topics, wanted.__contains__)]
+
+    def _column(self, part: int, path: str, packed: Packed) -> Column:
+        column = self._columns.get((part, path))
+        if column is not None:
+            return column
+        assert self.store is not None  # noqa: S101 - as above
+        data = b""
+        if not packed.codec.endswith(" constant"):
+            stored = self.store.part_data(part, path)
+            if stored is None:
+                raise GoneError
+            data = decompressed(stored)
+        column = unpack(packed.codec, packed.count, packed.zone.least, data)
+        self._columns.put((part, path), column, _bytes_of(column))
+        return column
+
+
+class _Scan:
+    """One scan: its sources, and which rows of them are copies."""
+
+    def __init__(self, scanner: Scanner, asked: Asked) -> None:
+        self._scanner = scanner
+        self._asked = asked
+        self._coverage = scanner.coverage(asked.timeline)
+        self._shared = [
+            span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
+        ]
+        self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
+        self._copies: dict[object, list[IntArray]] = defaultdict(list)
+        self._compared: set[Ns] = set()
+        self._relatched: dict[object, IntArray] = {}
+        self._relatched_since = MAX_NS
+        reach = asked.window
+        if asked.relatches:
+            reach = TimeWindow.everything()
+        elif self._shared:
+            reach = reach.widened(2 * COPY_HORIZON_NS)
+        self._sources = sorted(self._found(reach), key=lambda source: (source.first, source.last))
+
+    def rows(self, *, newest_first: bool) -> Iterator[Rows]:
+        sources = self._sources
+        if newest_first:
+            sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
+        window = self._asked.window
+        for source in sources:
+            if window.overlaps(source.first, source.last):
+                self._asked.check()
+                for unit in self._units(source):
+                    found = self._counting(unit)
+                    if found is not None:
+                        yield found
+
+    def _found(self, reach: TimeWindow) -> Iterator[_Source]:
+        """Yields the sources that may have rows in a window."""
+        topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
+        if coverage is None or self._scanner.store is None:
+            bags = {bag.file: bag for bag, *_ in timeline.extents(topic, reach)}
+            for bag in bags.values():
+                yield _Source(*bag.summary.span_of([topic]), None, bag)
+            return
+        for head in self._scanner.parts(topic, reach, coverage):
+            yield _Source(head.first, head.last, head)
+        for number in self._scanner.store.splits():
+            split = coverage.bag(number)
+            if (
+                split is not None
+                and split.summary.of(topic)
+                and reach.overlaps(split.start, split.end)
+            ):
+                yield _Source(*split.summary.span_of([topic]), None, split, number)
+        for bag in coverage.missing:
+            if reach.overlaps(bag.start, bag.end) and bag.summary.of(topic):
+                yield _Source(*bag.summary.span_of([topic]), None, bag)
+
+    def _units(self, source: _Source) -> Iterable[Unit]:
+        if source.part is not None and self._coverage is not None:
+            unit = self._scanner.part(source.part, self._coverage)
+            return () if unit is None else (unit,)
+        assert source.bag is not None  # noqa: S101 - a source is a part or a bag
+        known = self._decoded.get(source.bag.file)
+        if known is None:
+            tables = None
+            if source.number >= 0:
+                tables = self._scanner.split(source.number, self._asked.topic)
+            if tables is None:
+                hashed = bool(self._shared) or self._asked.relatches
+                tables = [*self._asked.decode(source.bag, self._asked.topic, hashed)]
+            known = [
+                BagUnit(source.bag, table, nth) for nth, table in enumerate(tables) if len(table)
+            ]
+            self._decoded[source.bag.file] = known
+            if len(self._decoded) > _MOST_DECODED:
+                self._decoded.popitem(last=False)
+        return known
+
+    def _counting(self, unit: Unit) -> Rows | None:
+        """Returns the rows of a unit that count in the window; None if there are none."""
+        window = self._asked.window
+        counting = unit.counting()
+        if not window.covers(unit.first, unit.last):
+            times = unit.times()
+            inside = (times >= window.start) & (times < window.stop)
+            counting = inside if counting is None else counting & inside
+        repeated = self._repeated(unit)
+        if repeated.size:
+            counting = np.ones(len(unit.table), np.bool_) if counting is None else counting
+            counting[repeated] = False
+        if counting is None or counting.all():
+            return Rows(unit, None) if len(unit.table) else None
+        index = np.flatnonzero(counting)
+        return Rows(unit, index) if index.size else None
+
+    # Copies
+
+    def _repeated(self, unit: Unit) -> IntArray:
+        """Returns the rows of a unit that repeat a message of another recording."""
+        for start, stop in self._shared:
+            if start <= unit.last and unit.first < stop:
+                for begin in range(start, stop, _SLICE_NS):
+                    end = min(begin + _SLICE_NS, stop)
+                    if begin <= unit.last and unit.first < end and begin not in self._compared:
+                        self._compared.add(begin)
+                        self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
+        found = self._copies.get(unit.key, [])
+        if self._asked.relatches:
+            found = [*found, self._received_again(unit)]
+        return np.concatenate(found) if found else np.empty(0, np.int64)
+
+    def _compare(self, span: TimeWindow, part: TimeWindow) -> None:
+        """Finds the copies in a part of a shared span."""
+        around = part.widened(2 * COPY_HORIZON_NS).intersect(span)
+        units = [*self._units_in(around)]
+        if len({unit.recording for unit in units}) < 2:
+            return
+        rows = [self._rows_in(unit, around) for unit in units]
+        messages = self._messages(units, rows)
+        copies = copies_among(messages)
+        copies &= (messages.log_times >= part.start) & (messages.log_times < part.stop)
+        begin = 0
+        for unit, some in zip(units, rows, strict=True):
+            of_unit = some[copies[begin : begin + some.size]]
+            begin += some.size
+            if of_unit.size:
+                self._copies[unit.key].append(of_unit)
+
+    def _received_again(self, unit: Unit) -> IntArray:
+        """Returns the rows of a unit that were received before, as late messages of a latch."""
+        none = np.empty(0, np.int64)
+        identities = unit.identities() if unit.table.channel.latched else None
+        if identities is None:
+            return none
+        published = identities[0]
+        late = unit.times() - published > RELATCHED_NS
+        if not late.any():
+            return none
+        since = max(int(published[late].min()) - COPY_HORIZON_NS, MIN_NS)
+        if since < self._relatched_since:
+            # As much again before it: late messages come many at once, of about the same age.
+            self._relatched_since = max(since - (unit.last - since), MIN_NS)
+            self._find_relatched(TimeWindow(self._relatched_since, MAX_NS))
+        return self._relatched.get(unit.key, none)
+
+    def _find_relatched(self, window: TimeWindow) -> None:
+        units = [*self._units_in(window)]
+        rows = [self._rows_in(unit, window) for unit in units]
+        messages = self._messages(units, rows)
+        latched = np.repeat(
+            [unit.table.channel.latched for unit in units], [some.size for some in rows]
+        )
+        again = relatched_among(messages) & latched
+        begin = 0
+        for unit, some in zip(units, rows, strict=True):
+            self._relatched[unit.key] = some[again[begin : begin + some.size]]
+            begin += some.size
+
+    def _units_in(self, window: TimeWindow) -> Iterator[Unit]:
+        # Sources are in the order of their first times, and reach beyond the next ones.
+        stop = bisect_right(self._sources, window.stop - 1, key=lambda source: source.first)
+        for source in self._sources[:stop]:
+            if source.last >= window.start:
+                self._asked.check()
+                yield from self._units(source)
+
+    def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
+        times, counting = unit.times(), unit.counting()
+        inside = (times >= window.start) & (times < window.stop)
+        return np.flatnonzero(inside if counting is None else inside & counting)
+
+    def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
+        """Returns what tells messages apart, of some rows of each unit."""
+        numbers: dict[Path, int] = {}
+        parts: list[Identities] = []
+        for unit, some in zip(units, rows, strict=True):
+            published, hashes = unit.identities() or self._hashed_again(unit)
+            recording = numbers.setdefault(unit.recording, len(numbers))
+            parts.append(
+                Identities(
+                    unit.times()[some],
+                    published[some],
+                    hashes[some],
+                    np.full(some.size, recording),
+                )
+            )
+        return joined_identities(parts)
+
+    def _hashed_again(self, unit: Unit) -> tuple[IntArray, IntArray]:
+        """Reads the bags of a unit that was stored before another recording came beside it."""
+        published = unit.times().copy()
+        hashes = np.full(published.size, -1, np.int64)
+        numbers = unit.bag_numbers()
+        for number, bag in unit.bags().items():
+            rows = np.flatnonzero(numbers == number)
+            for table in self._asked.decode(bag, self._asked.topic, True):
+                same = table.channel.type == unit.table.channel.type
+                if same and len(table) == rows.size and table.payload_hashes is not None:
+                    published[rows] = table.publish_times
+                    hashes[rows] = table.payload_hashes
+        return published, hashes
+
+
+def _bytes_of(column: Column) -> int:
+    if isinstance(column, Texts):
+        return column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
+    return column.nbytes

@@ -1,0 +1,193 @@
+"""The pieces that a scan is made of: the rows of a topic in a part, or in a bag."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.columns.parts import BAG, LOG_TIME, PAYLOAD_HASH, PUBLISH_TIME
+from ros2_memory.core.errors import QueryTimeoutError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.store import PartHead
+    from ros2_memory.columns.table import Table
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import IntArray
+
+
+class GoneError(QueryTimeoutError):
+    """Rows were deleted from the store while they were read."""
+
+    def __init__(self) -> None:
+        super().__init__("bags were deleted while they were read: ask again")
+
+
+class Unit(ABC):
+    """The rows of a topic of one type in a part, or in a bag.
+
+    Attributes:
+        key: tells units of one scan apart.
+        table: the rows, ordered by log time.
+        first: the earliest log time, inclusive.
+        last: the latest, inclusive.
+        recording: that all the rows are of.
+    """
+
+    key: object
+    table: Table
+    first: Ns
+    last: Ns
+    recording: Path
+
+    @abstractmethod
+    def times(self) -> IntArray:
+        """Returns the log times of the rows (ns)."""
+
+    @abstractmethod
+    def identities(self) -> tuple[IntArray, IntArray] | None:
+        """Returns publish times and hashes of payloads; None where they are not known."""
+
+    @abstractmethod
+    def bags(self) -> Mapping[int, BagFile]:
+        """Returns the bags that rows count of, by the numbers of `bag_numbers`."""
+
+    @abstractmethod
+    def bag_numbers(self) -> IntArray:
+        """Returns for each row the number of its bag."""
+
+    def counting(self) -> NDArray[np.bool_] | None:
+        """Returns which rows are of bags that count; None: all are."""
+        return None
+
+
+class BagUnit(Unit):
+    """A table of one bag: decoded, or from its split. `nth` tells tables of one bag apart."""
+
+    def __init__(self, bag: BagFile, table: Table, nth: int) -> None:
+        self.key = (bag.file, nth)
+        self.table = table
+        self.first, self.last = int(table.log_times[0]), int(table.log_times[-1])
+        self.recording = bag.recording
+        self._bag = bag
+
+    def times(self) -> IntArray:
+        """Returns the log times of the rows (ns)."""
+        return self.table.log_times
+
+    def identities(self) -> tuple[IntArray, IntArray] | None:
+        """Returns publish times and hashes of payloads; None where they were not hashed."""
+        hashes = self.table.payload_hashes
+        return None if hashes is None else (self.table.publish_times, hashes)
+
+    def bags(self) -> Mapping[int, BagFile]:
+        """Returns the bag."""
+        return {0: self._bag}
+
+    def bag_numbers(self) -> IntArray:
+        """Returns 0 for each row."""
+        return np.zeros(len(self.table), np.int64)
+
+
+class PartUnit(Unit):
+    """A part of the store.
+
+    Args:
+        head: what is known of it.
+        table: its rows.
+        load: returns one of the columns that every part may have; None where it has none.
+        bags: its bags of which rows count, by the numbers that the part has for them; at least one.
+    """
+
+    def __init__(
+        self,
+        head: PartHead,
+        table: Table,
+        load: Callable[[str], IntArray | None],
+        bags: Mapping[int, BagFile],
+    ) -> None:
+        self.key = head.number
+        self.table = table
+        self.first, self.last = head.first, head.last
+        self.recording = next(iter(bags.values())).recording
+        self._load = load
+        self._bags = bags
+        self._all_count = len(bags) == head.bags.size
+
+    def times(self) -> IntArray:
+        """Returns the log times of the rows (ns)."""
+        return self._column(LOG_TIME)
+
+    def identities(self) -> tuple[IntArray, IntArray] | None:
+        """Returns publish times and hashes of payloads; None where they are not stored."""
+        published, hashes = self._load(PUBLISH_TIME), self._load(PAYLOAD_HASH)
+        return None if published is None or hashes is None else (published, hashes)
+
+    def bags(self) -> Mapping[int, BagFile]:
+        """Returns the bags of which rows count, by their numbers in the store."""
+        return self._bags
+
+    def bag_numbers(self) -> IntArray:
+        """Returns for each row the number of its bag."""
+        return self._column(BAG)
+
+    def counting(self) -> NDArray[np.bool_] | None:
+        """Returns which rows are of bags that count; None: all are."""
+        if self._all_count:
+            return None
+        return np.isin(self.bag_numbers(), [*self._bags])
+
+    def _column(self, path: str) -> IntArray:
+        column = self._load(path)
+        if column is None:
+            raise GoneError
+        return column
+
+
+class Rows:
+    """The rows of one table that count, ordered by log time.
+
+    Attributes:
+        table: the table; not all of its rows need count.
+        index: which of its rows count, ascending; None: all.
+    """
+
+    def __init__(self, unit: Unit, index: IntArray | None) -> None:
+        self._unit = unit
+        self.table = unit.table
+        self.index = index
+
+    def __len__(self) -> int:
+        """Returns how many rows count."""
+        return len(self.table) if self.index is None else self.index.size
+
+    @property
+    def times(self) -> IntArray:
+        """Log times (ns) of the rows that count."""
+        times = self._unit.times()
+        return times if self.index is None else times[self.index]
+
+    @property
+    def recording(self) -> Path:
+        """The recording that the rows are of."""
+        return self._unit.recording
+
+    def bag(self, row: int) -> BagFile:
+        """Returns the bag of one of the rows that count."""
+        at = row if self.index is None else int(self.index[row])
+        return self._unit.bags()[int(self._unit.bag_numbers()[at])]
+
+    def mask(self) -> NDArray[np.bool_]:
+        """Returns for each row of the table whether it counts."""
+        if self.index is None:
+            return np.ones(len(self.table), np.bool_)
+        mask = np.zeros(len(self.table), np.bool_)
+        mask[self.index] = True
+        return mask
