@@ -7,11 +7,12 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.coverage import shared_times
-from ros2_memory.columns.decode import GROUP_BYTES, decoded
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.store import LONG_NS, PART_NS, BagKey
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.logging_setup import get_logger
@@ -21,7 +22,7 @@ from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.columns.scan import Scanner
@@ -160,16 +161,21 @@ class Filling:
         groups = decoded(self._reader, bag.path, hashed=is_hashed)
         first = next(groups, [])
         second = next(groups, None)
-        put = {"hashed": hashed, "is_current": partial(self._may_be_stored, bag)}
-        key = self._key(bag)
+        key, is_current = self._key(bag), partial(self._may_be_stored, bag)
+        definition_of = self._reader.definition
         if second is None and bag.end - bag.start <= LONG_NS:
-            return self.store.put(key, bag, _sound(bag, first), self._reader.definition, **put)
-        rest = [first, *([] if second is None else [second])]
-        every = (_sound(bag, tables) for tables in _chained(rest, groups))
-        return self.store.put_long(key, bag, every, self._reader.definition, **put)
+            tables = _sound(bag, first)
+            return self.store.put(
+                key, bag, tables, definition_of, hashed=hashed, is_current=is_current
+            )
+        begin = [first] if second is None else [first, second]
+        every = (_sound(bag, tables) for tables in chain(begin, groups))
+        return self.store.put_long(
+            key, bag, every, definition_of, hashed=hashed, is_current=is_current
+        )
 
     def _may_be_stored(self, bag: BagFile) -> bool:
-        """Returns whether the bag is as the index found it, for a while now, and none of it goes."""
+        """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
         try:
             stat = os.lstat(bag.path)
         except OSError:
@@ -232,13 +238,6 @@ def _sound(bag: BagFile, tables: Sequence[Table]) -> Sequence[Table]:
             reason = f"{table.channel.topic}: {table.undecodable_reason}"
             raise BagError(str(bag.path), reason)
     return tables
-
-
-def _chained(
-    begin: Sequence[Sequence[Table]], rest: Iterator[list[Table]]
-) -> Iterator[Sequence[Table]]:
-    yield from begin
-    yield from rest
 
 
 def _mtime_ns(path: Path) -> Ns:

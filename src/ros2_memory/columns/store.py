@@ -55,7 +55,7 @@ TABLES: Final = Tables(
 CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQUE,
   size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  hashed INTEGER NOT NULL);
+  hashed INTEGER NOT NULL, definitions TEXT NOT NULL);
 CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
   encoding TEXT NOT NULL, latched INTEGER NOT NULL, layout TEXT NOT NULL,
   UNIQUE (name, type, encoding, latched, layout));
@@ -141,16 +141,20 @@ class ColumnStore(Database):
         paths: where the file may lie; see `Database`.
         sources: other files that may be copied to a path that has none yet; only read.
         waits_for: a directory; until it exists, nothing is opened or made.
+        definitions: tells the configured message definitions apart. Bags with messages that these
+            could not decode are stored only for them.
     """
 
     def __init__(
         self,
         paths: Sequence[Path] | Callable[[], Sequence[Path]],
         *,
+        definitions: str = "",
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
     ) -> None:
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
+        self._definitions = definitions
         self._topics: dict[int, Topic] = {}
 
     # Reading
@@ -171,10 +175,11 @@ class ColumnStore(Database):
         """Returns the bags that are stored, by their paths; among some, or all of them."""
 
         def ask(connection: sqlite3.Connection) -> dict[str, StoredBag]:
-            among = "" if paths is None else "WHERE path IN (SELECT value FROM json_each(?))"
+            among = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
             rows = connection.execute(
-                f"SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag {among}",
-                () if paths is None else (json.dumps(paths),),
+                "SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag"
+                f" WHERE definitions IN ('', ?) {among}",
+                (self._definitions, *(() if paths is None else (json.dumps(paths),))),
             )
             return {
                 row[0]: StoredBag(self.offset + row[4], BagKey(*row[:4]), bool(row[5]))
@@ -192,6 +197,26 @@ class ColumnStore(Database):
             )
 
         return self.read(ask, frozenset())
+
+    def hashed(self) -> frozenset[int]:
+        """Returns the numbers of the splits in which copies of messages can be recognised."""
+
+        def ask(connection: sqlite3.Connection) -> frozenset[int]:
+            rows = connection.execute(
+                "SELECT id FROM bag WHERE hashed AND id IN (SELECT bag FROM split)"
+            )
+            return frozenset(self.offset + row[0] for row in rows)
+
+        return self.read(ask, frozenset())
+
+    def oldest(self) -> Ns | None:
+        """Returns the earliest log time (ns) of any bag; None without one."""
+
+        def ask(connection: sqlite3.Connection) -> Ns | None:
+            found: Ns | None = connection.execute("SELECT min(first_ns) FROM bag").fetchone()[0]
+            return found
+
+        return self.read(ask, None)
 
     def hashed(self) -> frozenset[int]:
         """Returns the numbers of the splits in which copies of messages can be recognised."""
@@ -303,6 +328,7 @@ class ColumnStore(Database):
         definition_of: DefinitionOf,
         *,
         hashed: bool,
+        is_current: Callable[[], bool] = lambda: True,
     ) -> bool:
         """Stores a bag, in place of what its path was stored with; returns whether it did.
 
@@ -312,11 +338,18 @@ class ColumnStore(Database):
             tables: all of its messages.
             definition_of: returns the definition of a channel, as `BagReader.definition`.
             hashed: whether all tables have the hashes of their payloads.
+            is_current: whether the bag may be stored, asked once nobody else can write.
         """
+        stored = False
 
         def write(connection: sqlite3.Connection) -> None:
+            nonlocal stored
+            stored = is_current()
+            if not stored:
+                return
             _delete(connection, [key.path])
-            number = _insert_bag(connection, key, bag, hashed=hashed)
+            definitions = self._definitions if _lacks_definitions(tables) else ""
+            number = _insert_bag(connection, key, bag, definitions, hashed=hashed)
             entries = [
                 Entry(*_topic_of(connection, table, definition_of), table) for table in tables
             ]
@@ -324,7 +357,7 @@ class ColumnStore(Database):
                 "INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries, places=False))
             )
 
-        return self.write(write)
+        return self.write(write) and stored
 
     def put_long(
         self,
@@ -334,6 +367,7 @@ class ColumnStore(Database):
         definition_of: DefinitionOf,
         *,
         hashed: bool,
+        is_current: Callable[[], bool] = lambda: True,
     ) -> bool:
         """Stores a bag as parts, group by group; returns whether it did.
 
@@ -341,23 +375,31 @@ class ColumnStore(Database):
         Arguments are as for `put`.
         """
         number = 0
+        stored = lacks_definitions = False
 
         def begin(connection: sqlite3.Connection) -> None:
             nonlocal number
             _delete(connection, [key.path])
-            number = _insert_bag(connection, key._replace(size=-1), bag, hashed=hashed)
+            number = _insert_bag(connection, key._replace(size=-1), bag, "", hashed=hashed)
 
         def end(connection: sqlite3.Connection) -> None:
-            connection.execute("UPDATE bag SET size = ? WHERE id = ?", (key.size, number))
+            nonlocal stored
+            stored = is_current()
+            size = key.size if stored else -1
+            definitions = self._definitions if lacks_definitions else ""
+            connection.execute(
+                "UPDATE bag SET size = ?, definitions = ? WHERE id = ?", (size, definitions, number)
+            )
 
         if not self.write(begin):
             return False
         for tables in groups:
+            lacks_definitions |= _lacks_definitions(tables)
             parts = [part for table in tables if len(table) for part in _in_parts(table)]
             insert = partial(_insert_rows, parts=parts, bag=number, definition_of=definition_of)
             if not self.write(insert):
                 return False
-        return self.write(end)
+        return self.write(end) and stored
 
     def merge(self, bags: Sequence[int], budget: int) -> bool:
         """Makes parts of bags of one recording; returns whether it did.
@@ -439,12 +481,19 @@ def _insert_rows(
         _insert_part(connection, topic, part)
 
 
-def _insert_bag(connection: sqlite3.Connection, key: BagKey, bag: BagFile, *, hashed: bool) -> int:
+def _lacks_definitions(tables: Sequence[Table]) -> bool:
+    """Returns whether other definitions may decode what these could not."""
+    return any("" in table.left_out for table in tables)
+
+
+def _insert_bag(
+    connection: sqlite3.Connection, key: BagKey, bag: BagFile, definitions: str, *, hashed: bool
+) -> int:
     messages = sum(topic.count for topic in bag.summary.topics)
     cursor = connection.execute(
-        "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, bag.start, bag.end, messages, hashed),
+        "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
+        " definitions) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (*key, bag.start, bag.end, messages, hashed, definitions),
     )
     return int(cursor.lastrowid or 0)
 
