@@ -218,26 +218,6 @@ class ColumnStore(Database):
 
         return self.read(ask, None)
 
-    def hashed(self) -> frozenset[int]:
-        """Returns the numbers of the splits in which copies of messages can be recognised."""
-
-        def ask(connection: sqlite3.Connection) -> frozenset[int]:
-            rows = connection.execute(
-                "SELECT id FROM bag WHERE hashed AND id IN (SELECT bag FROM split)"
-            )
-            return frozenset(self.offset + row[0] for row in rows)
-
-        return self.read(ask, frozenset())
-
-    def oldest(self) -> Ns | None:
-        """Returns the earliest log time (ns) of any bag; None without one."""
-
-        def ask(connection: sqlite3.Connection) -> Ns | None:
-            found: Ns | None = connection.execute("SELECT min(first_ns) FROM bag").fetchone()[0]
-            return found
-
-        return self.read(ask, None)
-
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
 
