@@ -46,7 +46,7 @@ from ros2_memory.columns.pack import (
     Packed,
     compressed,
     decompressed,
-    pack,
+    pack_columns,
     unpack,
     zone_of_texts,
 )
@@ -54,7 +54,7 @@ from ros2_memory.columns.steps import EXACT, Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts, Zone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -223,51 +223,43 @@ def pack_tables(entries: Iterable[Entry], *, published: bool = True, places: boo
         ValueError: a table has other columns than its layout.
     """
     heads: list[bytes] = []
-    packs: list[Packed] = []
+    columns: list[tuple[Column, Step]] = []
     for topic, layout, table in entries:
-        hashes = table.payload_hashes
-        flags = _PUBLISHED * published | _PLACES * places | _HASHES * (hashes is not None)
-        counts: list[int] = []
-        before = len(packs)
-        packs += _packed_times(table, published=published)
+        before, counts = len(columns), list[int]()
+        flags = _PUBLISHED * published | _PLACES * places
+        if published:
+            columns.append((table.log_times - table.publish_times, EXACT))
+        columns.append((table.publish_times if published else table.log_times, EXACT))
         if places:
-            packs.append(pack(table.places))
-        if hashes is not None:
-            packs.append(pack(hashes))
+            columns.append((table.places, EXACT))
+        if table.payload_hashes is not None:
+            flags |= _HASHES
+            columns.append((table.payload_hashes, EXACT))
         try:
-            packs += _packed_rows(layout, table, counts)
+            _add_columns(layout, table, columns, counts)
         except KeyError as error:
             raise ValueError(
                 f"the table of {table.channel.topic} has no {error}, which its layout has"
             ) from error
-        rows = len(table.log_times)
-        number = len(packs) - before
-        heads.append(
-            struct.pack(f"<IBHHI{len(counts)}I", topic, flags, number, len(counts), rows, *counts)
-        )
+        sizes = (len(columns) - before, len(counts), len(table), *counts)
+        heads.append(struct.pack(f"<IBHHI{len(counts)}I", topic, flags, *sizes))
+    packs = pack_columns(columns)
     head = struct.pack("<BH", FORMAT, len(heads)) + b"".join(heads)
     return compressed(head + _directory(packs) + b"".join(packed.data for packed in packs))
 
 
-def _packed_times(table: Table, *, published: bool) -> Iterator[Packed]:
-    if not published:
-        yield pack(table.log_times)
-        return
-    yield pack(table.log_times - table.publish_times)
-    yield pack(table.publish_times)
-
-
-def _packed_rows(layout: Layout, rows: Table | Elements, counts: list[int]) -> Iterator[Packed]:
-    """In the order of `Layout.slots`; adds the number of elements of every sequence."""
+def _add_columns(
+    layout: Layout, rows: Table | Elements, columns: list[tuple[Column, Step]], counts: list[int]
+) -> None:
+    """Adds columns in the order of `Layout.slots`, and the lengths of sequences."""
     if len(rows.columns) != len(layout.columns) or len(rows.elements) != len(layout.sequences):
         raise ValueError(f"a table has other columns than its layout: {sorted(rows.columns)}")
-    for path, kind in layout.columns.items():
-        yield pack(rows.columns[path], kind.step)
+    columns += [(rows.columns[path], kind.step) for path, kind in layout.columns.items()]
     for path, inner in layout.sequences.items():
         elements = rows.elements[path]
-        counts.append(len(elements.owners))
-        yield pack(elements.owners)
-        yield from _packed_rows(inner, elements, counts)
+        counts.append(len(elements))
+        columns.append((elements.owners, EXACT))
+        _add_columns(inner, elements, columns, counts)
 
 
 def _directory(packs: list[Packed]) -> bytes:
