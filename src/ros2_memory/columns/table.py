@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.storage.base import Channel, IntArray
 
-Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.generic[object]]]"
+Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
 MAX_NUMBERS: Final = 9
 """Longer arrays of numbers (covariances of poses, scans, images) are no columns."""

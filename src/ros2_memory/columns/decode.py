@@ -1,0 +1,280 @@
+"""Decodes a bag as tables, all messages of a topic at once.
+
+What the walk over bytes (`walk.py`) does not read, for whatever reason, goes through the reader's
+decoder message by message (`objects.py`), into the same columns; never as a part of what is there.
+"""
+
+from __future__ import annotations
+
+import zlib
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import numpy as np
+
+from ros2_memory.columns.objects import level_of
+from ros2_memory.columns.plan import UnplannedError, plan_of
+from ros2_memory.columns.table import Table, joined, order_of
+from ros2_memory.columns.walk import NotWalkedError, walked
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.columns.plan import Plan
+    from ros2_memory.storage.base import BagReader, Batch, Channel, Schema
+
+T = TypeVar("T")
+
+GROUP_BYTES: Final = 64 << 20
+"""Payloads, or tables made of them, that one group has at most, about."""
+BULKY_BYTES: Final = 64 << 10
+"""In large files, topics with larger messages have no columns."""
+LARGE_FILE_BYTES: Final = 64 << 20
+BULKY_TYPES: Final = frozenset(
+    {
+        "sensor_msgs/msg/Image",
+        "sensor_msgs/msg/CompressedImage",
+        "sensor_msgs/msg/PointCloud2",
+        "sensor_msgs/msg/PointCloud",
+        "stereo_msgs/msg/DisparityImage",
+        "theora_image_transport/msg/Packet",
+        "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+        "foxglove_msgs/msg/CompressedVideo",
+    }
+)
+"""Images and clouds, which have no columns in any file."""
+_BULKY: Final = "images, clouds and the like have no columns"
+_DECODED_BYTES: Final = 1 << 20
+"""Payloads whose decoded messages are in memory at once."""
+_EVERYTHING: Final = TimeWindow.everything()
+
+
+def never(channel: Channel) -> bool:
+    """Returns False: no payload is hashed."""
+    del channel
+    return False
+
+
+def decoded(
+    reader: BagReader,
+    path: Path,
+    window: TimeWindow = _EVERYTHING,
+    *,
+    topics: Collection[str] | None = None,
+    hashed: Callable[[Channel], bool] = never,
+    group_bytes: int = GROUP_BYTES,
+) -> Iterator[list[Table]]:
+    """Yields the messages of a bag as tables, in groups.
+
+    In one group there is one table for each topic, type and definition with messages; a bag that
+    decompresses to less than `group_bytes` is one group. Tables of later groups may overlap earlier
+    ones in time, as the chunks of the file do. In memory are one group and one buffer of the
+    reader. Lazy: nothing is opened before the first item is requested.
+
+    Args:
+        reader: reads the bag.
+        path: the file.
+        window: of log time.
+        topics: those to decode; None for all.
+        hashed: of which channels the payloads are hashed.
+        group_bytes: how much a group holds, about.
+
+    Raises:
+        BagVanishedError: the file is not there.
+        BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
+            read.
+    """
+
+    def found() -> Iterator[list[Table] | BagError]:
+        channels = [
+            channel
+            for channel in reader.channels(path)
+            if topics is None or channel.topic in topics
+        ]
+        kinds = _Kinds(reader, hashed)
+        kinds.look_at(channels, path, window)
+        bare = {channel.topic for channel in channels}
+        bare -= {channel.topic for channel in channels if kinds.of(channel).needs_payloads}
+        batches = reader.batches(path, {each.topic for each in channels}, window, bare=bare)
+        group = _Group(kinds, group_bytes)
+        while True:
+            try:
+                batch = next(batches)
+            except StopIteration:
+                break
+            except BagError as error:
+                yield error
+                continue
+            if group.is_full_before(batch):
+                yield group.tables()
+                group = _Group(kinds, group_bytes)
+            group.add(batch)
+            del batch  # and its buffer, before the next is read
+        tables = group.tables()
+        if tables:
+            yield tables
+
+    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+    return map(_unless_error, found())
+
+
+def _unless_error(item: T | BagError) -> T:
+    if isinstance(item, BagError):
+        raise item
+    return item
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """How the messages of a channel are decoded; without a plan, `reason` says why they are not."""
+
+    channel: Channel
+    plan: Plan | None
+    reason: str
+    is_hashed: bool
+
+    @property
+    def needs_payloads(self) -> bool:
+        return self.plan is not None or self.is_hashed
+
+
+@dataclass(slots=True)
+class _Kinds:
+    """The kinds of the channels of one bag."""
+
+    reader: BagReader
+    hashed: Callable[[Channel], bool]
+    # By identity, since hashing a channel hashes its definition.
+    _known: dict[int, _Kind] = field(default_factory=dict)
+    _bulky: set[str] = field(default_factory=set)
+
+    def look_at(self, channels: Sequence[Channel], path: Path, window: TimeWindow) -> None:
+        """Finds the topics of a large file that have large messages, by the newest of each."""
+        size = 0
+        with suppress(OSError):
+            size = path.stat().st_size
+        if size <= LARGE_FILE_BYTES:
+            return
+        for channel in channels:
+            if self._plan(channel)[0] is None:
+                continue
+            with suppress(BagError):
+                newest = self.reader.newest(path, channel.topic, window)
+                if newest is not None and len(newest.payload) > BULKY_BYTES:
+                    self._bulky.add(channel.topic)
+
+    def of(self, channel: Channel) -> _Kind:
+        """Returns the kind of a channel."""
+        known = self._known.get(id(channel))
+        if known is None:
+            plan, reason = self._plan(channel)
+            known = _Kind(channel, plan, reason, self.hashed(channel))
+            self._known[id(channel)] = known
+        return known
+
+    def _plan(self, channel: Channel) -> tuple[Plan | None, str]:
+        if channel.type in BULKY_TYPES or channel.topic in self._bulky:
+            return None, _BULKY
+        definition = self.reader.definition(channel)
+        if definition is None:
+            reason = self.reader.undecodable(channel)
+            return None, reason or f"messages encoded as {channel.encoding} have no columns"
+        if definition.type in BULKY_TYPES:
+            return None, _BULKY
+        try:
+            return plan_of(definition), ""
+        except UnplannedError as error:
+            return None, str(error)
+
+
+@dataclass(slots=True)
+class _Group:
+    """The tables of some buffers, while they are read."""
+
+    kinds: _Kinds
+    limit: int
+    _parts: dict[tuple[str, str, Schema], list[Table]] = field(default_factory=dict)
+    _buffer: bytes = b""
+    _bytes: int = 0
+
+    def is_full_before(self, batch: Batch) -> bool:
+        """Returns whether a batch belongs to the next group: only with a buffer one begins."""
+        if batch.buffer is self._buffer or not self._parts:
+            return False
+        size = self._bytes + len(batch.buffer)
+        if size <= self.limit and size > self.limit // 4:
+            size = sum(part.memory_bytes for parts in self._parts.values() for part in parts)
+        return size > self.limit
+
+    def add(self, batch: Batch) -> None:
+        """Decodes a batch."""
+        if batch.buffer is not self._buffer:
+            self._buffer = batch.buffer
+            self._bytes += len(batch.buffer)
+        if not batch.sizes.size:
+            return
+        channel = batch.channel
+        table = _table(self.kinds, batch)
+        self._parts.setdefault((channel.topic, channel.encoding, channel.schema), []).append(table)
+
+    def tables(self) -> list[Table]:
+        """Returns the tables, each of all its parts."""
+        self._buffer = b""
+        found = []
+        while self._parts:
+            _, parts = self._parts.popitem()
+            found.append(joined(parts))
+        return found[::-1]
+
+
+def _table(kinds: _Kinds, batch: Batch) -> Table:
+    """Returns the messages of a batch as a table."""
+    kind = kinds.of(batch.channel)
+    order = order_of(batch.log_times, batch.places)
+    if order is not None:
+        batch = batch.taken(order)
+    table = Table(batch.channel, batch.log_times, batch.publish_times, batch.places)
+    if kind.is_hashed:
+        hashes = [zlib.crc32(batch.payload(nth)) for nth in range(len(table))]
+        table = replace(table, payload_hashes=np.array(hashes, np.int64))
+    if kind.plan is None:
+        return replace(table, left_out={"": kind.reason})
+    try:
+        level = walked(kind.plan, batch)
+    except NotWalkedError:
+        return joined(list(_one_by_one(kinds.reader, kind.plan, batch, table)))
+    return replace(table, columns=level.columns, elements=level.elements, left_out=level.left_out)
+
+
+def _one_by_one(reader: BagReader, plan: Plan, batch: Batch, table: Table) -> Iterator[Table]:
+    """Yields parts of a table whose messages the reader decodes."""
+    begin = 0
+    count = len(table)
+    sizes = batch.sizes.tolist()
+    while begin < count:
+        messages: list[object] = []
+        rows: list[int] = []
+        reason = ""
+        size, nth = 0, begin
+        while nth < count and (nth == begin or size + sizes[nth] <= _DECODED_BYTES):
+            try:
+                messages.append(reader.decode(batch.record(nth)))
+                rows.append(nth)
+            except UndecodableError as error:
+                reason = reason or error.reason
+            size += sizes[nth]
+            nth += 1
+        level = level_of(plan, messages)
+        yield replace(
+            table.rows(np.array(rows, np.int64)),
+            columns=level.columns,
+            elements=level.elements,
+            left_out=level.left_out,
+            undecodable=nth - begin - len(rows),
+            undecodable_reason=reason,
+        )
+        begin = nth

@@ -1,0 +1,359 @@
+"""Reads all messages of a batch at once, field after field, with numpy.
+
+Each message has a position; every step reads one field (or run of fields) of all messages there and
+moves the positions on. The reads of a step may go past the end of their message: what shows it is
+that the position behind them does, since positions never go back. Then, and wherever rosbags would
+or might refuse a message, nothing of the walk is used: `NotWalkedError` leaves the whole batch to
+the decoder, which decides message by message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from ros2_memory.columns.plan import Array, NumberSequence, Run, Sequence, Text, Time
+from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Texts
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.storage.base import SEQUENCE
+
+if TYPE_CHECKING:
+    from ros2_memory.columns.plan import Plan
+    from ros2_memory.columns.table import Column, Numbers
+    from ros2_memory.storage.base import Batch, IntArray
+
+MAX_LOOPS: Final = 2_048
+"""Steps of a walk along sequences whose elements differ in size; of longer ones each message is
+sooner decoded alone."""
+MAX_COUNTED_BYTES: Final = 256 << 10
+"""In a larger message the decoder counts strings and messages, and may refuse it."""
+_HEADER_BYTES: Final = 4
+_LITTLE_ENDIAN: Final = 0x0100
+"""The first two bytes of the header of plain CDR in little endian, as a number in little endian."""
+_MAX_PADDING: Final = 3
+_EVERY_BYTE: Final = (1,)
+
+
+Row: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.generic[object]]]"
+Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
+
+
+class NotWalkedError(Exception):
+    """A batch that must be decoded message by message."""
+
+
+@dataclass(slots=True)
+class Level:
+    """The columns of messages, or of the elements of one sequence, while they are read."""
+
+    columns: dict[str, Column] = field(default_factory=dict)
+    elements: dict[str, Elements] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def walked(plan: Plan, batch: Batch) -> Level:
+    """Returns the columns of a batch.
+
+    Raises:
+        NotWalkedError: the messages must be decoded one by one.
+    """
+    sizes = batch.sizes
+    if not sizes.size:
+        raise NotWalkedError
+    if sizes.min() < _HEADER_BYTES or (plan.has_objects and sizes.max() >= MAX_COUNTED_BYTES):
+        raise NotWalkedError
+    walk = _Walk(batch.buffer)
+    try:
+        if (walk.at("<u2", batch.starts) != _LITTLE_ENDIAN).any():
+            raise NotWalkedError
+        level = Level(left_out=dict(plan.left_out))
+        rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
+        end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
+    except (IndexError, UnicodeDecodeError) as error:
+        raise NotWalkedError from error
+    left = rows.sizes - end
+    if left.min() < 0 or left.max() > _MAX_PADDING:
+        raise NotWalkedError
+    return level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """What is walked: where each message's body begins in the buffer, and its bytes.
+
+    Positions count from there, since alignment does.
+    """
+
+    origins: IntArray
+    sizes: IntArray
+
+    def of(self, rows: IntArray) -> _Rows:
+        return _Rows(self.origins[rows], self.sizes[rows])
+
+
+def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
+    if align > 1:
+        positions = (positions + (align - 1)) & -align
+    return positions + skip if skip else positions
+
+
+@dataclass(slots=True)
+class _Walk:
+    buffer: bytes
+    loops: int = 0
+
+    def at(self, dtype: np.dtype[np.generic[object]] | str, places: IntArray) -> Row:
+        """Returns what lies at these places of the buffer, aligned or not."""
+        kind = np.dtype(dtype)
+        # A view with an element at every byte: indexing it gathers one field of all messages.
+        count = max(len(self.buffer) - kind.itemsize + 1, 0)
+        return np.ndarray(count, kind, self.buffer, 0, _EVERY_BYTE)[places]
+
+    def read(self, plan: Plan, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
+        """Goes through messages that begin at these positions; returns where they end.
+
+        Args:
+            plan: of their type.
+            rows: the messages that they lie in.
+            at: where each begins.
+            level: takes the columns; None to find out where they end.
+        """
+        for step in plan.steps:
+            if isinstance(step, Run):
+                at = _aligned(at, step.align)
+                if level is not None and step.fields:
+                    self._read_run(step, rows.origins + at, level)
+                at = at + step.size
+            elif isinstance(step, Text):
+                at = self._read_text(step, rows, at, level)
+            elif isinstance(step, NumberSequence):
+                at = self._read_numbers(step, rows, at, level)
+            else:
+                at = self._read_sequence(step, rows, at, level)
+        return at
+
+    def _read_run(self, run: Run, places: IntArray, level: Level) -> None:
+        columns = level.columns
+        count = max(len(self.buffer) - run.dtype.itemsize + 1, 0)
+        block = np.ndarray(count, run.dtype, self.buffer, 0, _EVERY_BYTE)[places]
+        for nth, entry in enumerate(run.fields):
+            if isinstance(entry, Array):
+                columns[f"{entry.path}.length"] = np.full(places.size, entry.length, np.uint32)
+                if entry.is_ranged:
+                    add_ranges(columns, entry.path, block[str(nth)], is_bool=entry.is_bool)
+            elif isinstance(entry, Time):
+                time = block[str(nth)]
+                columns[entry.path] = time["f0"] * np.int64(NS_PER_S) + time["f1"]
+            else:
+                number = block[str(nth)]
+                columns[entry.path] = number != 0 if entry.is_bool else np.ascontiguousarray(number)
+
+    def _length(self, rows: _Rows, at: IntArray) -> IntArray:
+        return self.at("<u4", rows.origins + at).astype(np.int64)
+
+    def _read_text(self, text: Text, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
+        at = _aligned(at, text.align, text.skip)
+        sizes = self._length(rows, at)
+        at = at + 4
+        end = at + sizes
+        # Zero behind each string, as rosbags demands.
+        if (sizes < 1).any() or (end > rows.sizes).any():
+            raise NotWalkedError
+        if self.at("u1", rows.origins + end - 1).any():
+            raise NotWalkedError
+        if level is not None:
+            level.columns[text.path] = self._texts(rows.origins + at, sizes - 1)
+        return end
+
+    def _texts(self, places: IntArray, sizes: IntArray) -> Texts:
+        rows = places.size
+        if not rows:
+            return Texts(np.zeros(0, np.uint32), ())
+        size = int(sizes[0])
+        words: list[bytes]
+        if (sizes == size).all():
+            data = self.at(f"V{size}", places).tobytes() if size else b""
+            if data == data[:size] * rows:
+                return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
+            words = [data[begin : begin + size] for begin in range(0, len(data), size)]
+        else:
+            ends = (places + sizes).tolist()
+            buffer = self.buffer
+            words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
+        known: dict[bytes, int] = {}
+        codes = [known.setdefault(word, len(known)) for word in words]
+        return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in known]))
+
+    def _read_numbers(
+        self, step: NumberSequence, rows: _Rows, at: IntArray, level: Level | None
+    ) -> IntArray:
+        at = _aligned(at, step.align, step.skip)
+        counts = self._length(rows, at)
+        at = at + 4
+        # An empty sequence is not aligned to its elements.
+        begin = np.where(counts > 0, _aligned(at, step.size), at) if step.size > 4 else at
+        end = begin + counts * step.size
+        if (end > rows.sizes).any():
+            raise NotWalkedError
+        if level is not None:
+            values = self._values(step, rows.origins + begin, counts)
+            add_sequence(level, step.path, counts, values, is_bool=step.is_bool)
+        return end
+
+    def _values(self, step: NumberSequence, places: IntArray, counts: IntArray) -> Numbers:
+        """Returns the numbers of sequences, but of those that take too long to look at."""
+        short = counts * step.size <= MAX_RANGED_BYTES
+        if not short.all():
+            places, counts = places[short], counts[short]
+        if not counts.size:
+            return np.zeros(0, step.dtype)
+        count = int(counts[0])
+        if count and (counts == count).all():
+            data = self.at(f"V{count * step.size}", places).tobytes()
+            return np.frombuffer(data, step.dtype)
+        return self.at(step.dtype, np.repeat(places, counts) + within(counts) * step.size)
+
+    def _read_sequence(
+        self, step: Sequence, rows: _Rows, at: IntArray, level: Level | None
+    ) -> IntArray:
+        if step.length == SEQUENCE:
+            at = _aligned(at, step.align, step.skip)
+            counts = self._length(rows, at)
+            at = at + 4
+        else:
+            counts = np.full(at.size, step.length, np.int64)
+        if (at + counts * max(step.plan.least, 1) > rows.sizes).any():
+            raise NotWalkedError
+        owners = np.repeat(np.arange(at.size), counts)
+        if step.plan.ends:
+            begins, end = _steady(step.plan, at, counts, owners)
+        else:
+            begins, end = self._stepped(step.plan, rows, at, counts)
+        if (end > rows.sizes).any():
+            raise NotWalkedError
+        if level is not None:
+            inner = Level()
+            self.read(step.plan, rows.of(owners), begins, inner)
+            level.elements[step.path] = Elements(owners, inner.columns, inner.elements)
+            level.left_out |= {f"{step.path}.{path}": why for path, why in inner.left_out.items()}
+        return end
+
+    def _stepped(
+        self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Returns where elements of various sizes begin, and where their sequences end."""
+        most = int(counts.max(initial=0))
+        self.loops += most
+        if self.loops > MAX_LOOPS:
+            raise NotWalkedError
+        first = np.cumsum(counts) - counts
+        begins = np.zeros(int(counts.sum()), np.int64)
+        end = at.copy()
+        for nth in range(most):
+            left = np.flatnonzero(counts > nth)
+            is_all = left.size == counts.size
+            here = _aligned(end if is_all else end[left], plan.align)
+            begins[first + nth if is_all else first[left] + nth] = here
+            behind = self.read(plan, rows if is_all else rows.of(left), here, None)
+            if is_all:
+                end = behind
+            else:
+                end[left] = behind
+        return begins, end
+
+
+def _steady(
+    plan: Plan, at: IntArray, counts: IntArray, owners: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Returns where elements of a fixed layout begin, and where their sequences end.
+
+    The first begins anywhere; behind it all are equally far apart, since the last field of the
+    strictest alignment puts whatever follows it at the same distance from a multiple.
+    """
+    unit, ends = plan.unit, np.array(plan.ends)
+    first = _aligned(at, plan.align)
+    rest = first % unit
+    second = _aligned(first - rest + ends[rest], plan.align)
+    steady = second % unit
+    step = _aligned(ends[steady], plan.align) - steady
+    nth = within(counts)
+    begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * step[owners])
+    last = np.where(counts > 1, second + (counts - 2) * step, first)
+    end = last - last % unit + ends[last % unit]
+    return begins, np.where(counts > 0, end, at)
+
+
+def within(counts: IntArray) -> IntArray:
+    """Returns 0, 1, 2 .. for each count, one after the other."""
+    before = np.cumsum(counts) - counts
+    return np.arange(int(counts.sum())) - np.repeat(before, counts)
+
+
+def add_sequence(
+    level: Level, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
+) -> None:
+    """Adds what is kept of a sequence of numbers.
+
+    Args:
+        level: takes it.
+        path: of the sequence.
+        counts: the numbers of each row.
+        values: those of the rows that take no more than `MAX_RANGED_BYTES`, in order.
+        is_bool: whether they are booleans.
+    """
+    if is_bool:
+        values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
+    level.columns[f"{path}.length"] = counts.astype(np.uint32)
+    ranged = counts * values.itemsize <= MAX_RANGED_BYTES
+    least, greatest = _ranges(np.where(ranged, counts, 0), values)
+    level.columns[f"{path}.least"], level.columns[f"{path}.greatest"] = least, greatest
+    few = counts <= MAX_NUMBERS
+    kept = np.repeat(few[ranged], counts[ranged])
+    numbers = values if kept.all() else values[kept]
+    owners = np.repeat(np.arange(counts.size), np.where(few, counts, 0))
+    level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
+    if not few.all():
+        level.left_out[path] = f"more than {MAX_NUMBERS} numbers in some messages"
+
+
+def _ranges(counts: IntArray, values: Numbers) -> tuple[Floats, Floats]:
+    """Returns the least and greatest finite value of each row; NaN where there is none."""
+    least = np.full(counts.size, np.nan)
+    greatest = least.copy()
+    filled = counts > 0
+    if values.size:
+        begins = (np.cumsum(counts) - counts)[filled]
+        low, high = _finite_bounds(values)
+        least[filled] = np.minimum.reduceat(low, begins)
+        greatest[filled] = np.maximum.reduceat(high, begins)
+        _unbounded(least, greatest)
+    return least, greatest
+
+
+def add_ranges(columns: dict[str, Column], path: str, values: Numbers, *, is_bool: bool) -> None:
+    """Adds the least and greatest finite value of each row of numbers."""
+    if is_bool:
+        values = (values != 0).view(np.uint8)
+    low, high = _finite_bounds(values)
+    least, greatest = low.min(1).astype(np.float64), high.max(1).astype(np.float64)
+    _unbounded(least, greatest)
+    columns[f"{path}.least"], columns[f"{path}.greatest"] = least, greatest
+
+
+def _finite_bounds(values: Numbers) -> tuple[Numbers, Numbers]:
+    """Returns the values twice, with what is not finite put where it is neither bound."""
+    if values.dtype.kind != "f":
+        return values, values
+    finite = np.isfinite(values)
+    if finite.all():
+        return values, values
+    return np.where(finite, values, np.inf), np.where(finite, values, -np.inf)
+
+
+def _unbounded(least: Floats, greatest: Floats) -> None:
+    """Puts NaN where no value was finite."""
+    none = least > greatest
+    if none.any():
+        least[none] = greatest[none] = np.nan
