@@ -31,6 +31,10 @@ Differences have a sign: 0, -1, 1, -2, 2 are written 0, 1, 2, 3, 4. Sums start a
 of the zone says where. Numbers that are 2**62 apart and more are arranged `plain`: all 8 bytes, and
 nothing subtracted.
 
+A last word `from` says that the column was unpacked and is packed again (`carried`): its zone is
+that of the values before they were packed first, and its bytes begin with 8 for the least of those
+that it has now, a float64 or an integer.
+
 Texts are `text constant` (one word) or `text`, arrangement and bytes of their codes, whose least is
 0. Their bytes begin with the words, the codes follow::
 
@@ -44,8 +48,8 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import zstandard
@@ -54,13 +58,14 @@ from ros2_memory.columns.steps import EXACT, MOST_RELATIVE, Step
 from ros2_memory.columns.table import Column, Numbers, Texts, Zone
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from ros2_memory.storage.base import IntArray
 
-Number = TypeVar("Number", bound=np.generic)
+Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Values = TypeVar("Values", "IntArray", "Floats")
 
 FORMAT: Final = 1
 """What bytes mean: to be raised with every change of what this module or `blob` writes."""
@@ -108,6 +113,18 @@ class Packed:
     error: float
     zone: Zone
     data: bytes
+
+
+class Known(NamedTuple):
+    """What is known of a packed column without unpacking it.
+
+    Attributes:
+        error: the greatest absolute error of a value, against what the bag has.
+        zone: of the values that the bag has.
+    """
+
+    error: float
+    zone: Zone
 
 
 def pack(column: Column, step: Step = EXACT) -> Packed:
@@ -167,6 +184,11 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
         ValueError: there is no such codec, or the bytes are not of it.
     """
     kind, _, rest = codec.partition(" ")
+    if rest.endswith(" from"):
+        rest = rest.removesuffix(" from")
+        least, data = number_of(data[:8], kind), data[8:]
+        if math.isnan(least):
+            least = None
     if kind == "text":
         return _unpack_texts(rest, count, data)
     dtype = np.dtype(kind)
@@ -186,6 +208,33 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     lowest = int(_ordered(np.array([least], stored), rounded=rounded)[0])
     whole = _whole_numbers(arrangement, count, lowest, data)
     return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
+
+
+def carried(packed: Packed, known: Known) -> Packed:
+    """Returns a column that was unpacked before it was packed again, with what was known of it.
+
+    Its error is at most that of both times together, its zone the one from before any rounding.
+    """
+    error = packed.error + known.error
+    if packed.zone == known.zone:
+        return replace(packed, error=error)
+    least = packed.zone.least
+    base = eight_bytes(math.nan if least is None else least)
+    return Packed(f"{packed.codec} from", packed.count, error, known.zone, base + packed.data)
+
+
+def eight_bytes(number: float) -> bytes:
+    """Returns a float as a float64, an integer as one of 8 bytes, signed or not."""
+    if isinstance(number, int):
+        return (number & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "little")
+    return struct.pack("<d", number)
+
+
+def number_of(data: bytes, dtype: str) -> float:
+    """Returns what `eight_bytes` was given; `dtype` is the name of the column's."""
+    if dtype.startswith("float"):
+        return float(struct.unpack("<d", data)[0])
+    return int.from_bytes(data, "little", signed=not dtype.startswith("u"))
 
 
 def compressed(data: bytes, level: int = LEVEL) -> bytes:
@@ -225,21 +274,25 @@ class _InLine:
         self.stops = np.cumsum(self.lengths)
         self.starts = self.stops - self.lengths
 
-    def parts(self, values: NDArray[Number]) -> list[NDArray[Number]]:
+    def parts(self, values: Values) -> list[Values]:
         """Returns the values of each column."""
         bounds = zip(self.starts.tolist(), self.stops.tolist(), strict=True)
         return [values[start:stop] for start, stop in bounds]
 
-    def bounds(self, values: NDArray[Number]) -> Iterator[tuple[Number, Number]]:
-        """Yields the least and the greatest value of each column; NaN where it has one."""
-        least = np.minimum.reduceat(values, self.starts).tolist()
-        return zip(least, np.maximum.reduceat(values, self.starts).tolist(), strict=True)
+    def least(self, values: Values) -> Values:
+        """Returns the least value of each column; NaN where it has one."""
+        return np.minimum.reduceat(values, self.starts)
 
-    def means(self, values: NDArray[Number]) -> NDArray[np.float64]:
+    def greatest(self, values: Values) -> Values:
+        """Returns the greatest value of each column; NaN where it has one."""
+        return np.maximum.reduceat(values, self.starts)
+
+    def means(self, values: Values) -> Floats:
         """Returns the mean of each column."""
-        return np.add.reduceat(values, self.starts, dtype=np.float64) / self.lengths
+        means: Floats = np.add.reduceat(values, self.starts, dtype=np.float64) / self.lengths
+        return means
 
-    def rows(self, values: NDArray[Number]) -> NDArray[Number]:
+    def rows(self, values: Values) -> Values:
         """Returns a value of each column for every row of it."""
         return np.repeat(values, self.lengths)
 
@@ -248,12 +301,13 @@ def _pack_integers(columns: Sequence[Numbers]) -> Iterator[Packed | _Whole]:
     lie = _InLine(columns)
     # Unsigned ones of 2**63 and more wrap around, here and back.
     numbers = np.concatenate(columns, dtype=np.int64, casting="unsafe")
-    parts, bounds = lie.parts(numbers), lie.bounds(numbers)
-    for column, part, (least, greatest) in zip(columns, parts, bounds, strict=True):
+    leasts, greatests = lie.least(numbers).tolist(), lie.greatest(numbers).tolist()
+    for nth, (column, part) in enumerate(zip(columns, lie.parts(numbers), strict=True)):
         name = column.dtype.name
+        zone = Zone(leasts[nth], greatests[nth])
         if name == "uint64":
-            least, greatest = int(column.min()), int(column.max())
-        zone = Zone(least, greatest)
+            zone = Zone(int(column.min()), int(column.max()))
+        least, greatest = int(zone.least or 0), int(zone.greatest or 0)
         if least == greatest:
             yield Packed(f"{name} constant", len(part), 0.0, zone, b"")
         else:
@@ -274,8 +328,11 @@ class _Floats:
         lie = _InLine(self.columns)
         values = np.concatenate(self.columns, dtype=np.float64)
         self.values = lie.parts(values)
-        bounds = zip(self.values, lie.bounds(values), strict=True)
-        self.zones = [_zone_of(part, least, greatest) for part, (least, greatest) in bounds]
+        bounds = zip(lie.least(values).tolist(), lie.greatest(values).tolist(), strict=True)
+        self.zones = [
+            _zone_of(part, least, greatest)
+            for part, (least, greatest) in zip(self.values, bounds, strict=True)
+        ]
         self.found: dict[int, Packed | _Whole] = {}
 
     def packed(self) -> list[Packed | _Whole]:
@@ -314,15 +371,13 @@ class _Floats:
         samples = [self.values[nth][:: max(1, len(self.values[nth]) // _SAMPLE)] for nth in some]
         scaled = np.multiply.outer(np.array(_DECIMALS, np.float64), np.concatenate(samples))
         fit = np.abs(np.rint(scaled) - scaled) <= MOST_RELATIVE * np.abs(scaled)
-        all_fit = np.logical_and.reduceat(fit, _InLine(samples).starts, axis=1)
-        coarsest = zip(
-            some, all_fit.argmax(axis=0).tolist(), all_fit.any(axis=0).tolist(), strict=True
-        )
-        return {
-            nth: _DECIMALS[which]
-            for nth, which, is_one in coarsest
-            if is_one and self._most(nth) * _DECIMALS[which] < self.limit
-        }
+        fits = np.logical_and.reduceat(fit, _InLine(samples).starts, axis=1)
+        found: dict[int, int] = {}
+        for nth, column in zip(some, fits.T, strict=True):
+            coarsest = _DECIMALS[int(column.argmax())]
+            if column.any() and self._most(nth) * coarsest < self.limit:
+                found[nth] = coarsest
+        return found
 
     def _as_multiples(self, per_units: Mapping[int, int]) -> None:
         """Takes those of the columns that are multiples of a step, or near enough to them."""
@@ -334,40 +389,40 @@ class _Floats:
         back = multiples / per_unit
         if self.name == "float32":
             back = back.astype(np.float32).astype(np.float64)
-        forms = [f"/{number}" for number in per_units.values()]
-        self._take(members, forms, lie, values, back, multiples.astype(np.int64))
+        forms = {nth: f"/{number}" for nth, number in per_units.items()}
+        self._take(forms, values, back, multiples.astype(np.int64))
 
     def _rounded(self, members: Sequence[int]) -> None:
         """Takes the columns with fewer bits, or as they are: tiny numbers have no bits to spare."""
-        lie = _InLine([self.columns[nth] for nth in members])
         columns = np.concatenate([self.columns[nth] for nth in members])
         whole = _ordered(columns, rounded=True)
         back = _from_ordered(whole, columns.dtype, rounded=True)
         values = columns.astype(np.float64, copy=False)
-        self._take(members, ["rounded"] * len(members), lie, values, back, whole)
+        self._take(dict.fromkeys(members, "rounded"), values, back, whole)
         for nth in members:
             if nth not in self.found:
                 self._exactly(nth)
 
     def _take(
-        self,
-        members: Sequence[int],
-        forms: Sequence[str],
-        lie: _InLine,
-        values: NDArray[np.float64],
-        back: NDArray[np.float64],
-        whole: IntArray,
+        self, forms: Mapping[int, str], values: Floats, back: Floats, whole: IntArray
     ) -> None:
+        """Takes columns that come back so, unless one is relative and off by more than it may."""
+        lie = _InLine([self.columns[nth] for nth in forms])
         errors = np.abs(back - values)
-        excess = errors - MOST_RELATIVE * np.abs(values)
-        worst = np.maximum.reduceat(errors, lie.starts).tolist()
-        too_much = (np.maximum.reduceat(excess, lie.starts) > 0).tolist()
-        bounds = lie.bounds(whole)
-        for row, (part, (least, greatest)) in enumerate(zip(lie.parts(whole), bounds, strict=True)):
-            nth = members[row]
-            if not (self.steps[nth].relative and too_much[row]):
-                form, zone = f"{self.name} {forms[row]}", self.zones[nth]
-                self.found[nth] = _Whole(form, worst[row], zone, b"", part, least, greatest)
+        excess = lie.greatest(errors - MOST_RELATIVE * np.abs(values)).tolist()
+        worst = lie.greatest(errors).tolist()
+        leasts, greatests = lie.least(whole).tolist(), lie.greatest(whole).tolist()
+        for row, (nth, part) in enumerate(zip(forms, lie.parts(whole), strict=True)):
+            if not self.steps[nth].relative or excess[row] <= 0:
+                self.found[nth] = _Whole(
+                    f"{self.name} {forms[nth]}",
+                    worst[row],
+                    self.zones[nth],
+                    b"",
+                    part,
+                    leasts[row],
+                    greatests[row],
+                )
 
     def _exactly(self, nth: int) -> None:
         stored, form = self.columns[nth], "bits"
@@ -382,7 +437,7 @@ class _Floats:
         self.found[nth] = _Whole(form, 0.0, self.zones[nth], b"", whole, least, greatest)
 
 
-def _zone_of(values: NDArray[np.float64], least: float, greatest: float) -> Zone:
+def _zone_of(values: Floats, least: float, greatest: float) -> Zone:
     """The zone of values, by the least and the greatest of them: NaN where there is one."""
     if not math.isnan(least):
         return Zone(least + 0.0, greatest + 0.0)  # -0.0 becomes 0.0
@@ -407,9 +462,7 @@ def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
     return bits ^ ((bits >> 63) & magnitude)
 
 
-def _from_ordered(
-    whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool
-) -> NDArray[np.float64]:
+def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool) -> Floats:
     integer, magnitude, dropped = _BITS[dtype.itemsize]
     if rounded:
         bits = (whole ^ ((whole >> 63) & (magnitude >> dropped))) << dropped
@@ -473,30 +526,33 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
     """Returns the whole numbers that were arranged; the least of them is `least`."""
     name, _, width = arrangement.partition(" ")
     if name in {"plain", "flat"}:
-        numbers = _from_planes(data, 0, count, int(width)).astype(np.int64)
-        numbers += _wrapped(least)
-        return numbers
+        return np.add(_from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
     first: int = struct.unpack_from("<q", data)[0]
     if name == "line":
         numbers = np.arange(count)
         numbers *= first
         numbers += _from_planes(data, 8, count, int(width)).astype(np.int64, copy=False)
-    elif name in {"delta", "curve"}:
-        ahead = 1 if name == "delta" else 2
+    elif name == "delta":
         numbers = np.zeros(count, np.int64)
-        zigzag = _from_planes(data, 8, count - ahead, int(width))
-        signs = (zigzag & 1).view(zigzag.dtype.str.replace("u", "i"))
-        numbers[ahead:] = (zigzag >> 1).view(signs.dtype) ^ -signs
-        if name == "curve":
-            numbers[1] = first
-            np.cumsum(numbers[1:], out=numbers[1:])
-        elif first:
-            numbers[1:] += first
-        np.cumsum(numbers, out=numbers)
+        numbers[1:] = _signed(_from_planes(data, 8, count - 1, int(width)))
+        numbers[1:] += first
+    elif name == "curve":
+        numbers = np.zeros(count, np.int64)
+        numbers[1] = first
+        numbers[2:] = _signed(_from_planes(data, 8, count - 2, int(width)))
+        np.cumsum(numbers[1:], out=numbers[1:])
     else:
         raise ValueError(f"packed columns are not arranged {name!r}")
+    if name != "line":
+        np.cumsum(numbers, out=numbers)
     numbers += np.subtract(_wrapped(least), numbers.min(keepdims=True))
     return numbers
+
+
+def _signed(numbers: Numbers) -> Numbers:
+    """0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
+    signs = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
+    return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
 
 
 def _wrapped(number: int) -> np.int64:
@@ -524,7 +580,7 @@ def _from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
 
 def _pack_texts(column: Texts) -> Packed | _Whole:
     codes, words = _in_use(column)
-    zone = Zone(words=_folded(words))
+    zone = Zone(words=folded(words))
     if not words:
         return Packed("text constant", 0, 0.0, zone, b"")
     lengths = np.array([len(word) for word in words], "<u4")
@@ -546,7 +602,8 @@ def _in_use(column: Texts) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
     return codes, tuple(column.words[nth] for nth in np.flatnonzero(used).tolist())
 
 
-def _folded(words: tuple[str, ...]) -> str | None:
+def folded(words: Collection[str]) -> str | None:
+    """Returns the words as a zone has them; None if they are too many or too long to be kept."""
     if sum(map(len, words)) + len(words) > MOST_WORDS_BYTES:
         return None
     folded = "\n".join(dict.fromkeys(word.casefold() for word in words))
@@ -563,7 +620,7 @@ def _unpack_texts(arrangement: str, count: int, data: bytes) -> Texts:
 
 def zone_of_texts(data: bytes) -> Zone:
     """Returns the zone of packed texts from their words alone."""
-    return Zone(words=_folded(_words(data)[0]))
+    return Zone(words=folded(_words(data)[0]))
 
 
 def _words(data: bytes) -> tuple[tuple[str, ...], int]:
