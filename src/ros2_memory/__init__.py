@@ -22,7 +22,6 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     bag_dir         the contract between the two programs: file names, heartbeat, handover, lock,
                     own recordings, saved moments, requests, state of rules
     analysis        pure mathematics: transform tree, odometry, paths, intervals, conditions
-    columns         bags as columns: decoded once, packed, asked as arrays
     index           directory scan -> file state -> bag table -> timeline -> snapshot
     retention       garbage collection, latched carry-forward, repair, saved moments
     triggers        rules that keep what was recorded around an event

@@ -33,174 +33,39 @@ later: the middleware delays every message by a little, and publishers keep time
 
 from __future__ import annotations
 
-import json
 import struct
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple, NotRequired, TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
 from ros2_memory.columns.pack import (
     FORMAT,
+    Known,
     Packed,
+    carried,
     compressed,
     decompressed,
-    pack,
+    eight_bytes,
+    number_of,
+    pack_columns,
     unpack,
     zone_of_texts,
 )
-from ros2_memory.columns.steps import EXACT, Step, step_of
-from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts, Zone
+from ros2_memory.columns.steps import EXACT, Step
+from ros2_memory.columns.stored import StoredTable, Times, Topic, lazy_table
+from ros2_memory.columns.table import Column, Elements, Numbers, Table, Zone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from ros2_memory.storage.base import Channel, Definition, IntArray
+    from ros2_memory.columns.layout import Layout
+    from ros2_memory.storage.base import IntArray
 
 _PUBLISHED: Final = 1
 _PLACES: Final = 2
 _HASHES: Final = 4
-
-
-V = TypeVar("V")
-
-
-class _Described(TypedDict):
-    """A layout as JSON."""
-
-    columns: dict[str, str]
-    sequences: NotRequired[dict[str, _Described]]
-    left_out: NotRequired[dict[str, str]]
-
-
-class Kind(NamedTuple):
-    """What a column is: `text` or numpy's name of its dtype, and how exactly it is stored."""
-
-    dtype: str
-    step: Step = EXACT
-
-
-class Slot(NamedTuple):
-    """Where a column lies among the packed ones of its table, in the order of `Layout`.
-
-    Attributes:
-        nth: its place.
-        dtype: as in `Kind`.
-        sequence: the number of the sequence that it is of, counted like the places; 0: none.
-    """
-
-    nth: int
-    dtype: str
-    sequence: int
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """The columns of the tables of one topic, type and definition.
-
-    Attributes:
-        columns: by the path of the field.
-        sequences: by the path of the sequence, as `Elements` has them.
-        left_out: what is no column, and why.
-        slots: where a column lies among the packed ones of its table, by its path from there
-            (`detections.label`), and where owners lie, by the path of the sequence and `#`.
-    """
-
-    columns: Mapping[str, Kind]
-    sequences: Mapping[str, Layout] = field(default_factory=dict)
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    slots: Mapping[str, Slot] = field(init=False, compare=False, repr=False)
-
-    def __post_init__(self) -> None:
-        slots = {
-            path: Slot(nth, kind.dtype, 0) for nth, (path, kind) in enumerate(self.columns.items())
-        }
-        sequences = 0
-        for path, inner in self.sequences.items():
-            own = sequences + 1
-            sequences = own
-            slots[f"{path}#"] = Slot(len(slots), "int64", own)
-            begin = len(slots)
-            for name, slot in inner.slots.items():
-                whole = f"{path}.{name}".rstrip(".")
-                sequences = max(sequences, own + slot.sequence)
-                slots[whole] = Slot(begin + slot.nth, slot.dtype, own + slot.sequence)
-        object.__setattr__(self, "slots", slots)
-
-    @classmethod
-    def of(cls, table: Table, definition: Definition | None) -> Layout:
-        """Returns that of a table; the definition names the steps."""
-        return cls._of(table, definition, "", table.left_out)
-
-    @classmethod
-    def _of(
-        cls,
-        rows: Table | Elements,
-        definition: Definition | None,
-        around: str,
-        left_out: Mapping[str, str],
-    ) -> Layout:
-        columns = {
-            name: _kind(column, f"{around}{name}".rstrip("."), definition)
-            for name, column in rows.columns.items()
-        }
-        sequences = {
-            name: cls._of(inner, definition, f"{around}{name}.", {})
-            for name, inner in rows.elements.items()
-        }
-        return cls(columns, sequences, left_out)
-
-    def to_json(self) -> str:
-        """Returns it as a person can read it; equal layouts give equal texts."""
-        return json.dumps(self._described(), ensure_ascii=False)
-
-    def _described(self) -> dict[str, object]:
-        found: dict[str, object] = {
-            "columns": {
-                path: kind.dtype if kind.step == EXACT else f"{kind.dtype} {kind.step}"
-                for path, kind in self.columns.items()
-            }
-        }
-        if self.sequences:
-            found["sequences"] = {
-                path: inner._described() for path, inner in self.sequences.items()
-            }
-        if self.left_out:
-            found["left_out"] = dict(self.left_out)
-        return found
-
-    @classmethod
-    def from_json(cls, text: str) -> Layout:
-        """Returns the layout that was written so.
-
-        Raises:
-            ValueError: it is not one.
-        """
-        try:
-            return cls._read(cast("_Described", json.loads(text)))
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(f"this is not the layout of a table: {text[:80]!r}") from error
-
-    @classmethod
-    def _read(cls, described: _Described) -> Layout:
-        columns: dict[str, Kind] = {}
-        for path, words in described["columns"].items():
-            dtype, _, step = words.partition(" ")
-            columns[path] = Kind(dtype, Step.parse(step) if step else EXACT)
-        sequences = {
-            path: cls._read(inner) for path, inner in described.get("sequences", {}).items()
-        }
-        return cls(columns, sequences, described.get("left_out", {}))
-
-
-def _kind(column: Column, path: str, definition: Definition | None) -> Kind:
-    if isinstance(column, Texts):
-        return Kind("text")
-    name = column.dtype.name
-    return Kind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)
 
 
 class Entry(NamedTuple):
@@ -214,8 +79,8 @@ class Entry(NamedTuple):
 def pack_tables(entries: Iterable[Entry], *, places: bool = True) -> bytes:
     """Returns the tables as one compressed blob.
 
-    Publish times are packed where there are hashes: they tell copies of a message. Elsewhere they
-    come back as log times.
+    Publish times are packed where there are hashes, with which they tell copies of a message.
+    Elsewhere they come back as log times.
 
     Args:
         entries: the tables, in any order.
@@ -225,52 +90,74 @@ def pack_tables(entries: Iterable[Entry], *, places: bool = True) -> bytes:
         ValueError: a table has other columns than its layout.
     """
     heads: list[bytes] = []
-    packs: list[Packed] = []
+    columns: list[_Source] = []
     for topic, layout, table in entries:
-        hashes = table.payload_hashes
-        published = hashes is not None
-        flags = _PUBLISHED * published | _PLACES * places | _HASHES * (hashes is not None)
-        counts: list[int] = []
-        before = len(packs)
-        packs += _packed_times(table, published=published)
+        published = table.payload_hashes is not None
+        flags = _PUBLISHED * published | _PLACES * places
+        first = [table.log_times]
+        if published:
+            first = [table.log_times - table.publish_times, table.publish_times]
         if places:
-            packs.append(pack(table.places))
-        if hashes is not None:
-            packs.append(pack(hashes))
-        try:
-            packs += _packed_rows(layout, table, counts)
-        except KeyError as error:
-            raise ValueError(
-                f"the table of {table.channel.topic} has no {error}, which its layout has"
-            ) from error
-        rows = len(table.log_times)
-        number = len(packs) - before
-        heads.append(
-            struct.pack(f"<IBHHI{len(counts)}I", topic, flags, number, len(counts), rows, *counts)
-        )
+            first.append(table.places)
+        if table.payload_hashes is not None:
+            flags |= _HASHES
+            first.append(table.payload_hashes)
+        if not layout.fits(table):
+            raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
+        sources = [*(_Source(times) for times in first), *_sources(layout, table)]
+        counts = [len(one.column) for one in sources[len(first) :] if one.are_owners]
+        sizes = (len(sources), len(counts), len(table), *counts)
+        heads.append(struct.pack(f"<IBHHI{len(counts)}I", topic, flags, *sizes))
+        columns += sources
+    packs = _packed(columns)
     head = struct.pack("<BH", FORMAT, len(heads)) + b"".join(heads)
     return compressed(head + _directory(packs) + b"".join(packed.data for packed in packs))
 
 
-def _packed_times(table: Table, *, published: bool) -> Iterator[Packed]:
-    if not published:
-        yield pack(table.log_times)
-        return
-    yield pack(table.log_times - table.publish_times)
-    yield pack(table.publish_times)
+def pack_table(layout: Layout, table: Table) -> dict[str, Packed]:
+    """Returns the columns of one table, each on its own, by the paths of `Layout.slots`.
+
+    Times, places and hashes are not among them.
+
+    Raises:
+        ValueError: the table has other columns than the layout.
+    """
+    if not layout.fits(table):
+        raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
+    return dict(zip(layout.slots, _packed(list(_sources(layout, table))), strict=True))
 
 
-def _packed_rows(layout: Layout, rows: Table | Elements, counts: list[int]) -> Iterator[Packed]:
-    """In the order of `Layout.slots`; adds the number of elements of every sequence."""
-    if len(rows.columns) != len(layout.columns) or len(rows.elements) != len(layout.sequences):
-        raise ValueError(f"a table has other columns than its layout: {sorted(rows.columns)}")
+class _Source(NamedTuple):
+    """A column to be packed, and what is known of it if it was packed before."""
+
+    column: Column
+    step: Step = EXACT
+    known: Known | None = None
+    are_owners: bool = False
+
+
+def _packed(sources: Sequence[_Source]) -> list[Packed]:
+    packs = pack_columns([(source.column, source.step) for source in sources])
+    return [
+        packed if source.known is None else carried(packed, source.known)
+        for packed, source in zip(packs, sources, strict=True)
+    ]
+
+
+def _sources(
+    layout: Layout, table: Table, rows: Elements | None = None, around: str = ""
+) -> Iterator[_Source]:
+    """The columns of a table, or of elements of it, in the order of `Layout.slots`."""
+    some = table if rows is None else rows
     for path, kind in layout.columns.items():
-        yield pack(rows.columns[path], kind.step)
+        whole = f"{around}{path}"
+        zone = table.zone(whole)
+        known = None if zone is None else Known(table.error(whole), zone)
+        yield _Source(some.columns[path], kind.step, known)
     for path, inner in layout.sequences.items():
-        elements = rows.elements[path]
-        counts.append(len(elements.owners))
-        yield pack(elements.owners)
-        yield from _packed_rows(inner, elements, counts)
+        elements = some.elements[path]
+        yield _Source(elements.owners, are_owners=True)
+        yield from _sources(inner, table, elements, f"{around}{path}.")
 
 
 def _directory(packs: list[Packed]) -> bytes:
@@ -283,8 +170,9 @@ def _directory(packs: list[Packed]) -> bytes:
     stated = np.where(stated < errors, np.nextafter(stated, np.float32(np.inf)), stated)
     sizes = np.array([len(packed.data) for packed in packs], "<u4")
     nulls = np.array([packed.zone.nulls for packed in packs], "<u4")
-    least = np.frombuffer(b"".join(_eight(packed.zone.least) for packed in packs), "<u8")
-    greatest = np.frombuffer(b"".join(_eight(packed.zone.greatest) for packed in packs), "<u8")
+    leasts = [eight_bytes(packed.zone.least or 0) for packed in packs]
+    greatests = [eight_bytes(packed.zone.greatest or 0) for packed in packs]
+    least, greatest = (np.frombuffer(b"".join(some), "<u8") for some in (leasts, greatests))
     names = "\n".join(codecs).encode()
     return b"".join(
         (
@@ -300,23 +188,8 @@ def _directory(packs: list[Packed]) -> bytes:
     )
 
 
-def _eight(number: float | None) -> bytes:
-    if number is None:
-        return bytes(8)
-    if isinstance(number, int):
-        return (number & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "little")
-    return struct.pack("<d", number)
-
-
 def _in_planes(numbers: Numbers) -> bytes:
     return numbers.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes()
-
-
-class Topic(NamedTuple):
-    """What the caller keeps of a topic under its number."""
-
-    channel: Channel
-    layout: Layout
 
 
 def unpack_tables(
@@ -387,7 +260,8 @@ class _Packs:
         error, nulls, least, difference = struct.unpack("<fIQQ", self._facts[nth])
         zone = Zone(nulls=nulls)
         if nulls < count:
-            zone = Zone(_number(dtype, least), _number(dtype, least ^ difference), nulls)
+            least, greatest = (struct.pack("<Q", bits) for bits in (least, least ^ difference))
+            zone = Zone(number_of(least, dtype), number_of(greatest, dtype), nulls)
         return Packed(codec, count, error, zone, data)
 
 
@@ -400,127 +274,35 @@ def _from_planes(planes: NDArray[np.uint8], dtype: str) -> Numbers:
     return np.ascontiguousarray(planes.T).view(dtype).ravel()
 
 
-def _number(dtype: str, bits: int) -> float:
-    raw = bits.to_bytes(8, "little")
-    if dtype.startswith("float"):
-        return float(struct.unpack("<d", raw)[0])
-    return int.from_bytes(raw, "little", signed=not dtype.startswith("u"))
-
-
-class Lazily(Mapping[str, V]):
-    """A mapping whose values are made when they are first asked for, and kept."""
-
-    def __init__(self, names: Collection[str], make: Callable[[str], V]) -> None:
-        self._names = names
-        self._make = make
-        self._made: dict[str, V] = {}
-
-    def __getitem__(self, name: str) -> V:
-        made = self._made.get(name)
-        if made is None:
-            if name not in self._names:
-                raise KeyError(name)
-            made = self._made[name] = self._make(name)
-        return made
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._names
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
-    def __len__(self) -> int:
-        return len(self._names)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredTable(Table):
-    """A table of a blob. Its columns are unpacked when they are first asked for, by any thread."""
-
-    number: int = 0
-    known: Callable[[str], Packed] | None = None
-
-    def error(self, path: str) -> float:
-        """Returns the greatest absolute error of a column, 0.0 where it is exact.
-
-        Args:
-            path: the column; of elements `<sequence>.<column>`.
-
-        Raises:
-            KeyError: there is no such column.
-        """
-        return 0.0 if self.known is None else self.known(path).error
-
-    def zone(self, path: str) -> Zone | None:
-        """Returns what is known of a column without unpacking it; `path` as in `error`.
-
-        Raises:
-            KeyError: there is no such column.
-        """
-        return None if self.known is None else self.known(path).zone
-
-
 def _table(
     packs: _Packs, first: int, head: _Head, counts: tuple[int, ...], topic: Topic
 ) -> StoredTable:
     """The table whose packed columns begin with number `first`."""
-    rows, layout = head.rows, topic.layout
-    times = iter(range(first, first + head.packs))
-
-    def integers() -> IntArray:
-        return cast("IntArray", unpacked(packs.packed(next(times), "int64", rows)))
-
-    log_times = integers()
-    publish_times = log_times
-    if head.flags & _PUBLISHED:
-        publish_times = integers()
-        log_times += publish_times
-    places = integers() if head.flags & _PLACES else np.arange(rows)
-    hashes = integers() if head.flags & _HASHES else None
-    begin = next(times, first + head.packs)
-    if len(layout.slots) != first + head.packs - begin:
+    has = [flag for flag in (_PUBLISHED, _PLACES, _HASHES) if head.flags & flag]
+    begin = first + 1 + len(has)
+    if len(topic.layout.slots) != first + head.packs - begin:
         raise ValueError(f"a blob has other columns of {topic.channel.topic} than its layout")
-    counted = (rows, *counts)
 
-    def known(path: str) -> Packed:
-        slot = layout.slots[path.rstrip(".")]
-        return packs.packed(begin + slot.nth, slot.dtype, counted[slot.sequence])
+    def packed(path: str) -> Packed:
+        slot = topic.layout.slots[path]
+        count = counts[slot.sequence - 1] if slot.sequence else head.rows
+        return packs.packed(begin + slot.nth, slot.dtype, count)
 
-    def column(path: str) -> Column:
-        return unpacked(known(path))
+    def known(path: str) -> Known:
+        found = packed(path)
+        return Known(found.error, found.zone)
 
-    return StoredTable(
-        channel=topic.channel,
-        log_times=log_times,
-        publish_times=publish_times,
-        places=places,
-        columns=Lazily(layout.columns, column),
-        elements=lazy_elements(layout, "", column),
-        left_out=layout.left_out,
-        payload_hashes=hashes,
-        number=head.topic,
-        known=known,
+    times = [
+        cast("IntArray", unpacked(packs.packed(nth, "int64", head.rows)))
+        for nth in range(first, begin)
+    ]
+    log_times, others = times[0], dict(zip(has, times[1:], strict=True))
+    if _PUBLISHED in others:
+        log_times = log_times + others[_PUBLISHED]
+    kept = Times(
+        log_times,
+        others.get(_PUBLISHED, log_times),
+        others.get(_PLACES, np.arange(head.rows)),
+        others.get(_HASHES),
     )
-
-
-def lazy_elements(
-    layout: Layout, around: str, column: Callable[[str], Column]
-) -> Mapping[str, Elements]:
-    """Returns the sequences of a layout, of which columns are unpacked by their path.
-
-    Args:
-        layout: of a table, or of a sequence in it.
-        around: the path of that sequence and a dot; empty for a table.
-        column: unpacks a column by its path in the table; owners by their sequence's and `#`.
-    """
-
-    def elements(path: str) -> Elements:
-        whole = f"{around}{path}"
-        inner = layout.sequences[path]
-        return Elements(
-            cast("IntArray", column(f"{whole}#")),
-            Lazily(inner.columns, lambda name: column(f"{whole}.{name}")),
-            lazy_elements(inner, f"{whole}.", column),
-        )
-
-    return Lazily(layout.sequences, elements)
+    return lazy_table(head.topic, topic, kept, known, lambda path: unpacked(packed(path)))

@@ -31,6 +31,10 @@ Differences have a sign: 0, -1, 1, -2, 2 are written 0, 1, 2, 3, 4. Sums start a
 of the zone says where. Numbers that are 2**62 apart and more are arranged `plain`: all 8 bytes, and
 nothing subtracted.
 
+A last word `from` says that the column was unpacked and is packed again (`carried`): its zone is
+that of the values before they were packed first, and its bytes begin with 8 for the least of those
+that it has now, a float64 or an integer.
+
 Texts are `text constant` (one word) or `text`, arrangement and bytes of their codes, whose least is
 0. Their bytes begin with the words, the codes follow::
 
@@ -44,8 +48,8 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import zstandard
@@ -54,17 +58,26 @@ from ros2_memory.columns.steps import EXACT, MOST_RELATIVE, Step
 from ros2_memory.columns.table import Column, Numbers, Texts, Zone
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+
     from numpy.typing import NDArray
 
     from ros2_memory.storage.base import IntArray
+
+Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Values = TypeVar("Values", "IntArray", "Floats")
 
 FORMAT: Final = 1
 """What bytes mean: to be raised with every change of what this module or `blob` writes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 3
 
-_NOTHING: Final = Zone()
+_ARRANGEMENTS: Final = ("flat", "line", "delta", "curve")
+_CONTAINERS: Final = ("<u1", "<u1", "<u2", "<u4", "<u4", "<u8", "<u8", "<u8", "<u8")
+"""For each width in bytes the least unsigned integer that numpy has."""
 _FAR_APART: Final = 1 << 62
+_AT_ONCE: Final = 1 << 16
+"""Values that are packed at once, if it is not one column that has more."""
 _MOST_MULTIPLES: Final = {4: float(1 << 24), 8: float(1 << 46)}
 """Multiples of a step up to these are fewer bits than the float32 or float64 itself."""
 _DECIMALS: Final = (1, 10, 100, 1_000, 10_000, 100_000)
@@ -102,21 +115,60 @@ class Packed:
     data: bytes
 
 
+class Known(NamedTuple):
+    """What is known of a packed column without unpacking it.
+
+    Attributes:
+        error: the greatest absolute error of a value, against what the bag has.
+        zone: of the values that the bag has.
+    """
+
+    error: float
+    zone: Zone
+
+
 def pack(column: Column, step: Step = EXACT) -> Packed:
     """Returns the column as bytes. `step` counts for floats alone; all others are exact."""
-    if isinstance(column, Texts):
-        return _pack_texts(column)
-    if not len(column):
-        return Packed(f"{column.dtype.name} constant", 0, 0.0, _NOTHING, b"")
-    if column.dtype.kind == "f":
-        return _pack_floats(column, step)
-    least, greatest = int(column.min()), int(column.max())
-    zone = Zone(least, greatest)
-    if least == greatest:
-        return Packed(f"{column.dtype.name} constant", len(column), 0.0, zone, b"")
-    # Unsigned ones of 2**63 and more wrap around, here and back: no difference is that large.
-    arrangement, data = _arranged(column.astype(np.int64), least, greatest)
-    return Packed(f"{column.dtype.name} whole {arrangement}", len(column), 0.0, zone, data)
+    return pack_columns([(column, step)])[0]
+
+
+def pack_columns(columns: Sequence[tuple[Column, Step]]) -> list[Packed]:
+    """Returns columns as bytes, as `pack` does one.
+
+    What is done for one is done for all at once, one after the other in one array: a bag has some
+    sixty short columns, and numpy takes longer to be called than to go through one of them.
+    """
+    packed: list[Packed] = []
+    first = values = 0
+    for nth, (column, _) in enumerate(columns):
+        values += len(column.codes) if isinstance(column, Texts) else len(column)
+        if values > _AT_ONCE:
+            packed += _pack_at_once(columns[first : nth + 1])
+            first, values = nth + 1, 0
+    return packed + _pack_at_once(columns[first:])
+
+
+def _pack_at_once(columns: Sequence[tuple[Column, Step]]) -> list[Packed]:
+    found: dict[int, Packed | _Whole] = {}
+    integers: dict[int, Numbers] = {}
+    floats: dict[str, dict[int, tuple[Numbers, Step]]] = {}
+    for nth, (column, step) in enumerate(columns):
+        if isinstance(column, Texts):
+            found[nth] = _pack_texts(column)
+        elif not len(column):
+            found[nth] = Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
+        elif column.dtype.kind == "f":
+            floats.setdefault(column.dtype.str, {})[nth] = (column, step)
+        else:
+            integers[nth] = column
+    if integers:
+        found.update(zip(integers, _pack_integers(list(integers.values())), strict=True))
+    for some in floats.values():
+        found.update(zip(some, _Floats(list(some.values())).packed(), strict=True))
+    waiting = [one for one in found.values() if isinstance(one, _Whole)]
+    arranged = iter(_arranged(waiting) if waiting else ())
+    packed = {nth: next(arranged) if isinstance(one, _Whole) else one for nth, one in found.items()}
+    return [packed[nth] for nth in range(len(columns))]
 
 
 def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
@@ -132,6 +184,11 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
         ValueError: there is no such codec, or the bytes are not of it.
     """
     kind, _, rest = codec.partition(" ")
+    if rest.endswith(" from"):
+        rest = rest.removesuffix(" from")
+        least, data = number_of(data[:8], kind), data[8:]
+        if math.isnan(least):
+            least = None
     if kind == "text":
         return _unpack_texts(rest, count, data)
     dtype = np.dtype(kind)
@@ -153,6 +210,33 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
 
 
+def carried(packed: Packed, known: Known) -> Packed:
+    """Returns a column that was unpacked before it was packed again, with what was known of it.
+
+    Its error is at most that of both times together, its zone the one from before any rounding.
+    """
+    error = packed.error + known.error
+    if packed.zone == known.zone:
+        return replace(packed, error=error)
+    least = packed.zone.least
+    base = eight_bytes(math.nan if least is None else least)
+    return Packed(f"{packed.codec} from", packed.count, error, known.zone, base + packed.data)
+
+
+def eight_bytes(number: float) -> bytes:
+    """Returns a float as a float64, an integer as one of 8 bytes, signed or not."""
+    if isinstance(number, int):
+        return (number & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "little")
+    return struct.pack("<d", number)
+
+
+def number_of(data: bytes, dtype: str) -> float:
+    """Returns what `eight_bytes` was given; `dtype` is the name of the column's."""
+    if dtype.startswith("float"):
+        return float(struct.unpack("<d", data)[0])
+    return int.from_bytes(data, "little", signed=not dtype.startswith("u"))
+
+
 def compressed(data: bytes, level: int = LEVEL) -> bytes:
     """Returns the bytes as a zstd frame that states its size."""
     return zstandard.ZstdCompressor(level=level).compress(data)
@@ -170,96 +254,193 @@ def decompressed(data: bytes) -> bytes:
         raise ValueError(f"packed columns cannot be decompressed: {error}") from error
 
 
+class _Whole(NamedTuple):
+    """A column as whole numbers, not all equal, that are yet to be arranged."""
+
+    form: str
+    error: float
+    zone: Zone
+    head: bytes
+    numbers: IntArray
+    least: int
+    greatest: int
+
+
+class _InLine:
+    """Where columns lie that follow each other in one array. None is empty."""
+
+    def __init__(self, columns: Sequence[Numbers]) -> None:
+        self.lengths = np.array([len(column) for column in columns])
+        self.stops = np.cumsum(self.lengths)
+        self.starts = self.stops - self.lengths
+
+    def parts(self, values: Values) -> list[Values]:
+        """Returns the values of each column."""
+        bounds = zip(self.starts.tolist(), self.stops.tolist(), strict=True)
+        return [values[start:stop] for start, stop in bounds]
+
+    def least(self, values: Values) -> Values:
+        """Returns the least value of each column; NaN where it has one."""
+        return np.minimum.reduceat(values, self.starts)
+
+    def greatest(self, values: Values) -> Values:
+        """Returns the greatest value of each column; NaN where it has one."""
+        return np.maximum.reduceat(values, self.starts)
+
+    def means(self, values: Values) -> Floats:
+        """Returns the mean of each column."""
+        means: Floats = np.add.reduceat(values, self.starts, dtype=np.float64) / self.lengths
+        return means
+
+    def rows(self, values: Values) -> Values:
+        """Returns a value of each column for every row of it."""
+        return np.repeat(values, self.lengths)
+
+
+def _pack_integers(columns: Sequence[Numbers]) -> Iterator[Packed | _Whole]:
+    lie = _InLine(columns)
+    # Unsigned ones of 2**63 and more wrap around, here and back.
+    numbers = np.concatenate(columns, dtype=np.int64, casting="unsafe")
+    leasts, greatests = lie.least(numbers).tolist(), lie.greatest(numbers).tolist()
+    for nth, (column, part) in enumerate(zip(columns, lie.parts(numbers), strict=True)):
+        name = column.dtype.name
+        zone = Zone(leasts[nth], greatests[nth])
+        if name == "uint64":
+            zone = Zone(int(column.min()), int(column.max()))
+        least, greatest = int(zone.least or 0), int(zone.greatest or 0)
+        if least == greatest:
+            yield Packed(f"{name} constant", len(part), 0.0, zone, b"")
+        else:
+            yield _Whole(f"{name} whole", 0.0, zone, b"", part, least, greatest)
+
+
 # Floats
 
 
-def _pack_floats(column: Numbers, step: Step) -> Packed:
-    values = column.astype(np.float64, copy=False)
-    zone = _zone_of(values)
-    least, greatest = zone.least, zone.greatest
-    name = column.dtype.name
-    if least == greatest and zone.nulls in {0, len(values)}:
-        return Packed(f"{name} constant", len(values), 0.0, zone, b"")
-    if least is not None and greatest is not None and not zone.nulls:
-        most = max(abs(least), abs(greatest))
-        if math.isfinite(most):
-            found = _near(column, values, most, step)
-            if found is not None:
-                return Packed(f"{name} {found.codec}", len(values), found.error, zone, found.data)
-    return _exact(column, zone)
+class _Floats:
+    """Columns of floats of one type."""
+
+    def __init__(self, columns: Sequence[tuple[Numbers, Step]]) -> None:
+        self.columns = [column for column, _ in columns]
+        self.steps = [step for _, step in columns]
+        self.name = self.columns[0].dtype.name
+        self.limit = _MOST_MULTIPLES[self.columns[0].itemsize]
+        lie = _InLine(self.columns)
+        values = np.concatenate(self.columns, dtype=np.float64)
+        self.values = lie.parts(values)
+        bounds = zip(lie.least(values).tolist(), lie.greatest(values).tolist(), strict=True)
+        self.zones = [
+            _zone_of(part, least, greatest)
+            for part, (least, greatest) in zip(self.values, bounds, strict=True)
+        ]
+        self.found: dict[int, Packed | _Whole] = {}
+
+    def packed(self) -> list[Packed | _Whole]:
+        """Returns each as multiples of its step, else with fewer bits, else as it is."""
+        relative, multiples = [], {}
+        for nth, (zone, step) in enumerate(zip(self.zones, self.steps, strict=True)):
+            count = len(self.columns[nth])
+            if zone.least == zone.greatest and zone.nulls in {0, count}:
+                self.found[nth] = Packed(f"{self.name} constant", count, 0.0, zone, b"")
+            elif zone.nulls or not math.isfinite(self._most(nth)):
+                self._exactly(nth)
+            elif step.relative:
+                relative.append(nth)
+            elif step.per_unit and self._most(nth) * step.per_unit < self.limit:
+                multiples[nth] = step.per_unit
+            else:
+                self._exactly(nth)
+        if relative:
+            multiples |= self._decimals(relative)
+        if multiples:
+            self._as_multiples(multiples)
+        rest = [nth for nth in relative if nth not in self.found]
+        if rest:
+            self._rounded(rest)
+        return [self.found[nth] for nth in range(len(self.columns))]
+
+    def _most(self, nth: int) -> float:
+        zone = self.zones[nth]
+        return max(abs(zone.least or 0.0), abs(zone.greatest or 0.0))
+
+    def _decimals(self, members: Sequence[int]) -> dict[int, int]:
+        """The coarsest decimal step that some values of a column nearly have, where they do."""
+        some = [nth for nth in members if self._most(nth) < self.limit]
+        if not some:
+            return {}
+        samples = [self.values[nth][:: max(1, len(self.values[nth]) // _SAMPLE)] for nth in some]
+        scaled = np.multiply.outer(np.array(_DECIMALS, np.float64), np.concatenate(samples))
+        fit = np.abs(np.rint(scaled) - scaled) <= MOST_RELATIVE * np.abs(scaled)
+        fits = np.logical_and.reduceat(fit, _InLine(samples).starts, axis=1)
+        found: dict[int, int] = {}
+        for nth, column in zip(some, fits.T, strict=True):
+            coarsest = _DECIMALS[int(column.argmax())]
+            if column.any() and self._most(nth) * coarsest < self.limit:
+                found[nth] = coarsest
+        return found
+
+    def _as_multiples(self, per_units: Mapping[int, int]) -> None:
+        """Takes those of the columns that are multiples of a step, or near enough to them."""
+        members = list(per_units)
+        lie = _InLine([self.values[nth] for nth in members])
+        values = np.concatenate([self.values[nth] for nth in members])
+        per_unit = lie.rows(np.array(list(per_units.values()), np.float64))
+        multiples = np.rint(values * per_unit)
+        back = multiples / per_unit
+        if self.name == "float32":
+            back = back.astype(np.float32).astype(np.float64)
+        forms = {nth: f"/{number}" for nth, number in per_units.items()}
+        self._take(forms, values, back, multiples.astype(np.int64))
+
+    def _rounded(self, members: Sequence[int]) -> None:
+        """Takes the columns with fewer bits, or as they are: tiny numbers have no bits to spare."""
+        columns = np.concatenate([self.columns[nth] for nth in members])
+        whole = _ordered(columns, rounded=True)
+        back = _from_ordered(whole, columns.dtype, rounded=True)
+        values = columns.astype(np.float64, copy=False)
+        self._take(dict.fromkeys(members, "rounded"), values, back, whole)
+        for nth in members:
+            if nth not in self.found:
+                self._exactly(nth)
+
+    def _take(
+        self, forms: Mapping[int, str], values: Floats, back: Floats, whole: IntArray
+    ) -> None:
+        """Takes columns that come back so, unless one is relative and off by more than it may."""
+        lie = _InLine([self.columns[nth] for nth in forms])
+        errors = np.abs(back - values)
+        excess = lie.greatest(errors - MOST_RELATIVE * np.abs(values)).tolist()
+        worst = lie.greatest(errors).tolist()
+        leasts, greatests = lie.least(whole).tolist(), lie.greatest(whole).tolist()
+        for row, (nth, part) in enumerate(zip(forms, lie.parts(whole), strict=True)):
+            if not self.steps[nth].relative or excess[row] <= 0:
+                self.found[nth] = _Whole(
+                    f"{self.name} {forms[nth]}",
+                    worst[row],
+                    self.zones[nth],
+                    b"",
+                    part,
+                    leasts[row],
+                    greatests[row],
+                )
+
+    def _exactly(self, nth: int) -> None:
+        stored, form = self.columns[nth], "bits"
+        if stored.itemsize == 8:
+            with np.errstate(over="ignore"):
+                short = stored.astype(np.float32)
+            if np.array_equal(short, stored, equal_nan=True):
+                stored, form = short, "float32"
+        whole = _ordered(stored)
+        least, greatest = int(whole.min()), int(whole.max())
+        form = f"{self.name} {form}"
+        self.found[nth] = _Whole(form, 0.0, self.zones[nth], b"", whole, least, greatest)
 
 
-class _Near(NamedTuple):
-    codec: str
-    error: float
-    data: bytes
-
-
-def _near(column: Numbers, values: NDArray[np.float64], most: float, step: Step) -> _Near | None:
-    """The values within the step, or nothing where they themselves are smaller."""
-    limit = _MOST_MULTIPLES[column.itemsize]
-    if step.per_unit:
-        return _multiples(column, values, step.per_unit) if most * step.per_unit < limit else None
-    if not step.relative:
-        return None
-    decimal = _decimal(values) if most < limit else 0
-    if decimal and most * decimal < limit:
-        found = _multiples(column, values, decimal, MOST_RELATIVE)
-        if found is not None:
-            return found
-    whole = _ordered(column, rounded=True)
-    back = _from_ordered(whole, column.dtype, rounded=True).astype(np.float64, copy=False)
-    # An exponent too large becomes infinite; tiny numbers have no bits to spare.
-    errors = np.abs(back - values)
-    if not bool((errors <= MOST_RELATIVE * np.abs(values)).all()):
-        return None
-    arrangement, data = _arranged(whole, int(whole.min()), int(whole.max()))
-    return _Near(f"rounded {arrangement}", float(errors.max()), data)
-
-
-def _multiples(
-    column: Numbers, values: NDArray[np.float64], per_unit: int, relative: float = 0.0
-) -> _Near | None:
-    """The values as multiples of a step; nothing where one is not within the relative error."""
-    multiples = np.rint(values * per_unit)
-    back = multiples / per_unit
-    if column.itemsize == 4:
-        back = back.astype(np.float32).astype(np.float64)
-    errors = np.abs(back - values)
-    if relative and not bool((errors <= relative * np.abs(values)).all()):
-        return None
-    whole = multiples.astype(np.int64)
-    arrangement, data = _arranged(whole, int(whole.min()), int(whole.max()))
-    return _Near(f"/{per_unit} {arrangement}", float(errors.max()), data)
-
-
-def _decimal(values: NDArray[np.float64]) -> int:
-    """The coarsest decimal step that some of the values have, nearly; 0 where they have none."""
-    sample = values[:: max(1, len(values) // _SAMPLE)]
-    scaled = np.multiply.outer(np.array(_DECIMALS, np.float64), sample)
-    fits = np.abs(np.rint(scaled) - scaled) <= MOST_RELATIVE * np.abs(scaled)
-    rows = fits.all(axis=1)
-    nth = int(rows.argmax())
-    return _DECIMALS[nth] if rows[nth] else 0
-
-
-def _exact(column: Numbers, zone: Zone) -> Packed:
-    stored, form = column, "bits"
-    if column.itemsize == 8:
-        with np.errstate(over="ignore"):
-            short = column.astype(np.float32)
-        if np.array_equal(short, column, equal_nan=True):
-            stored, form = short, "float32"
-    whole = _ordered(stored)
-    arrangement, data = _arranged(whole, int(whole.min()), int(whole.max()))
-    codec = f"{column.dtype.name} {form} {arrangement}"
-    return Packed(codec, len(column), 0.0, zone, data)
-
-
-def _zone_of(values: NDArray[np.float64]) -> Zone:
-    least, greatest = float(values.min()), float(values.max())
+def _zone_of(values: Floats, least: float, greatest: float) -> Zone:
+    """The zone of values, by the least and the greatest of them: NaN where there is one."""
     if not math.isnan(least):
-        return Zone(least + 0.0, greatest + 0.0)
+        return Zone(least + 0.0, greatest + 0.0)  # -0.0 becomes 0.0
     there = values[~np.isnan(values)]
     nulls = len(values) - len(there)
     if not len(there):
@@ -281,70 +462,97 @@ def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
     return bits ^ ((bits >> 63) & magnitude)
 
 
-def _from_ordered(
-    whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool
-) -> Numbers:
+def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, rounded: bool) -> Floats:
     integer, magnitude, dropped = _BITS[dtype.itemsize]
     if rounded:
         bits = (whole ^ ((whole >> 63) & (magnitude >> dropped))) << dropped
     else:
         bits = whole ^ ((whole >> 63) & magnitude)
-    return bits.astype(integer, copy=False).view(dtype)
+    return bits.astype(integer, copy=False).view(dtype).astype(np.float64, copy=False)
 
 
 # Whole numbers
 
 
-def _arranged(whole: IntArray, least: int, greatest: int) -> tuple[str, bytes]:
-    """Whole numbers, at least two and not all equal, as `arrangement width` and bytes.
+def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
+    """The columns, each arranged as its numbers are nearest to each other."""
+    lie = _InLine([column.numbers for column in columns])
+    flat = np.concatenate([column.numbers for column in columns])
+    flat -= lie.rows(np.array([_wrapped(column.least) for column in columns]))
+    slopes = np.rint((flat[lie.stops - 1] - flat[lie.starts]) / (lie.lengths - 1)).astype(np.int64)
+    slope = lie.rows(slopes)
+    line = flat - slope * (np.arange(len(flat)) - lie.rows(lie.starts))
+    steps = _differences(flat, lie.starts)
+    delta = steps - slope
+    delta[lie.starts] = 0
+    curve = _differences(steps, lie.starts)
+    curve[lie.starts + 1] = 0
+    costs = np.array(
+        [
+            lie.means(np.abs(flat - lie.rows(lie.means(flat)))),
+            lie.means(np.abs(line - lie.rows(lie.means(line)))),
+            lie.means(np.abs(delta)),
+            lie.means(np.abs(curve)),
+        ]
+    )
+    line -= lie.rows(np.minimum.reduceat(line, lie.starts))
+    numbers = (flat, line, (delta << 1) ^ (delta >> 63), (curve << 1) ^ (curve >> 63))
+    most = [np.maximum.reduceat(some.view(np.uint64), lie.starts).tolist() for some in numbers]
+    found = []
+    for nth, (column, which) in enumerate(zip(columns, costs.argmin(axis=0).tolist(), strict=True)):
+        start, stop = int(lie.starts[nth]), int(lie.stops[nth])
+        if column.greatest - column.least >= _FAR_APART:
+            arrangement, data = "plain 8", _planes(flat[start:stop], 8)
+        else:
+            width = (most[which][nth].bit_length() + 7) // 8
+            arrangement = f"{_ARRANGEMENTS[which]} {width}"
+            first = steps[start + 1] if which == 3 else slopes[nth]
+            data = struct.pack("<q", first) if which else b""
+            data += _planes(numbers[which][start + max(0, which - 1) : stop], width)
+        codec = f"{column.form} {arrangement}"
+        found.append(Packed(codec, stop - start, column.error, column.zone, column.head + data))
+    return found
 
-    Of the arrangements it takes the one whose numbers are nearest to each other on average.
-    """
-    numbers = whole - _wrapped(least)
-    if greatest - least >= _FAR_APART:
-        return "plain 8", _planes(numbers, 8)
-    steps = numbers[1:] - numbers[:-1]
-    curve = steps[1:] - steps[:-1]
-    slope = round((int(numbers[-1]) - int(numbers[0])) / len(steps))
-    delta, line = steps, numbers
-    if slope:
-        delta, line = steps - slope, numbers - slope * np.arange(len(numbers))
-    costs = (_spread(numbers), _spread(line), _size(delta), _size(curve))
-    best = costs.index(min(costs))
-    if best == 0:
-        return _in_planes("flat", b"", numbers)
-    if best == 1:
-        return _in_planes("line", struct.pack("<q", slope), line - line.min())
-    if best == 2:
-        return _in_planes("delta", struct.pack("<q", slope), (delta << 1) ^ (delta >> 63))
-    return _in_planes("curve", struct.pack("<q", steps[0]), (curve << 1) ^ (curve >> 63))
+
+def _differences(numbers: IntArray, starts: IntArray) -> IntArray:
+    """What each number is more than the one before it; 0 of the first of each column."""
+    found = np.empty_like(numbers)
+    np.subtract(numbers[1:], numbers[:-1], out=found[1:])
+    found[starts] = 0
+    return found
 
 
 def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> IntArray:
     """Returns the whole numbers that were arranged; the least of them is `least`."""
     name, _, width = arrangement.partition(" ")
     if name in {"plain", "flat"}:
-        return _from_planes(data, 0, count, int(width)) + _wrapped(least)
+        return np.add(_from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
     first: int = struct.unpack_from("<q", data)[0]
     if name == "line":
-        numbers = _from_planes(data, 8, count, int(width))
-        numbers += first * np.arange(count)
-    elif name in {"delta", "curve"}:
+        numbers = np.arange(count)
+        numbers *= first
+        numbers += _from_planes(data, 8, count, int(width)).astype(np.int64, copy=False)
+    elif name == "delta":
         numbers = np.zeros(count, np.int64)
-        ahead = 1 if name == "delta" else 2
-        zigzag = _from_planes(data, 8, count - ahead, int(width))
-        numbers[ahead:] = (zigzag.view(np.uint64) >> np.uint64(1)).view(np.int64) ^ -(zigzag & 1)
-        if name == "delta":
-            numbers[1:] += first
-        else:
-            numbers[1] = first
-            np.cumsum(numbers[1:], out=numbers[1:])
-        np.cumsum(numbers, out=numbers)
+        numbers[1:] = _signed(_from_planes(data, 8, count - 1, int(width)))
+        numbers[1:] += first
+    elif name == "curve":
+        numbers = np.zeros(count, np.int64)
+        numbers[1] = first
+        numbers[2:] = _signed(_from_planes(data, 8, count - 2, int(width)))
+        np.cumsum(numbers[1:], out=numbers[1:])
     else:
         raise ValueError(f"packed columns are not arranged {name!r}")
-    numbers -= numbers.min()
-    numbers += _wrapped(least)
+    if name != "line":
+        np.cumsum(numbers, out=numbers)
+    numbers += np.subtract(_wrapped(least), numbers.min(keepdims=True))
     return numbers
+
+
+def _signed(numbers: Numbers) -> Numbers:
+    """0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
+    signs = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
+    return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
 
 
 def _wrapped(number: int) -> np.int64:
@@ -352,52 +560,41 @@ def _wrapped(number: int) -> np.int64:
     return np.int64(number - (1 << 64) if number >= 1 << 63 else number)
 
 
-def _spread(numbers: IntArray) -> float:
-    """The mean distance from the mean."""
-    mean = float(np.add.reduce(numbers, dtype=np.float64)) / len(numbers)
-    return float(np.add.reduce(np.abs(numbers - mean))) / len(numbers)
-
-
-def _size(numbers: IntArray) -> float:
-    """The mean absolute value; infinite of none."""
-    if not len(numbers):
-        return math.inf
-    return float(np.add.reduce(np.abs(numbers), dtype=np.float64)) / len(numbers)
-
-
-def _in_planes(name: str, head: bytes, numbers: IntArray) -> tuple[str, bytes]:
-    width = (int(numbers.view(np.uint64).max()).bit_length() + 7) // 8
-    return f"{name} {width}", head + _planes(numbers, width)
-
-
 def _planes(numbers: IntArray, width: int) -> bytes:
-    return numbers.astype("<i8", copy=False).view(np.uint8).reshape(-1, 8).T[:width].tobytes()
+    short = numbers.astype(_CONTAINERS[width], copy=False)
+    return short.view(np.uint8).reshape(-1, short.itemsize).T[:width].tobytes()
 
 
-def _from_planes(data: bytes, start: int, count: int, width: int) -> IntArray:
-    numbers = np.zeros((count, 8), np.uint8)
-    planes = np.frombuffer(data, np.uint8, count * width, start)
-    numbers[:, :width] = planes.reshape(width, count).T
-    return numbers.view("<i8").ravel()
+def _from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
+    """The numbers as unsigned ones of the least width that numpy has."""
+    dtype = _CONTAINERS[width]
+    planes = np.frombuffer(data, np.uint8, count * width, start).reshape(width, count)
+    numbers = planes[0].astype(dtype) if width else np.zeros(count, dtype)
+    for nth in range(1, width):
+        numbers |= planes[nth].astype(dtype) << (8 * nth)
+    return numbers
 
 
 # Texts
 
 
-def _pack_texts(column: Texts) -> Packed:
+def _pack_texts(column: Texts) -> Packed | _Whole:
     codes, words = _in_use(column)
+    zone = Zone(words=folded(words))
+    if not words:
+        return Packed("text constant", 0, 0.0, zone, b"")
     lengths = np.array([len(word) for word in words], "<u4")
     text = "".join(words).encode("utf-8", "surrogatepass")
     head = struct.pack("<II", len(words), len(text)) + lengths.tobytes() + text
-    zone = Zone(words=_folded(words))
-    if len(words) <= 1:
-        return Packed("text constant", len(codes), 0.0, zone, head if words else b"")
-    arrangement, data = _arranged(codes.astype(np.int64), 0, len(words) - 1)
-    return Packed(f"text {arrangement}", len(codes), 0.0, zone, head + data)
+    if len(words) == 1:
+        return Packed("text constant", len(codes), 0.0, zone, head)
+    return _Whole("text", 0.0, zone, head, codes.astype(np.int64), 0, len(words) - 1)
 
 
 def _in_use(column: Texts) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
     """The column without words that no row has: whoever forgot the rows forgot their words."""
+    if len(column.words) <= 1 and len(column.codes):
+        return column.codes, column.words
     used = np.bincount(column.codes, minlength=len(column.words)) > 0
     if used.all():
         return column.codes, column.words
@@ -405,7 +602,8 @@ def _in_use(column: Texts) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
     return codes, tuple(column.words[nth] for nth in np.flatnonzero(used).tolist())
 
 
-def _folded(words: tuple[str, ...]) -> str | None:
+def folded(words: Collection[str]) -> str | None:
+    """Returns the words as a zone has them; None if they are too many or too long to be kept."""
     if sum(map(len, words)) + len(words) > MOST_WORDS_BYTES:
         return None
     folded = "\n".join(dict.fromkeys(word.casefold() for word in words))
@@ -422,7 +620,7 @@ def _unpack_texts(arrangement: str, count: int, data: bytes) -> Texts:
 
 def zone_of_texts(data: bytes) -> Zone:
     """Returns the zone of packed texts from their words alone."""
-    return Zone(words=_folded(_words(data)[0]))
+    return Zone(words=folded(_words(data)[0]))
 
 
 def _words(data: bytes) -> tuple[tuple[str, ...], int]:

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.blob import Lazily, StoredTable, lazy_elements
-from ros2_memory.columns.pack import Packed, compressed, pack
-from ros2_memory.columns.steps import EXACT
-from ros2_memory.columns.table import joined
+from ros2_memory.columns.blob import pack_table
+from ros2_memory.columns.pack import Known, Packed, compressed, pack
+from ros2_memory.columns.stored import Lazily, Times, joined_stored, lazy_table
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from ros2_memory.columns.blob import Layout, Topic
-    from ros2_memory.columns.table import Column, Elements, Table
+    from ros2_memory.columns.layout import Layout
+    from ros2_memory.columns.stored import StoredTable, Topic
+    from ros2_memory.columns.table import Column, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
 
@@ -68,22 +68,23 @@ class PackedPart:
         return replace(self, columns=columns)
 
 
-def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:
+def packed_part(layout: Layout, tables: Sequence[tuple[int, StoredTable]]) -> PackedPart:
     """Returns the rows of some bags as one part.
 
     Args:
         layout: of the topic, type and definition that all these tables are of.
-        tables: each with the number of its bag; at least one has a row.
+        tables: each with the number of its bag, and at least one row.
     """
-    numbered, count = [], 0
+    numbered: list[StoredTable] = []
+    count = 0
     for _, table in tables:
         # The place of a row becomes its number among all rows: so its bag is known once sorted.
-        numbered.append(replace_places(table, count))
+        numbered.append(replace(table, places=np.arange(count, count + len(table))))
         count += len(table)
     bags = np.repeat(
         np.array([bag for bag, _ in tables], np.int64), [len(table) for _, table in tables]
     )
-    whole = joined(numbered)
+    whole = joined_stored(numbered)
     return pack_rows(layout, whole, bags[whole.places])
 
 
@@ -93,7 +94,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     if table.payload_hashes is not None:
         columns[PUBLISH_TIME] = pack(table.publish_times)
         columns[PAYLOAD_HASH] = pack(table.payload_hashes)
-    columns.update(_packed(layout, table, ""))
+    columns.update(pack_table(layout, table))
     return PackedPart(
         int(table.log_times[0]),
         int(table.log_times[-1]),
@@ -104,15 +105,6 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
             for path, packed in columns.items()
         },
     )
-
-
-def _packed(layout: Layout, rows: Table | Elements, before: str) -> Iterator[tuple[str, Packed]]:
-    for name, kind in layout.columns.items():
-        yield f"{before}{name}".rstrip("."), pack(rows.columns[name], kind.step)
-    for name, inner in layout.sequences.items():
-        elements = rows.elements[name]
-        yield f"{before}{name}#", pack(elements.owners, EXACT)
-        yield from _packed(inner, elements, f"{before}{name}.")
 
 
 def part_table(
@@ -131,27 +123,21 @@ def part_table(
         load: returns a column by its path.
         times: the log times of its rows.
     """
-    left_out = dict(topic.layout.left_out)
-    elements = lazy_elements(topic.layout, "", lambda path: load(path.rstrip(".")))
-    # A topic is dropped whole: its sequences have owners, or it has no sequence.
-    sequences = [path for path in elements if columns[f"{path}#"].codec != DROPPED]
-    for path, packed in columns.items():
-        if packed.codec == DROPPED:
-            left_out[path.rstrip("#")] = "beyond the share of the store (store.max_share)"
-    there = [path for path in topic.layout.columns if columns[path].codec != DROPPED]
-    return StoredTable(
-        topic.channel,
-        times,
-        times,
-        np.broadcast_to(np.int64(0), times.shape),
-        Lazily(there, load),
-        Lazily(sequences, elements.__getitem__),
-        left_out,
-        number=number,
-        known=lambda path: columns[path.rstrip(".")],
+
+    def known(path: str) -> Known:
+        return Known(columns[path].error, columns[path].zone)
+
+    kept = Times(times, times, np.broadcast_to(np.int64(0), times.shape))
+    table = lazy_table(number, topic, kept, known, load)
+    dropped = {path for path, packed in columns.items() if packed.codec == DROPPED}
+    if not dropped:
+        return table
+    reason = "beyond the share of the store (store.max_share)"
+    there = [path for path in table.columns if path not in dropped]
+    sequences = [path for path in table.elements if f"{path}#" not in dropped]
+    return replace(
+        table,
+        columns=Lazily(there, table.columns.__getitem__),
+        elements=Lazily(sequences, table.elements.__getitem__),
+        left_out={**table.left_out, **dict.fromkeys(dropped, reason)},
     )
-
-
-def replace_places(table: Table, first: int) -> Table:
-    """Returns a table whose places count on from a number, in the order of its rows."""
-    return replace(table, places=np.arange(first, first + len(table)))

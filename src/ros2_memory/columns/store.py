@@ -22,10 +22,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.blob import Entry, Layout, Topic, pack_tables, unpack_tables
+from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
+from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
 from ros2_memory.columns.parts import pack_rows, packed_part
+from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.base import Channel, Schema
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.parts import PackedPart
+    from ros2_memory.columns.stored import StoredTable
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.storage.base import Definition, IntArray
@@ -400,7 +403,7 @@ class ColumnStore(Database):
             ).fetchall()
             if len(rows) < len(numbers):
                 return  # another program merges them
-            found: dict[int, list[tuple[int, Table]]] = defaultdict(list)
+            found: dict[int, list[tuple[int, StoredTable]]] = defaultdict(list)
             for bag, blob in rows:
                 for table in unpack_tables(blob, topics):
                     if len(table):

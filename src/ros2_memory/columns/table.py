@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -40,8 +40,7 @@ MAX_RANGED_BYTES: Final = 4096
 """Of longer arrays the least and the greatest number are not looked for."""
 
 
-@dataclass(frozen=True, slots=True)
-class Zone:
+class Zone(NamedTuple):
     """What is known of a column without reading its values.
 
     Attributes:
