@@ -545,8 +545,10 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
         raise ValueError(f"packed columns are not arranged {name!r}")
     if name != "line":
         np.cumsum(numbers, out=numbers)
-    numbers += np.subtract(_wrapped(least), numbers.min(keepdims=True))
-    return numbers
+    # Differences wrap around, as those of the packed numbers did.
+    lift: Numbers = np.subtract(_wrapped(least), numbers.min(keepdims=True))
+    found: Numbers = np.add(numbers, lift, out=numbers)
+    return found
 
 
 def _signed(numbers: Numbers) -> Numbers:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
+from ros2_memory.columns.decode import decoded
 from ros2_memory.core.errors import (
     BagContradictionError,
     BagError,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
@@ -152,11 +154,14 @@ class BagAccess:
         written the reply has to report that it was used.
         """
         for each in messages:
-            if each.bag.state is BagState.INCOMPLETE:
-                self.notes.complete = False
-            elif each.bag.state is BagState.ACTIVE:
-                self.call.used_active = True
+            self._track_source(each.bag)
             yield each
+
+    def _track_source(self, bag: BagFile) -> None:
+        if bag.state is BagState.INCOMPLETE:
+            self.notes.complete = False
+        elif bag.state is BagState.ACTIVE:
+            self.call.used_active = True
 
     def track_all_sources(self) -> None:
         """Does as `track_sources` for an answer that is about all bags of the index."""
@@ -252,6 +257,46 @@ class BagAccess:
             finally:
                 self.call.stages.add("read", spent)
                 spent = 0
+
+    def tables(self, bag: BagFile, topic: str, *, hashed: bool) -> Iterator[Table]:
+        """Yields one bag's messages of a topic as tables; a note reports what cannot be read.
+
+        With `hashed` they have the hashes of all payloads, else those of latched channels alone.
+        """
+        self.check_deadline()
+        groups = decoded(
+            self.memory.reader,
+            bag.path,
+            _indexed_part(bag, TimeWindow.everything()),
+            topics=[topic],
+            hashed=lambda channel: hashed or channel.latched,
+        )
+        while True:
+            try:
+                with self.call.stages.timed("read"):
+                    tables = next(groups, None)
+            except BagError as error:
+                self._note_unreadable(bag, error)
+                if error.lost is None:
+                    return
+                continue
+            if tables is None:
+                return
+            self._track_source(bag)
+            for table in tables:
+                self._note_undecodable(table)
+                yield table
+            self.check_deadline()
+
+    def _note_undecodable(self, table: Table) -> None:
+        """Notes that messages have no row, because they cannot be decoded."""
+        if table.undecodable:
+            self.notes.complete = False
+            topic, type_name = table.channel.topic, table.channel.type
+            kind = Reason(
+                f"could not be decoded: {table.undecodable_reason}", "topic", of="messages of "
+            )
+            self.notes.add(Note(kind, f"{topic} ({type_name})"))
 
     def all_of(
         self, segment: Segment, topic: str

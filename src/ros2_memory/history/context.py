@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import State
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
+    from ros2_memory.columns.scan import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.text import Reason
@@ -107,7 +108,9 @@ class SnapshotSource(Protocol):
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
-    `recall` holds digests of the bags. Every answer is the same with it and without. `stated` is
+    `columns` scans topics, from its store where that has the bags; a lake has none. `recall` holds
+    digests of the bags, for what does not scan yet. Every answer is the same with them and without.
+    `stated` is
     set for a lake, which stores what messages state instead of the messages: it returns that, or
     None for a message that can be decoded. The poses of a lake are thinned.
     """
@@ -118,6 +121,7 @@ class Memory:
     clock: Clock
     limits: QuerySettings
     recall: DigestCache | None = None
+    columns: Scanner | None = None
     stated: Callable[[Record], State | None] | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
