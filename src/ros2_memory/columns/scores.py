@@ -9,7 +9,7 @@ and more would have to be looked at then, the limits say that they do not know.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeGuard
 
 import numpy as np
 
@@ -25,14 +25,15 @@ from ros2_memory.columns.shown import (
     children,
     leaves_below,
     opened,
+    unknown,
 )
-from ros2_memory.columns.table import Texts
 from ros2_memory.columns.values import Kind, Leaf, Level
 from ros2_memory.messages.detections import MAX_DEPTH, NAMES, NOT_LABELLED, SCORES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from ros2_memory.columns.table import Texts
     from ros2_memory.columns.values import Floats, Ints, Mask, Values
 
 Object: TypeAlias = Message | Group
@@ -129,24 +130,21 @@ class _BestScores:
         size = values.size(self.level) or 0
         labelled, found = self.hypotheses.labelled(values), self.hypotheses.score(values)
         results = values.elements(self.hypotheses.level)
-        if labelled is None or found is None or results is None:
-            return unknown(size)
-        score, error = found
+        if labelled is None or found is None or results is None or found[1]:
+            return unknown(size)  # also with rounded scores, of which another may be the best
+        score, _ = found
         rank = np.where(np.isnan(score), -np.inf, score)
         # The first of those of the highest score, for each detection.
         order = np.lexsort((-rank, results.owners))
-        owners = results.owners[order]
-        first = np.flatnonzero(np.diff(owners, prepend=-1))
-        best, of = order[first], owners[first]
+        first = np.flatnonzero(np.diff(results.owners[order], prepend=-1))
+        best = order[first]
+        of = results.owners[best]
         surely, perhaps = np.ones(size, np.bool_), np.ones(size, np.bool_)
-        surely[of] = labelled[best] & ~(score[best] < self.least + error)
-        perhaps[of] = ~labelled[best] | ~(score[best] < self.least - error)
-        if error:
-            surely[of] = False
         if self.has_inner or may_be_json(values, self.texts):
-            has_none = np.ones(size, np.bool_)
-            has_none[of] = False
-            surely &= ~has_none
+            surely[:] = False
+        is_low = score[best] < self.least
+        surely[of] = labelled[best] & ~is_low
+        perhaps[of] = ~(labelled[best] & is_low)
         return Kept(surely, perhaps)
 
 
@@ -154,21 +152,22 @@ class _BestScores:
 class _Hypotheses:
     """Which of several hypotheses stay, in a detection that stays."""
 
-    scored: _Scored
-    least: float
+    best: _BestScores
 
     @property
     def level(self) -> Level:
         """The level of the hypotheses."""
-        return self.scored.level
+        return self.best.hypotheses.level
 
     def kept(self, values: Values, among: Ints) -> Kept:
         """Returns where the hypothesis stays."""
-        found = self.scored.score(values)
-        if found is None:
+        found, results = self.best.hypotheses.score(values), values.elements(self.level)
+        if found is None or found[1] or results is None:
             return unknown(len(among))
-        score, error = found[0][among], found[1]
-        return Kept(~(score < self.least + error), ~(score < self.least - error))
+        # Where it is not sure that the detection is one, neither is what stays of it.
+        is_one = self.best.kept(values, results.owners[among]).surely
+        is_low = found[0][among] < self.best.least
+        return Kept(~is_low & is_one, ~is_low | ~is_one)
 
 
 def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
@@ -179,20 +178,23 @@ def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
     """
     if depth == 0:
         return node
-    if isinstance(node, Leaf):
-        return replace(node, json_depth=depth) if node.kind is Kind.TEXT else node
     if isinstance(node, Narrowed):
         return Narrowed(node.limit, without_low(node.node, least, depth))
     if isinstance(node, Choice):
         return Choice(tuple(without_low(case, least, depth) for case in node.cases), node.array)
     if isinstance(node, Listing):
         # In lists, `without_low_scores` looks at objects alone.
-        is_object = not any(isinstance(spot.node, Leaf) for spot in opened(Spot(node.element)))
-        element = without_low(node.element, least, depth - 1) if is_object else node.element
-        return Listing(node.level, element)
-    if isinstance(node, Message) or (isinstance(node, Group) and node.turned is None):
-        return _object_without_low(node, least, depth)
-    return node
+        has_objects = all(is_object(spot.node) for spot in opened(Spot(node.element)))
+        inner = without_low(node.element, least, depth - 1) if has_objects else node.element
+        return Listing(node.level, inner)
+    if isinstance(node, Leaf) and node.kind is Kind.TEXT:
+        return replace(node, json_depth=depth)
+    return _object_without_low(node, least, depth) if is_object(node) else node
+
+
+def is_object(node: Node) -> TypeGuard[Object]:
+    """Returns whether a node is an object that may be a detection, or have some in it."""
+    return isinstance(node, Message) or (isinstance(node, Group) and node.turned is None)
 
 
 def _object_without_low(node: Object, least: float, depth: int) -> Node:
@@ -210,7 +212,7 @@ def _object_without_low(node: Object, least: float, depth: int) -> Node:
             texts, has_inner = _inside(others, depth)
             level = hypotheses.level.parent or hypotheses.level
             best = _BestScores(level, hypotheses, least, texts, has_inner)
-            kept = Narrowed(_Hypotheses(hypotheses, least), results.element)
+            kept = Narrowed(_Hypotheses(best), results.element)
             return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
     return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})
 
@@ -251,11 +253,6 @@ def may_be_json(values: Values, texts: tuple[Leaf, ...]) -> bool:
     return any(
         column is None or any(word[:1] in {"[", "{"} for word in column.words) for column in columns
     )
-
-
-def unknown(size: int) -> Kept:
-    """Returns that nothing is known of so many rows or elements."""
-    return Kept(np.zeros(size, np.bool_), np.ones(size, np.bool_))
 
 
 def _flags(texts: Texts, meets: Callable[[str], bool]) -> Mask:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.table import MAX_NUMBERS, Texts
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made
+from ros2_memory.columns.table import MAX_NUMBERS
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values
 from ros2_memory.extract import POINTS
 from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
@@ -29,7 +29,8 @@ from ros2_memory.storage.base import SEQUENCE, Definition
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from ros2_memory.columns.values import Ints, Mask, Values
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Floats, Ints, Mask
     from ros2_memory.extract import SchemaExtractor
 
 MAX_LEAVES: Final = 20_000
@@ -50,6 +51,11 @@ class Kept(NamedTuple):
 
     surely: Mask
     perhaps: Mask
+
+
+def unknown(size: int) -> Kept:
+    """Returns that nothing is known of so many rows or elements."""
+    return Kept(np.zeros(size, np.bool_), np.ones(size, np.bool_))
 
 
 class Limit(Protocol):
@@ -73,6 +79,8 @@ class Pick:
     def kept(self, values: Values, among: Ints) -> Kept:
         """Returns where the elements stand at the place."""
         places = values.places(self.level, among, from_end=self.place < 0)
+        if places is None:
+            return unknown(len(among))
         kept = places == self.place
         return Kept(kept, kept)
 
@@ -88,9 +96,9 @@ class LongerThan:
 
     def kept(self, values: Values, among: Ints) -> Kept:
         """Returns where the sequence is that long."""
-        lengths = values.column(self.level, f"{self.sequence}.length")
-        if lengths is None or isinstance(lengths, Texts):
-            return Kept(np.zeros(len(among), np.bool_), np.ones(len(among), np.bool_))
+        lengths = values.numeric(self.level, f"{self.sequence}.length")
+        if lengths is None:
+            return unknown(len(among))
         kept = (lengths[among] > self.count) == self.is_longer
         return Kept(kept, kept)
 
@@ -277,25 +285,27 @@ class Shape:
 
     def shown(self, place: Place) -> Node:
         """Returns a part of the message as the value shows it."""
-        level, path, kind, length, depth = place
-        if length is not None:
-            return self._array(place)
-        if isinstance(kind, str):
-            return Leaf(level, (path,), _kind(kind))
-        if depth >= MAX_DEPTH:
-            raise UnknownShapeError(f"{path} lies {depth} levels deep")
-        message = Message(self, level, path, kind, depth)
-        known = kind_of_type(kind.type, [field.name for field in kind.fields])
-        if known is ValueKind.TIME:
+        if place.length is None and isinstance(place.kind, str):
+            return Leaf(place.level, (place.path,), _kind(place.kind))
+        if place.depth >= MAX_DEPTH:
+            raise UnknownShapeError(f"{place.path} lies {place.depth} levels deep")
+        if place.length is None and isinstance(place.kind, Definition):
+            return self._shown_message(place, place.kind)
+        return self._array(place)
+
+    def _shown_message(self, place: Place, definition: Definition) -> Node:
+        level, path = place.level, place.path
+        message = Message(self, level, path, definition, place.depth)
+        kind = kind_of_type(definition.type, [field.name for field in definition.fields])
+        if kind is ValueKind.TIME:
             return Leaf(level, (path,), Kind.REAL, Made.SECONDS)
-        if known is ValueKind.PLAIN:
-            return message
-        if not all(_is_number(field.kind, field.length) for field in kind.fields):
-            return message if known is ValueKind.VECTOR else NOTHING
-        sources = [f"{path}.{field.name}" if path else field.name for field in kind.fields]
-        if known is ValueKind.VECTOR:
+        are_numbers = all(_is_number(field.kind, field.length) for field in definition.fields)
+        sources = [f"{path}.{field.name}" if path else field.name for field in definition.fields]
+        if kind is ValueKind.VECTOR and are_numbers:
             return _vector(level, sources)
-        return _turned(level, sources, message)
+        if kind is ValueKind.QUATERNION:
+            return _turned(level, sources, message) if are_numbers else NOTHING
+        return message
 
     def plain(self, place: Place) -> Node:
         """Returns a part of the message as its definition has it, to be walked further."""
@@ -370,8 +380,6 @@ class Shape:
 
     def _array(self, place: Place) -> Node:
         level, path, kind, length, depth = place
-        if depth >= MAX_DEPTH:
-            raise UnknownShapeError(f"{path} lies {depth} levels deep")
         inner = Level(level, path)
         element = self.shown(Place(inner, "", kind, None, depth + 1))
         listing = Listing(inner, element)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import POSITION_KEYS, Beyond, Contains, Equals, NearPosition
-from ros2_memory.columns.scores import may_be_json, unknown, without_low
+from ros2_memory.columns.scores import may_be_json, without_low
 from ros2_memory.columns.shown import (
     MAX_LEAVES,
     Group,
@@ -32,6 +32,7 @@ from ros2_memory.columns.shown import (
     leaves_below,
     opened,
     placed,
+    unknown,
 )
 from ros2_memory.columns.table import MAX_NUMBERS, Texts
 from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.shown import Limits, Node
     from ros2_memory.columns.table import Table, Zone
     from ros2_memory.columns.values import Mask, Numeric
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import Definition
 
@@ -304,55 +306,44 @@ class _LeafTest:
     ) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields the rows or elements whose arrays are too long to be held, by what is known."""
         path = self.leaf.level.name
-        lengths = values.column(level, f"{path}.length")
-        if lengths is None or isinstance(lengths, Texts):
+        lengths = values.numeric(level, f"{path}.length")
+        if lengths is None:
             if not is_part:
                 yield level, None, self.limits
             return
         here = lengths > (MAX_NUMBERS if is_part else 0)
         if not here.any():
             return
+        least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))
+        kept = unknown(len(lengths))
+        if least is not None and greatest is not None and self.leaf.kind is not Kind.BOOLEAN:
+            kept = self._between(least, greatest)
         limits = tuple(limit for limit in self.limits if limit.level != self.leaf.level)
-        surely, perhaps = self._in_range(values, level, path)
-        if len(limits) < len(self.limits):
-            surely = np.zeros(len(here), np.bool_)
-        yield level, Kept(here & surely, here & perhaps), limits
+        # Of one that is picked from an array, what is known of all says only what it may be.
+        surely = here & kept.surely & (len(limits) == len(self.limits))
+        yield level, Kept(surely, here & kept.perhaps), limits
 
-    def _in_range(self, values: Values, level: Level, path: str) -> tuple[Mask, Mask]:
-        """Returns in which arrays a number passes, by their least and greatest finite ones."""
-        least, greatest = (values.column(level, f"{path}.{end}") for end in ("least", "greatest"))
-        is_known = not (
-            least is None
-            or greatest is None
-            or isinstance(least, Texts)
-            or isinstance(greatest, Texts)
-        )
-        size = values.size(level) or 0
-        surely, perhaps = np.zeros(size, np.bool_), np.ones(size, np.bool_)
-        if not is_known or self.leaf.kind is Kind.BOOLEAN:
-            return surely, perhaps
-        assert not (least is None or greatest is None)
-        assert not (isinstance(least, Texts) or isinstance(greatest, Texts))
-        return self._between(least, greatest)
+    def _between(self, least: Numeric, greatest: Numeric) -> Kept:
+        """Returns in which arrays a number passes, by their least and greatest finite ones.
 
-    def _between(self, least: Numeric, greatest: Numeric) -> tuple[Mask, Mask]:
-        is_unknown = np.isnan(least)
+        NaN where those are not known. Integers of more than 53 bits were rounded.
+        """
+        is_real = self.leaf.kind is Kind.REAL
+        surely, perhaps = np.zeros(len(least), np.bool_), np.isnan(least)
+        is_rounded = np.maximum(np.abs(least), np.abs(greatest)) >= _EXACT_BELOW
+        if not is_real:
+            perhaps |= is_rounded
         if isinstance(self.test, Beyond):
             ends = greatest if self.test.above else least
             surely = beyond(ends, self.test.limit, above=self.test.above)
-            # Infinities are no finite numbers, and integers of more than 53 bits were rounded.
-            may_hide = self.leaf.kind is Kind.REAL
-            return surely & ~_is_rounded(self.leaf, ends), surely | may_hide | is_unknown | (
-                _is_rounded(self.leaf, ends)
-            )
-        surely, perhaps = np.zeros(len(least), np.bool_), is_unknown.copy()
-        rounded = _is_rounded(self.leaf, least) | _is_rounded(self.leaf, greatest)
+            perhaps |= is_real  # infinities are not among the finite ones
         for number in self.numbers:
+            at = _as_float(number)
             surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
-            if math.isinf(_as_float(number)):
-                perhaps |= self.leaf.kind is Kind.REAL
-            perhaps |= (least <= _as_float(number)) & (greatest >= _as_float(number))
-        return surely & ~rounded, surely | perhaps | rounded
+            perhaps |= ((least <= at) & (at <= greatest)) | (is_real and math.isinf(at))
+        if not is_real:
+            surely &= ~is_rounded
+        return Kept(surely, perhaps | surely)
 
 
 def may_be_rewritten(zone: Zone) -> bool:
@@ -360,21 +351,17 @@ def may_be_rewritten(zone: Zone) -> bool:
     return zone.words is None or "[" in zone.words or "{" in zone.words
 
 
-def _is_rounded(leaf: Leaf, numbers: Numeric) -> Mask:
-    return (np.abs(numbers) >= _EXACT_BELOW) & (leaf.kind is Kind.INTEGER)
-
-
 def _without_low(word: str, least: float, depth: int) -> str:
     """Returns a text of a value, which lies that deep in it, without detections of a low score."""
     if word[:1] not in {"[", "{"}:
         return word
     around = MAX_DEPTH - depth
-    value: object = word
+    value: JsonValue = word
     for _ in range(around):
         value = {"": value}
-    found: object = without_low_scores(value, least)  # type: ignore[arg-type]
-    for _ in range(around):
-        found = found[""]  # type: ignore[index]
+    found = without_low_scores(value, least)
+    while isinstance(found, dict):
+        found = found[""]
     return str(found)
 
 

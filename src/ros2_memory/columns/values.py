@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from ros2_memory.columns.table import Texts, Zone
+from ros2_memory.columns.table import MAX_NUMBERS, Texts, Zone
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.messages.conversions import ANGLES, channels_of, euler_of
 
@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.table import Column, Elements, Table
 
-    Numeric: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.number | np.bool_]]"
     Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+    # Of any dtype: that of floats has the operations that all of them have.
+    Numeric: TypeAlias = Floats
     Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
     Mask: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
@@ -194,26 +195,39 @@ class Values:
         found = self.column(leaf.level, leaf.sources[0])
         return found if isinstance(found, Texts) else None
 
+    def numeric(self, level: Level, path: str) -> Numeric | None:
+        """Returns a column of numbers or booleans; None where the table does not hold it."""
+        found = self.column(level, path)
+        return None if found is None or isinstance(found, Texts) else cast("Numeric", found)
+
     def numbers(self, leaf: Leaf) -> Numbers | None:
         """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
-        if leaf.made is Made.CONSTANT:
-            size = self.size(leaf.level)
-            return None if size is None else Numbers(np.full(size, leaf.constant))
         if leaf.made is Made.CHANNELS:
             texts = self.texts(leaf)
             return None if texts is None else Numbers(_channels(texts))
-        columns = [self.column(leaf.level, path) for path in leaf.sources]
-        found = [each for each in columns if each is not None and not isinstance(each, Texts)]
-        if len(found) < len(columns):
-            return None
+        if leaf.made is Made.CONSTANT:
+            size = self.size(leaf.level)
+            return None if size is None else Numbers(np.full(size, float(leaf.constant)))
+        columns = [self.numeric(leaf.level, path) for path in leaf.sources]
+        found = [column for column in columns if column is not None]
+        return self._made(leaf, found) if len(found) == len(columns) else None
+
+    def _made(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
         if leaf.made in _ANGLES:
-            return self._turned(leaf, found)
-        first, error = found[0], self.error(leaf)
+            return self._turned(leaf, columns)
+        first, error = columns[0], self.error(leaf)
         if leaf.made is Made.PRODUCT:
-            return Numbers(first.astype(np.uint64) * found[1].astype(np.uint64))
+            return Numbers(_product(first, columns[1]))
         if leaf.made is Made.SECONDS:
             return Numbers(seconds(first), error / NS_PER_S)
         return Numbers(first.astype(np.float64) if leaf.made is Made.REAL else first, error)
+
+    def holds_all(self, leaf: Leaf) -> bool:
+        """Returns whether no array that a leaf is an element of is too long to be held."""
+        if not leaf.is_of_array or leaf.level.parent is None:
+            return True
+        lengths = self.numeric(leaf.level.parent, f"{leaf.level.name}.length")
+        return lengths is None or not (lengths > MAX_NUMBERS).any()
 
     def error(self, leaf: Leaf) -> float:
         """Returns the greatest error of the columns of a leaf, in their own unit."""
@@ -267,6 +281,10 @@ def seconds(times: Numeric) -> Floats:
     whole = times // NS_PER_S
     parts = whole.astype(np.float64) + (times - whole * NS_PER_S) / NS_PER_S
     return np.where(np.abs(times) < _EXACT_BELOW, times / NS_PER_S, parts)
+
+
+def _product(one: Numeric, other: Numeric) -> Numeric:
+    return cast("Numeric", one.astype(np.uint64) * other.astype(np.uint64))
 
 
 def _channels(encodings: Texts) -> Floats:
