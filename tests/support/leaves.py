@@ -1,4 +1,4 @@
-"""Compares tables with decoded messages, leaf by leaf, without the plan that the tables came from."""
+"""Compares tables with decoded messages, leaf by leaf, without the plan they were made by."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Table, Texts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Container, Iterator, Sequence
 
 FILLER: Final = "structure_needs_at_least_one_member"
 TIMES: Final = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
@@ -27,52 +27,48 @@ class Comparison:
 
     def table(self, table: Table, messages: Sequence[object]) -> None:
         """Compares the rows of a table with messages in their order."""
-        if len(table) != len(messages):
-            self.wrong.append(f"{len(table)} rows for {len(messages)} messages")
-            return
-        self._rows(table, messages, table.channel.topic, table.left_out)
+        self._rows(table, messages, table.channel.topic)
 
-    def _rows(
-        self, rows: Table | Elements, values: Sequence[object], where: str, left_out: Iterable[str]
-    ) -> None:
+    def _rows(self, rows: Table | Elements, values: Sequence[object], where: str) -> None:
         """Compares the columns of a table or of elements with a message for each row."""
-        columns = {
-            path: column.values() if isinstance(column, Texts) else column.tolist()
+        columns: dict[str, list[object]] = {
+            path: list(column.values() if isinstance(column, Texts) else column.tolist())
             for path, column in rows.columns.items()
         }
-        for path, column in columns.items():
-            if len(column) != len(values):
-                self.wrong.append(f"{where} {path}: {len(column)} rows for {len(values)}")
-                return
+        lengths = {len(rows), *map(len, columns.values())}
+        if lengths != {len(values)}:
+            self.wrong.append(f"{where}: {lengths} rows for {len(values)} messages")
+            return
         met: set[str] = set()
-        lists: dict[str, list[tuple[int, list[object]]]] = {}
+        lists: dict[str, list[tuple[int, list[object]]]] = {path: [] for path in rows.elements}
         for row, value in enumerate(values):
             for path, leaf in leaves(value):
-                if isinstance(leaf, list):
-                    lists.setdefault(path, []).append((row, leaf))
-                    continue
                 for own, expected in _of_array(path, leaf, columns, rows.elements):
-                    met.add(own)
-                    self.leaves += 1
                     if isinstance(expected, list):
                         lists.setdefault(own, []).append((row, expected))
-                    elif own not in columns:
-                        self.wrong.append(f"{where} {own}: no column")
-                    elif not same(columns[own][row], expected):
-                        self.wrong.append(f"{where} {own}[{row}]: {columns[own][row]} {expected!r}")
+                        continue
+                    met.add(own)
+                    found = columns[own][row] if own in columns else "no column"
+                    self._leaf(f"{where} {own}[{row}]", found, expected)
         if values:
             self.wrong += [f"{where} {path}: extra" for path in columns.keys() - met]
-        for path, found in lists.items():
-            if path not in rows.elements:
-                self.wrong.append(f"{where} {path}: no elements")
-                continue
-            inner = rows.elements[path]
-            owners = [row for row, entries in found for _ in entries]
-            if owners != inner.owners.tolist():
-                self.wrong.append(f"{where} {path}: owners {inner.owners.tolist()} not {owners}")
-                continue
-            entries = [entry for _, each in found for entry in each]
-            self._rows(inner, entries, f"{where} {path}", left_out)
+        for path, found_lists in lists.items():
+            self._elements(rows.elements.get(path), found_lists, f"{where} {path}")
+
+    def _leaf(self, where: str, found: object, expected: object) -> None:
+        self.leaves += 1
+        if not same(found, expected):
+            self.wrong.append(f"{where}: {found!r} for {expected!r}")
+
+    def _elements(
+        self, elements: Elements | None, lists: list[tuple[int, list[object]]], where: str
+    ) -> None:
+        """Compares elements with the list of each row."""
+        owners = [row for row, entries in lists for _ in entries]
+        if elements is None or owners != elements.owners.tolist():
+            self.wrong.append(f"{where}: elements are missing, or belong to other rows")
+            return
+        self._rows(elements, [entry for _, entries in lists for entry in entries], where)
 
 
 def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
@@ -92,14 +88,14 @@ def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:
 
 
 def _of_array(
-    path: str, leaf: object, columns: dict[str, list[object]], elements: object
+    path: str, leaf: object, columns: dict[str, list[object]], elements: Container[str]
 ) -> Iterator[tuple[str, object]]:
     """What stands for a leaf: itself, or for an array its length, bounds and short content."""
     if not isinstance(leaf, np.ndarray):
         yield path, leaf
         return
     numbers = leaf.tolist()
-    is_sequence = path in elements  # type: ignore[operator]
+    is_sequence = path in elements
     if f"{path}.0" in columns and not is_sequence:
         for nth, number in enumerate(numbers):
             yield f"{path}.{nth}", number
@@ -121,11 +117,3 @@ def same(found: object, expected: object) -> bool:
     if isinstance(found, float) and math.isnan(found):
         return isinstance(expected, float) and math.isnan(expected)
     return bool(found == expected)
-
-
-def compared(tables: Iterable[Table], decode: Callable[[Table], Sequence[object]]) -> Comparison:
-    """Compares tables with what `decode` gives for each."""
-    comparison = Comparison()
-    for table in tables:
-        comparison.table(table, decode(table))
-    return comparison

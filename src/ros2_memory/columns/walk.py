@@ -9,6 +9,7 @@ the decoder, which decides message by message.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Column, Numbers
     from ros2_memory.storage.base import Batch, IntArray
 
-MAX_LOOPS: Final = 2_048
-"""Steps of a walk along sequences whose elements differ in size; of longer ones each message is
-sooner decoded alone."""
+_FEW_ROWS: Final = 24
+"""With fewer rows on average, the elements of sequences are sooner passed one by one than nth by
+nth."""
 MAX_COUNTED_BYTES: Final = 256 << 10
 """In a larger message the decoder counts strings and messages, and may refuse it."""
 _HEADER_BYTES: Final = 4
@@ -34,6 +35,7 @@ _LITTLE_ENDIAN: Final = 0x0100
 """The first two bytes of the header of plain CDR in little endian, as a number in little endian."""
 _MAX_PADDING: Final = 3
 _EVERY_BYTE: Final = (1,)
+_LENGTH: Final = struct.Struct("<I")
 
 
 Row: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.generic[object]]]"
@@ -71,7 +73,7 @@ def walked(plan: Plan, batch: Batch) -> Level:
         level = Level(left_out=dict(plan.left_out))
         rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
-    except (IndexError, UnicodeDecodeError) as error:
+    except (IndexError, UnicodeDecodeError, struct.error) as error:
         raise NotWalkedError from error
     left = rows.sizes - end
     if left.min() < 0 or left.max() > _MAX_PADDING:
@@ -102,7 +104,6 @@ def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
 @dataclass(slots=True)
 class _Walk:
     buffer: bytes
-    loops: int = 0
 
     def at(self, dtype: np.dtype[np.generic[object]] | str, places: IntArray) -> Row:
         """Returns what lies at these places of the buffer, aligned or not."""
@@ -244,13 +245,12 @@ class _Walk:
         self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
     ) -> tuple[IntArray, IntArray]:
         """Returns where elements of various sizes begin, and where their sequences end."""
-        most = int(counts.max(initial=0))
-        self.loops += most
-        if self.loops > MAX_LOOPS:
-            raise NotWalkedError
+        most, total = int(counts.max(initial=0)), int(counts.sum())
+        if total < _FEW_ROWS * most:
+            return self._passed_each(plan, rows, at, counts)
         first = np.cumsum(counts) - counts
-        begins = np.zeros(int(counts.sum()), np.int64)
-        end = at.copy()
+        begins = np.zeros(total, np.int64)
+        end = at
         for nth in range(most):
             left = np.flatnonzero(counts > nth)
             is_all = left.size == counts.size
@@ -260,8 +260,50 @@ class _Walk:
             if is_all:
                 end = behind
             else:
+                end = end.copy()
                 end[left] = behind
         return begins, end
+
+    def _passed_each(
+        self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Returns what `_stepped` does, element by element."""
+        begins: list[int] = []
+        ends: list[int] = []
+        spans = zip(rows.origins.tolist(), rows.sizes.tolist(), at.tolist(), strict=True)
+        for (origin, size, position), count in zip(spans, counts.tolist(), strict=True):
+            here = position
+            for _ in range(count):
+                here += -here % plan.align
+                begins.append(here)
+                here = self._passed(plan, origin, here, size)
+            ends.append(here)
+        return np.array(begins, np.int64), np.array(ends, np.int64)
+
+    def _passed(self, plan: Plan, origin: int, at: int, size: int) -> int:
+        """Returns where a message ends that begins `at` behind its origin."""
+        for step in plan.steps:
+            if isinstance(step, Run):
+                at += -at % step.align + step.size
+                continue
+            if isinstance(step, Sequence) and step.length != SEQUENCE:
+                count = step.length
+            else:
+                at += -at % step.align + step.skip
+                (count,) = _LENGTH.unpack_from(self.buffer, origin + at)
+                at += 4
+            if isinstance(step, Text):
+                at += count
+            elif isinstance(step, NumberSequence):
+                at += (-at % step.size if count and step.size > 4 else 0) + count * step.size
+            elif at + count * max(step.plan.least, 1) > size:
+                raise NotWalkedError
+            else:
+                for _ in range(count):
+                    at = self._passed(step.plan, origin, at + -at % step.plan.align, size)
+            if at > size:
+                raise NotWalkedError
+        return at
 
 
 def _steady(
@@ -325,9 +367,12 @@ def _ranges(counts: IntArray, values: Numbers) -> tuple[Floats, Floats]:
     filled = counts > 0
     if values.size:
         begins = (np.cumsum(counts) - counts)[filled]
-        low, high = _finite_bounds(values)
-        least[filled] = np.minimum.reduceat(low, begins)
-        greatest[filled] = np.maximum.reduceat(high, begins)
+        low, high = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
+        if not _are_finite(low, high):
+            least_of, greatest_of = _finite_only(values)
+            low = np.minimum.reduceat(least_of, begins)
+            high = np.maximum.reduceat(greatest_of, begins)
+        least[filled], greatest[filled] = low, high
         _unbounded(least, greatest)
     return least, greatest
 
@@ -336,19 +381,27 @@ def add_ranges(columns: dict[str, Column], path: str, values: Numbers, *, is_boo
     """Adds the least and greatest finite value of each row of numbers."""
     if is_bool:
         values = (values != 0).view(np.uint8)
-    low, high = _finite_bounds(values)
-    least, greatest = low.min(1).astype(np.float64), high.max(1).astype(np.float64)
+    # Numpy goes along the last axis, so that the shorter one comes first.
+    table = np.ascontiguousarray(values.T)
+    least, greatest = table.min(0), table.max(0)
+    if not _are_finite(least, greatest):
+        low, high = _finite_only(table)
+        least, greatest = low.min(0), high.max(0)
+    least, greatest = least.astype(np.float64), greatest.astype(np.float64)
     _unbounded(least, greatest)
     columns[f"{path}.least"], columns[f"{path}.greatest"] = least, greatest
 
 
-def _finite_bounds(values: Numbers) -> tuple[Numbers, Numbers]:
+def _are_finite(least: Numbers, greatest: Numbers) -> bool:
+    """Returns whether all numbers were finite: NaN and infinities are among their bounds."""
+    if least.dtype.kind != "f":
+        return True
+    return bool(np.isfinite(least).all() and np.isfinite(greatest).all())
+
+
+def _finite_only(values: Numbers) -> tuple[Numbers, Numbers]:
     """Returns the values twice, with what is not finite put where it is neither bound."""
-    if values.dtype.kind != "f":
-        return values, values
     finite = np.isfinite(values)
-    if finite.all():
-        return values, values
     return np.where(finite, values, np.inf), np.where(finite, values, -np.inf)
 
 

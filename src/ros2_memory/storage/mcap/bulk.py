@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.storage.base import Channel, IntArray
+    from ros2_memory.storage.base import Channel, IntArray, Mask
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import Column
     from ros2_memory.storage.mcap.summary import Chunk
@@ -273,9 +273,10 @@ def batches_of(
     times, places = pairs.times[order], pairs.offsets[order] + steps
     starts = at + MESSAGE.size
     lengths = stops[order] - starts
+    has_frames = bool(_are_frames(buffer, starts, lengths).any())
     bounds = np.flatnonzero(of[1:] != of[:-1]) + 1
     edges = [0, *bounds.tolist(), of.size] if of.size else []
-    found = []
+    found: list[Batch] = []
     for first, last in pairwise(edges):
         rows = slice(first, last)
         batch = Batch(
@@ -287,7 +288,7 @@ def batches_of(
             starts[rows],
             lengths[rows],
         )
-        found += list(_decompressed(batch, max_bytes))
+        found += _decompressed(batch, max_bytes) if has_frames else [batch]
     return found
 
 
@@ -338,27 +339,32 @@ def batches_of_chunk(
 
 def _decompressed(batch: Batch, max_bytes: int) -> Iterator[Batch]:
     """Yields a batch; or several where rosbag2 compressed each message."""
-    long = batch.sizes >= len(FRAME_MAGIC)
-    if batch.channel.encoding != "cdr" or not long.any():
-        yield batch
-        return
-    views = np.ndarray(len(batch.buffer) - 3, "<u4", batch.buffer, 0, _EVERY_BYTE)
-    compressed = np.zeros(long.size, np.bool_)
-    compressed[long] = views[batch.starts[long]] == _MAGIC
-    if not compressed.any():
+    compressed = _are_frames(batch.buffer, batch.starts, batch.sizes)
+    if batch.channel.encoding != "cdr" or not compressed.any():
         yield batch
         return
     begin, size = 0, 0
     payloads: list[bytes] = []
-    for nth in range(long.size):
+    for nth in range(compressed.size):
         payload = batch.payload(nth)
         if compressed[nth]:
             payload = uncompressed_payload(batch.channel, payload, max_bytes)
         payloads.append(payload)
         size += len(payload)
-        if size >= BATCH_BYTES or nth == long.size - 1:
+        if size >= BATCH_BYTES or nth == compressed.size - 1:
             yield _with_payloads(batch.taken(np.arange(begin, nth + 1)), payloads)
             begin, size, payloads = nth + 1, 0, []
+
+
+def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
+    """Returns which payloads begin as zstd does."""
+    long = sizes >= len(FRAME_MAGIC)
+    if not long.all():
+        starts = starts[long]
+    views = np.ndarray(max(len(buffer) - 3, 0), "<u4", buffer, 0, _EVERY_BYTE)
+    found = np.zeros(long.size, np.bool_)
+    found[long] = views[starts] == _MAGIC
+    return found
 
 
 def _with_payloads(batch: Batch, payloads: Sequence[bytes]) -> Batch:

@@ -1,0 +1,153 @@
+"""Batches of MCAP files that are damaged, lie, or are made as few writers make them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType
+
+from ros2_memory.core.errors import BagContradictionError, BagError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap import bag_file, bulk
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.examples import examples
+from tests.support.mcap_surgery import SMALL, change_index, chatter, chunks_of, damaged, spoil_chunk
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from ros2_memory.storage.base import Batch, Record
+
+EVERYTHING = TimeWindow.everything()
+TOPICS = ("/chatter", "/bumper")
+
+
+def all_of(items: Iterator[Record] | Iterator[Batch]) -> tuple[list[object], list[BagError]]:
+    """What an iterator yields, and what it raises meanwhile."""
+    found: list[object] = []
+    errors: list[BagError] = []
+    while True:
+        try:
+            found.append(next(items))
+        except StopIteration:
+            return found, errors
+        except BagError as error:
+            errors.append(error)
+
+
+def records_in(batches: Iterable[object]) -> Counter[object]:
+    return Counter[object](
+        batch.record(nth)  # type: ignore[attr-defined]
+        for batch in batches
+        for nth in range(batch.sizes.size)  # type: ignore[attr-defined]
+    )
+
+
+def times_in(batches: Iterable[object]) -> Counter[int]:
+    return Counter(
+        time
+        for batch in batches
+        for time in batch.log_times.tolist()  # type: ignore[attr-defined]
+    )
+
+
+def test_a_damaged_chunk_is_lost_alone_and_named(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    spoilt = chunks_of(path)[2]
+    spoil_chunk(path, 2)
+    found, [error] = all_of(McapReader().batches(path, TOPICS, EVERYTHING))
+    assert error.lost == (spoilt.message_start_time, spoilt.message_end_time)
+    lost = set(range(spoilt.message_start_time, spoilt.message_end_time + 1))
+    assert set(times_in(found)) == set(range(20)) - lost
+
+
+@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize(("at", "value"), [(0, 3), (8, 1)])
+def test_an_index_that_lies_loses_no_message_and_doubles_none(
+    tmp_path: Path, number: int, at: int, value: int
+) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    chunk = chunks_of(path)[number]
+    change_index(path, chunk, at, chunk.message_start_time + 1 if at == 0 else value)
+    reader = McapReader()
+    for _ in range(2):
+        found, errors = all_of(reader.batches(path, TOPICS, EVERYTHING))
+        # The first time of all is compared before anything is read.
+        assert len(errors) == (0 if (number, at) == (0, 0) else 1)
+        assert all(isinstance(error, BagContradictionError) for error in errors)
+        times = times_in(found)
+        assert times == Counter(range(20))
+
+
+@settings(max_examples=examples(150))
+@given(seed=st.integers(0, 2**32), layout=st.sampled_from(["plain", "zstd"]))
+def test_of_a_damaged_file_batches_hold_what_records_do(seed: int, layout: str) -> None:
+    how = {
+        "plain": SMALL,
+        "zstd": McapLayout(chunk_size=400, compression=CompressionType.ZSTD),
+    }[layout]
+    messages = [*chatter(12), *(boolean(time, True) for time in range(5, 9))]
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_mcap(Path(folder) / "a.mcap", messages, how)
+        path.write_bytes(damaged(path.read_bytes(), seed))
+        records, errors = all_of(McapReader().records(path, TOPICS, EVERYTHING))
+        batches, others = all_of(McapReader().batches(path, TOPICS, EVERYTHING))
+    found, expected = records_in(batches), Counter[object](records)
+    assert not expected - found
+    contradicted = any(isinstance(error, BagContradictionError) for error in errors)
+    if not contradicted:
+        assert found == expected
+    assert bool(errors) == bool(others)
+
+
+def test_chunks_of_bare_topics_are_not_decompressed(tmp_path: Path) -> None:
+    messages = [*chatter(12), *(boolean(time, True) for time in range(12, 40))]
+    path = write_mcap(tmp_path / "a.mcap", messages, SMALL)
+    spoil_chunk(path, 0)
+    batches = list(McapReader().batches(path, TOPICS, EVERYTHING, bare=["/chatter"]))
+    times = times_in(batches)
+    assert times == Counter(range(40))
+
+
+def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:
+    plain = [text(time, f"message {time}") for time in range(9)]
+    packed = [
+        Msg(each.topic, each.type, each.log_time, zstandard.compress(each.payload))
+        if each.log_time % 2
+        else each
+        for each in plain
+    ]
+    path = write_mcap(tmp_path / "a.mcap", packed, SMALL)
+    batches = list(McapReader().batches(path, TOPICS, EVERYTHING))
+    found = {
+        time: batch.payload(nth)
+        for batch in batches
+        for nth, time in enumerate(batch.log_times.tolist())
+    }
+    assert found == {each.log_time: each.payload for each in plain}
+
+
+def test_indexed_chunks_are_read_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(40), SMALL)
+    monkeypatch.delattr(bag_file.McapBags, "_batches_of_chunk")
+    [batch] = McapReader().batches(path, TOPICS, EVERYTHING)
+    assert batch.log_times.tolist() == list(range(40))
+
+
+def test_no_buffer_has_more_than_its_share_of_small_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(40), SMALL)
+    monkeypatch.setattr(bulk, "BATCH_BYTES", 1500)
+    batches = list(McapReader().batches(path, TOPICS, EVERYTHING))
+    assert len(batches) > 3
+    assert max(len(batch.buffer) for batch in batches) <= 1500
+    assert [time for batch in batches for time in batch.log_times.tolist()] == list(range(40))
