@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,7 +25,7 @@ from ros2_memory.analysis.conditions import (
 )
 from ros2_memory.columns.objects import level_of
 from ros2_memory.columns.plan import plan_of
-from ros2_memory.columns.table import Table
+from ros2_memory.columns.table import Column, Elements, Table, Texts, Zone, joined
 from ros2_memory.columns.walk import NotWalkedError, walked
 from ros2_memory.storage.base import Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from random import Random
 
-    from hypothesis.strategies import DrawFn, SearchStrategy
+    from hypothesis.strategies import DrawFn
     from rosbags.typesys.store import Typestore
 
     from ros2_memory.core.model import JsonValue
@@ -50,11 +51,13 @@ VISION_MSGS: Final = {
     "vision_msgs/msg/BoundingBox2D": "Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
     "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
     "vision_msgs/msg/Detection2D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\nstring id\n"
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\n"
+        "BoundingBox2D bbox\nstring id\n"
     ),
     "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nDetection2D[] detections\n",
     "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\nstring id\n"
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\n"
+        "BoundingBox3D bbox\nstring id\n"
     ),
     "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
 }
@@ -169,34 +172,126 @@ class Drawn:
 
 def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
     """Messages of one channel in the order of time, as a table."""
-    channel = records[0].channel
-    definition = reader.definition(channel)
+    batches: list[Batch] = [*batched(enumerate(records))]  # type: ignore[arg-type]
+    table = joined([_table(batch, reader) for batch in batches])
+    return Drawn(table, [reader.decode(record) for record in records])
+
+
+def _table(batch: Batch, reader: McapReader) -> Table:
+    definition = reader.definition(batch.channel)
     assert definition is not None
     plan = plan_of(definition)
-    messages = [reader.decode(record) for record in records]
-    batches: list[Batch] = [*batched(enumerate(records))]  # type: ignore[arg-type]
-    assert len(batches) == 1
-    batch = batches[0]
     try:
         level = walked(plan, batch)
     except NotWalkedError:
-        level = level_of(plan, messages)
-    return Drawn(
-        Table(
-            channel,
-            batch.log_times,
-            batch.publish_times,
-            batch.places,
-            level.columns,
-            level.elements,
-            level.left_out,
-            definition=definition,
-        ),
-        messages,
+        level = level_of(
+            plan, [reader.decode(batch.record(nth)) for nth in range(len(batch.starts))]
+        )
+    return Table(
+        batch.channel,
+        batch.log_times,
+        batch.publish_times,
+        batch.places,
+        level.columns,
+        level.elements,
+        level.left_out,
+        definition=definition,
     )
 
 
 _READER: Final = McapReader()
+
+
+class LazyColumns(Mapping[str, Column]):
+    """Columns that say which of them were unpacked."""
+
+    def __init__(self, prefix: str, columns: Mapping[str, Column], unpacked: set[str]) -> None:
+        self._prefix = prefix
+        self._columns = columns
+        self._unpacked = unpacked
+
+    def __getitem__(self, path: str) -> Column:
+        column = self._columns[path]
+        self._unpacked.add(f"{self._prefix}.{path}".strip("."))
+        return column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+
+class StoredTable(Table):
+    """A table as it comes out of a store: floats rounded to a step, with zones."""
+
+    __slots__ = ("errors", "unpacked", "zones")
+    errors: dict[str, float]
+    unpacked: set[str]
+    zones: dict[str, Zone]
+
+    def error(self, path: str) -> float:
+        return self.errors.get(path, 0.0)
+
+    def zone(self, path: str) -> Zone | None:
+        return self.zones.get(path)
+
+
+def stored(table: Table, step: float, *, zones: bool = True) -> StoredTable:
+    """The table with floats rounded to a multiple of `step`; 0 for no rounding."""
+    errors: dict[str, float] = {}
+    known: dict[str, Zone] = {}
+    unpacked: set[str] = set()
+
+    def packed(prefix: str, columns: Mapping[str, Column]) -> LazyColumns:
+        found: dict[str, Column] = {}
+        for path, column in columns.items():
+            full = f"{prefix}.{path}".strip(".")
+            # A list of numbers is not always held whole.
+            if zones and path:
+                known[full] = zone_of(column)
+            found[path] = column
+            if step and not isinstance(column, Texts) and column.dtype.kind == "f":
+                found[path], errors[full] = rounded(column, step)
+        return LazyColumns(prefix, found, unpacked)
+
+    def elements(prefix: str, within: Mapping[str, Elements]) -> dict[str, Elements]:
+        return {
+            path: Elements(
+                inner.owners,
+                packed(f"{prefix}.{path}".strip("."), inner.columns),
+                elements(f"{prefix}.{path}".strip("."), inner.elements),
+            )
+            for path, inner in within.items()
+        }
+
+    made = {entry.name: getattr(table, entry.name) for entry in fields(Table)}
+    made["columns"] = packed("", table.columns)
+    made["elements"] = elements("", table.elements)
+    result = StoredTable(**made)
+    for name, value in (("errors", errors), ("zones", known), ("unpacked", unpacked)):
+        object.__setattr__(result, name, value)
+    return result
+
+
+def rounded(column: Any, step: float) -> tuple[Any, float]:
+    """Floats as multiples of a step, and the most by which they are off."""
+    with np.errstate(all="ignore"):
+        near = np.round(column.astype(np.float64) / step) * step
+        near = np.where(np.isfinite(near), near, column.astype(np.float64))
+        off = np.abs(near - column.astype(np.float64))
+    return near, float(np.max(off, initial=0.0, where=np.isfinite(off)))
+
+
+def zone_of(column: Column) -> Zone:
+    """What is known of a column without unpacking it."""
+    if isinstance(column, Texts):
+        return Zone(words="\n".join(sorted({word.casefold() for word in column.words})))
+    kept = column[~np.isnan(column)] if column.dtype.kind == "f" else column
+    if not kept.size:
+        return Zone(nulls=column.size)
+    least, greatest = (end.item() for end in (kept.min(), kept.max()))
+    return Zone(least, greatest, int(column.size - kept.size))
 
 
 @st.composite
@@ -207,6 +302,11 @@ def drawn_tables(draw: DrawFn, types: Sequence[str] = (*MAPPED, *OTHERS)) -> Dra
     is_odd = draw(st.booleans())
     count = draw(st.integers(1, ROWS))
     messages = [message(type_name, random, is_odd=is_odd) for _ in range(count)]
+    return drawn_of(type_name, messages)
+
+
+def drawn_of(type_name: str, messages: Sequence[object]) -> Drawn:
+    """These messages, one each nanosecond, as a table."""
     payloads = [bytes(store().serialize_cdr(each, type_name)) for each in messages]
     records = [Record(_channel(type_name), at, at, payload) for at, payload in enumerate(payloads)]
     return table_of(records, _READER)
@@ -332,12 +432,7 @@ def _test(leaf: JsonValue, random: Random) -> Contains | Equals | Beyond:
     kind = random.choice(["contains", "equals", "above", "below"])
     if kind in {"above", "below"}:
         is_number = isinstance(needle, int | float) and not isinstance(needle, bool)
-        return (
-            Beyond(float(needle) if not is_number else needle, kind == "above")
-            # type: ignore[arg-type]
-            if (is_number)
-            else Beyond(0.5, kind == "above")
-        )
+        return Beyond(needle if is_number else 0.5, kind == "above")  # type: ignore[arg-type]
     if kind == "contains":
         return Contains(needle if not isinstance(needle, str) or needle.strip() else "cup")
     return Equals(needle)

@@ -87,11 +87,11 @@ class Truth:
 
 
 def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
-    """Returns which rows of a table meet a condition; of several tables use one `Tester`."""
-    return Tester(condition, extractor).truth(table)
+    """Returns which rows of a table meet a condition; of several tables use one `ColumnCondition`."""
+    return ColumnCondition(condition, extractor).truth(table)
 
 
-class Tester:
+class ColumnCondition:
     """Tests one condition on tables; remembers what it means for each type that it met.
 
     Args:
@@ -289,7 +289,7 @@ class _LeafTest:
             return Kept(passed, passed)
         near = np.isinf(error) | np.zeros(len(column), np.bool_)
         for bound in (self.test.limit,) if isinstance(self.test, Beyond) else self.numbers:
-            near |= np.abs(column - _as_float(bound)) <= error
+            near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
             return Kept(passed & ~near, passed | near)
         among = np.flatnonzero(near)
@@ -371,10 +371,11 @@ def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
         whole = math.floor(limit) if above else math.ceil(limit)
         return column > whole if above else column < whole
     # Not a Python float, to which float32 would be compared as float32.
-    bound = np.float64(_as_float(limit))
+    nearest = _as_float(limit)
+    bound = np.float64(nearest)
     if above:
-        return column >= bound if bound > limit else column > bound
-    return column <= bound if bound < limit else column < bound
+        return column >= bound if nearest > limit else column > bound
+    return column <= bound if nearest < limit else column < bound
 
 
 def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:

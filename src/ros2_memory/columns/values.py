@@ -270,7 +270,9 @@ class Values:
                 found[nth] = known[numbers]
             return found
 
-        return Numbers(angles[which], _ROUNDING_DEG, exactly)
+        # Zero is zero everywhere, and a robot in the plane has nothing else.
+        off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
+        return Numbers(angles[which], off, exactly)
 
 
 def seconds(times: Numeric) -> Floats:
