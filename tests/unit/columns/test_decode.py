@@ -12,107 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.columns import decode
-from ros2_memory.columns.decode import decoded
-from ros2_memory.columns.table import joined
-from ros2_memory.columns.walk import NotWalkedError, walked
-from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.decoded_bags import bag_of, decoded_alike, tables_of
 from tests.support.drawn_types import DrawnTypes, drawn_types
 from tests.support.examples import LONG, examples
 from tests.support.leaves import Comparison
-from tests.support.mcap_surgery import raw_mcap
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from mcap.writer import Writer
-
-    from ros2_memory.columns.plan import Plan
-    from ros2_memory.columns.table import Table
-    from ros2_memory.columns.walk import Level
-    from ros2_memory.storage.base import BagReader, Batch, Record
+    pass
 
 EVERYTHING: Final = TimeWindow.everything()
-
-
-@pytest.fixture
-def fallbacks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The topics of batches that were decoded message by message."""
-    topics: list[str] = []
-
-    def noting(plan: Plan, batch: Batch) -> Level:
-        try:
-            return walked(plan, batch)
-        except NotWalkedError:
-            topics.append(batch.channel.topic)
-            raise
-
-    monkeypatch.setattr(decode, "walked", noting)
-    return topics
-
-
-def tables_of(reader: BagReader, path: Path, **how: object) -> list[Table]:
-    """All tables of a bag, those of several groups joined; errors of lost messages are passed."""
-    parts: dict[object, list[Table]] = {}
-    groups = decoded(reader, path, **how)  # type: ignore[arg-type]
-    while True:
-        try:
-            group = next(groups)
-        except StopIteration:
-            break
-        except BagError:
-            continue
-        for table in group:
-            parts.setdefault((table.channel.topic, table.channel.schema), []).append(table)
-    return [joined(tables) for tables in parts.values()]
-
-
-def records_of(reader: BagReader, path: Path, topics: set[str]) -> Iterator[Record]:
-    records = reader.records(path, topics, EVERYTHING)
-    while True:
-        try:
-            yield next(records)
-        except StopIteration:
-            return
-        except BagError:
-            continue
-
-
-def compared(reader: BagReader, path: Path, tables: Sequence[Table]) -> Comparison:
-    """Compares tables with the records of a bag, decoded one by one."""
-    topics = {table.channel.topic for table in tables}
-    records: dict[object, list[Record]] = {}
-    for record in records_of(reader, path, topics):
-        records.setdefault((record.channel.topic, record.channel.schema), []).append(record)
-    assert records.keys() == {(table.channel.topic, table.channel.schema) for table in tables}
-    comparison = Comparison()
-    for table in tables:
-        found = records[table.channel.topic, table.channel.schema]
-        kept, messages = found, []
-        if "" not in table.left_out:
-            kept = []
-            for record in found:
-                try:
-                    messages.append(reader.decode(record))
-                    kept.append(record)
-                except UndecodableError:
-                    pass
-            comparison.table(table, messages)
-        assert table.undecodable == len(found) - len(kept)
-        assert table.log_times.tolist() == [record.log_time for record in kept]
-        if "" not in table.left_out:
-            assert table.publish_times.tolist() == [record.publish_time for record in kept]
-    return comparison
-
-
-def decoded_alike(reader: BagReader, path: Path) -> Comparison:
-    comparison = compared(reader, path, tables_of(reader, path))
-    assert comparison.wrong == []
-    return comparison
 
 
 def bags_below(folder: Path) -> list[Path]:
@@ -122,7 +34,7 @@ def bags_below(folder: Path) -> list[Path]:
     if LONG:
         return files
     first = {file.parent: file for file in reversed(files)}
-    return sorted(file for file in first.values() if file.stat().st_size < 500_000)
+    return sorted(file for file in first.values() if file.stat().st_size < 120_000)
 
 
 @needs_real
@@ -141,26 +53,7 @@ def test_recorded_sessions_are_decoded_as_rosbags_does(path: Path, fallbacks: li
     assert fallbacks == []
 
 
-def bag_of(
-    path: Path,
-    types: DrawnTypes,
-    payloads: Sequence[bytes],
-    *,
-    is_idl: bool = False,
-) -> Path:
-    """A bag of one topic."""
-
-    def fill(writer: Writer) -> None:
-        encoding, definition = ("ros2idl", types.idl()) if is_idl else ("ros2msg", types.msg())
-        schema = writer.register_schema(types.root, encoding, definition.encode())
-        channel = writer.register_channel("/drawn", "cdr", schema)
-        for nth, payload in enumerate(payloads):
-            writer.add_message(channel, 10 + nth, payload, 5 + nth)
-
-    return raw_mcap(path, fill, profile="ros2", chunk_size=4096)
-
-
-@settings(max_examples=examples(300))
+@settings(max_examples=examples(75))
 @given(
     types=drawn_types(),
     seed=st.integers(0, 2**32),
@@ -193,7 +86,7 @@ def test_messages_of_any_definition_are_decoded_as_rosbags_does(
         assert comparison.wrong == []
 
 
-@settings(max_examples=examples(300))
+@settings(max_examples=examples(75))
 @given(types=drawn_types(), seed=st.integers(0, 2**32))
 def test_damaged_payloads_are_decoded_or_counted_as_rosbags_decides(
     types: DrawnTypes, seed: int

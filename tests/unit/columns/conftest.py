@@ -1,0 +1,31 @@
+"""Fixtures of the tests of columns."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.columns import decode
+from ros2_memory.columns.walk import NotWalkedError, walked
+
+if TYPE_CHECKING:
+    from ros2_memory.columns.plan import Plan
+    from ros2_memory.columns.walk import Level
+    from ros2_memory.storage.base import Batch
+
+
+@pytest.fixture
+def fallbacks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The topics of batches that were decoded message by message."""
+    topics: list[str] = []
+
+    def noting(plan: Plan, batch: Batch) -> Level:
+        try:
+            return walked(plan, batch)
+        except NotWalkedError:
+            topics.append(batch.channel.topic)
+            raise
+
+    monkeypatch.setattr(decode, "walked", noting)
+    return topics

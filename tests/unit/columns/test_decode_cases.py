@@ -1,0 +1,406 @@
+"""What decoding a bag as columns does with long, hostile, many, odd and bulky messages."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import pytest
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.columns import decode
+from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.table import Texts
+from ros2_memory.core.errors import BagError, BagVanishedError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap import bulk
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    header,
+    make,
+    odom,
+    point,
+    quaternion,
+    text,
+    tf,
+    write_mcap,
+)
+from tests.support.bags import transform as transform_of
+from tests.support.decoded_bags import bag_of, compared, decoded_alike, tables_of
+from tests.support.drawn_types import DrawnField, DrawnTypes
+from tests.support.leaves import Comparison
+from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mcap.writer import Writer
+
+    from ros2_memory.columns.table import Table
+    from ros2_memory.storage.base import Channel
+
+EVERYTHING: Final = TimeWindow.everything()
+
+
+def path_message(ns: int, points: int) -> Msg:
+    """A path whose poses have frames of various lengths, and which something follows in a type."""
+    poses = [
+        make(
+            "geometry_msgs/msg/PoseStamped",
+            header=header(ns + nth, "map" if nth % 3 else "odometry"),
+            pose=make(
+                "geometry_msgs/msg/Pose",
+                position=point(float(nth), 0.5),
+                orientation=quaternion(0.1),
+            ),
+        )
+        for nth in range(points)
+    ]
+    made = make("nav_msgs/msg/Path", header=header(ns, "map"), poses=poses)
+    return Msg("/plan", "nav_msgs/msg/Path", ns, made)
+
+
+def numbers(table: Table, path: str) -> list[object]:
+    column = table.columns[path]
+    assert isinstance(column, np.ndarray)
+    return list(column.tolist())
+
+
+def texts(table: Table, path: str) -> list[str]:
+    column = table.columns[path]
+    assert isinstance(column, Texts)
+    return column.values()
+
+
+LONG_TYPES: Final = DrawnTypes(
+    (
+        (
+            "Point",
+            (DrawnField("x", "float64"), DrawnField("kind", "uint8")),
+        ),
+        (
+            "Named",
+            (DrawnField("label", "string"), DrawnField("points", "Point", -1)),
+        ),
+        (
+            "Long",
+            (
+                DrawnField("points", "Point", -1),
+                DrawnField("named", "Named", -1),
+                DrawnField("scan", "float32", -1),
+                DrawnField("answer", "int32"),
+            ),
+        ),
+    )
+)
+
+
+@pytest.mark.parametrize("rows", [1, 40])
+def test_what_follows_long_sequences_is_read_where_it_is(
+    tmp_path: Path, rows: int, fallbacks: list[str]
+) -> None:
+    store = LONG_TYPES.store()
+    named, part, long = (
+        store.types[f"drawn_msgs/msg/{name}"] for name in ("Named", "Point", "Long")
+    )
+    messages = [
+        long(
+            [part(float(nth), nth % 200) for nth in range(700 + row)],
+            [named("n" * (nth % 7), [part(0.5, 1)] * (nth % 4)) for nth in range(30)],
+            np.arange(2000 - row, dtype=np.float32),
+            42,
+        )
+        for row in range(rows)
+    ]
+    payloads = [bytes(store.serialize_cdr(each, LONG_TYPES.root)) for each in messages]
+    path = bag_of(tmp_path / "long.mcap", LONG_TYPES, payloads)
+    reader = McapReader()
+    [table] = tables_of(reader, path)
+    comparison = Comparison()
+    comparison.table(table, messages)
+    assert comparison.wrong == []
+    assert numbers(table, "answer") == [42] * rows
+    assert len(table.elements["named"].elements["points"]) == rows * 43
+    assert numbers(table, "scan.length")[0] == 2000
+    assert fallbacks == []
+
+
+@pytest.mark.parametrize("points", [0, 1, 600, 5000])
+def test_paths_of_any_length_keep_all_their_poses(
+    tmp_path: Path, points: int, fallbacks: list[str]
+) -> None:
+    path = write_mcap(tmp_path / "a.mcap", [path_message(5, points), path_message(6, 3)])
+    decoded_alike(McapReader(), path)
+    # From 256 KiB on the decoder counts the objects of a message, and may refuse it.
+    assert fallbacks == ([] if points < 3000 else ["/plan"])
+
+
+def strings(path: Path, payloads: Sequence[bytes]) -> Table:
+    """The table of strings with these payloads, each in a chunk with the others."""
+    messages = [
+        Msg("/chatter", "std_msgs/msg/String", nth, each) for nth, each in enumerate(payloads)
+    ]
+    [table] = tables_of(McapReader(), write_mcap(path, messages))
+    return table
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 60) + b"a\0", id="into the neighbour"),
+        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2**32 - 1) + b"a\0", id="past the file"),
+        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 0), id="no zero"),
+        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2) + b"ab", id="another end"),
+        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2) + b"\xff\0", id="no UTF-8"),
+        pytest.param(struct.pack("<4sI", b"\0\1\0\0", 2) + b"a\0" + bytes(4), id="too long"),
+        pytest.param(b"\0\1\0", id="shorter than its header"),
+        pytest.param(b"", id="empty"),
+        pytest.param(struct.pack("<4sI", b"\0\3\0\0", 2) + b"a\0", id="another encoding"),
+    ],
+)
+def test_a_hostile_payload_is_counted_and_changes_no_other_message(
+    tmp_path: Path, bad: bytes
+) -> None:
+    good = [text(nth, f"message {nth}").payload for nth in range(4)]
+    table = strings(tmp_path / "a.mcap", [good[0], bad, *good[1:]])
+    assert texts(table, "data") == [f"message {nth}" for nth in range(4)]
+    assert table.log_times.tolist() == [0, 2, 3, 4]
+    assert table.undecodable == 1
+    assert table.undecodable_reason
+
+
+def test_big_endian_messages_are_decoded(tmp_path: Path) -> None:
+    table = strings(
+        tmp_path / "a.mcap",
+        [text(0, "little").payload, struct.pack(">4sI", b"\0\0\0\0", 4) + b"big\0"],
+    )
+    assert (texts(table, "data"), table.undecodable) == (["little", "big"], 0)
+
+
+def test_a_definition_that_changes_between_bags_is_read_with_that_of_each(tmp_path: Path) -> None:
+    old = DrawnTypes((("State", (DrawnField("level", "int8"),)),))
+    new = DrawnTypes((("State", (DrawnField("name", "string"), DrawnField("level", "float64"))),))
+    reader = McapReader()
+    for nth, types in enumerate((old, new, old)):
+        store = types.store()
+        state = store.types[types.root]
+        message = state(7) if types is old else state("docked", 7.5)
+        payload = bytes(store.serialize_cdr(message, types.root))
+        [table] = tables_of(reader, bag_of(tmp_path / f"{nth}.mcap", types, [payload]))
+        assert set(table.columns) == ({"level"} if types is old else {"name", "level"})
+        assert numbers(table, "level") == [7 if types is old else 7.5]
+
+
+def test_two_types_on_one_topic_are_two_tables(tmp_path: Path) -> None:
+    messages = [text(1, "one", "/t"), boolean(2, True, "/t"), text(3, "three", "/t")]
+    tables = tables_of(McapReader(), write_mcap(tmp_path / "a.mcap", messages))
+    assert {table.channel.type: table.log_times.tolist() for table in tables} == {
+        "std_msgs/msg/String": [1, 3],
+        "std_msgs/msg/Bool": [2],
+    }
+
+
+def two_publishers(path: Path) -> Path:
+    """A topic with a channel for each of two publishers."""
+    types = DrawnTypes((("State", (DrawnField("level", "int64"),)),))
+    store = types.store()
+
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema(types.root, "ros2msg", types.msg().encode())
+        channels = [writer.register_channel("/state", "cdr", schema) for _ in range(2)]
+        for time in range(9):
+            payload = store.serialize_cdr(store.types[types.root](time), types.root)
+            writer.add_message(channels[time % 2], time, bytes(payload), time)
+
+    return raw_mcap(path, fill, profile="ros2")
+
+
+def test_two_publishers_of_one_topic_are_one_table(tmp_path: Path) -> None:
+    [[table]] = decoded(McapReader(), two_publishers(tmp_path / "a.mcap"))
+    assert numbers(table, "level") == list(range(9))
+
+
+def test_every_one_of_649_topics_has_its_table(tmp_path: Path) -> None:
+    messages = [text(nth, f"of {nth % 649}", f"/topic_{nth % 649:03}") for nth in range(1400)]
+    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=5000))
+    [tables] = decoded(McapReader(), path)
+    assert len(tables) == 649
+    assert compared(McapReader(), path, tables).wrong == []
+
+
+def mixed(count: int) -> list[Msg]:
+    messages: list[Msg] = []
+    for time in range(0, count * 10, 10):
+        messages += [
+            odom(time, time / 7, -1.0),
+            tf(
+                time + 1,
+                *(
+                    transform_of(time, "odom", f"link{nth}", (0.0, 1.0, nth))
+                    for nth in range(time // 10 % 3)
+                ),
+            ),
+            text(time + 2, f"text {time // 40}"),
+            detections(time + 3, ["cup", "person"][: time // 10 % 3]),
+        ]
+    return messages
+
+
+def test_small_groups_hold_together_what_one_group_does(tmp_path: Path) -> None:
+    # Out of order, so that later groups reach back in time.
+    messages = mixed(40)
+    messages = [*messages[:50], *messages[90:], *messages[50:90]]
+    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=1500))
+    reader = McapReader()
+    [whole] = decoded(reader, path)
+    groups = list(decoded(reader, path, group_bytes=1))
+    assert len(groups) == 1  # one buffer
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bulk, "BATCH_BYTES", 4000)
+        groups = list(decoded(reader, path, group_bytes=8000))
+        assert len(groups) > 5
+        tables = tables_of(reader, path, group_bytes=8000)
+    assert compared(reader, path, tables).wrong == []
+    assert {len(table) for table in tables} == {len(table) for table in whole}
+
+
+def test_rows_of_a_table_keep_their_elements_and_words(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", mixed(12))
+    reader = McapReader()
+    everything = TimeWindow.everything()
+    for table in tables_of(reader, path):
+        messages = [
+            reader.decode(record)
+            for record in reader.records(path, [table.channel.topic], everything)
+        ]
+        chosen = [9, 2, 2, 0, 11]
+        comparison = Comparison()
+        comparison.table(table.rows(np.array(chosen)), [messages[nth] for nth in chosen])
+        assert comparison.wrong == []
+        for column in table.rows(np.array([3])).columns.values():
+            assert not isinstance(column, Texts) or len(column.words) == 1
+
+
+def test_only_the_window_and_the_topics_asked_for_are_decoded(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", mixed(12))
+    [[table]] = decoded(McapReader(), path, TimeWindow(20, 60), topics=["/chatter"])
+    assert table.channel.topic == "/chatter"
+    assert table.log_times.tolist() == [22, 32, 42, 52]
+
+
+def test_payloads_are_hashed_where_that_is_asked_for(tmp_path: Path) -> None:
+    messages = mixed(4)
+    path = write_mcap(tmp_path / "a.mcap", messages)
+
+    def chatter(channel: Channel) -> bool:
+        return channel.topic == "/chatter"
+
+    [tables] = decoded(McapReader(), path, hashed=chatter)
+    for table in tables:
+        expected = [
+            zlib.crc32(each.payload) for each in messages if each.topic == table.channel.topic
+        ]
+        if table.channel.topic == "/chatter":
+            assert table.payload_hashes is not None
+            assert table.payload_hashes.tolist() == expected
+        else:
+            assert table.payload_hashes is None
+
+
+def image(ns: int, size: int = 3000) -> Msg:
+    """An image, out of a camera."""
+    made = make(
+        "sensor_msgs/msg/Image",
+        header=header(ns, "camera"),
+        height=1,
+        width=size,
+        encoding="mono8",
+        is_bigendian=0,
+        step=size,
+        data=np.zeros(size, np.uint8),
+    )
+    return Msg("/camera", "sensor_msgs/msg/Image", ns, made)
+
+
+def test_images_have_times_alone_and_their_chunks_are_not_read(tmp_path: Path) -> None:
+    messages = [*(image(time) for time in range(10)), *(text(time, "x") for time in range(10, 20))]
+    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=4000))
+    spoil_chunk(path, 0)
+    [tables] = decoded(McapReader(), path)
+    by_topic = {table.channel.topic: table for table in tables}
+    assert by_topic["/camera"].log_times.tolist() == list(range(10))
+    assert by_topic["/camera"].columns == {}
+    assert "" in by_topic["/camera"].left_out
+    assert len(by_topic["/chatter"]) == 10
+
+
+def test_large_messages_of_large_files_have_times_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages = [text(1, "x" * 100_000, "/long"), text(2, "x", "/short")]
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    [tables] = decoded(McapReader(), path)
+    assert all(table.columns for table in tables)
+    monkeypatch.setattr(decode, "LARGE_FILE_BYTES", 1000)
+    [tables] = decoded(McapReader(), path)
+    assert {table.channel.topic: bool(table.columns) for table in tables} == {
+        "/long": False,
+        "/short": True,
+    }
+
+
+def test_json_and_unknown_types_have_times_alone_and_say_why(tmp_path: Path) -> None:
+    def fill(writer: Writer) -> None:
+        plain = writer.register_schema("Log", "jsonschema", b"{}")
+        odd = writer.register_schema("nowhere_msgs/msg/Oddity", "", b"")
+        for topic, encoding, schema in (("/log", "json", plain), ("/odd", "cdr", odd)):
+            channel = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channel, 3, b"{}", 3)
+
+    path = raw_mcap(tmp_path / "a.mcap", fill)
+    [tables] = decoded(McapReader(), path)
+    reasons = {table.channel.topic: table.left_out[""] for table in tables}
+    assert "json" in reasons["/log"]
+    assert "no definition" in reasons["/odd"]
+    assert all(table.log_times.tolist() == [3] for table in tables)
+
+
+def test_what_a_damaged_chunk_loses_is_raised_and_the_rest_follows(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    spoil_chunk(path, 1)
+    groups = decoded(McapReader(), path)
+    with pytest.raises(BagError) as caught:
+        next(groups)
+    assert caught.value.lost is not None
+    [table] = next(groups)
+    first, last = caught.value.lost
+    assert set(table.log_times.tolist()) == set(range(20)) - set(range(first, last + 1))
+    assert list(groups) == []
+
+
+def test_a_bag_that_is_gone_has_vanished_when_it_is_asked_for(tmp_path: Path) -> None:
+    groups = decoded(McapReader(), tmp_path / "gone.mcap")
+    with pytest.raises(BagVanishedError):
+        next(groups)
+
+
+def test_an_empty_bag_has_no_group(tmp_path: Path) -> None:
+    assert list(decoded(McapReader(), write_mcap(tmp_path / "a.mcap", []))) == []
+
+
+def test_messages_that_count_elsewhere_have_no_row(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a" / "a_0.mcap", mixed(12))
+    end = Overlap(log_from=None, log_until=None, files=("a_0.mcap",))
+    write_handover(tmp_path / "a", Handover(next="b", counts_until=60, end=end))
+    reader = BagDirReader(McapReader())
+    tables = tables_of(reader, path)
+    assert compared(reader, path, tables).wrong == []
+    assert {int(table.log_times.max()) // 10 for table in tables} == {5}
