@@ -153,7 +153,8 @@ _MAX_STRAIGHT: Final = 4096
 """Getters of `_straight` by class and path."""
 _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
-_POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
+POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
+"""Names of the schema map under which an array of three numbers is shown as x, y and z."""
 _POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 3: "body FRD"}
 """The constants of px4_msgs/msg/VehicleOdometry."""
@@ -288,6 +289,10 @@ class SchemaExtractor:
             return path
         length, name = max(leading)
         return ".".join((name, *segments[length:]))
+
+    def fields_of(self, type_name: str) -> Mapping[str, Segments]:
+        """Returns the fields that the schema map names, with their paths; none if it has none."""
+        return self._plan(type_name).fields
 
     def is_mapped(self, type_name: str) -> bool:
         """Returns whether the schema map lists a type; what any other carries its messages show."""
@@ -448,7 +453,7 @@ def _converted(name: str, node: object) -> object:
     """Returns the value of a name of the schema map: an array as the point or rotation it is."""
     if not isinstance(node, np.ndarray):
         return node
-    if name in _POINTS:
+    if name in POINTS:
         point = triple(node)
         return node if point is None else dict(zip("xyz", map(Metric, point), strict=True))
     if name == "orientation" and len(node) == 4:

@@ -57,19 +57,24 @@ class Contains:
     boolean wherever one is equal. A number is a whole value, never a part of one, and is searched
     only where a field leads (`has_element`): in a whole message every size, level and coordinate
     would match. Elsewhere its digits are searched as a string.
+
+    Attributes:
+        equal: what an element is compared with.
+        folded: the needle as casefolded text; None where no text can contain it.
+        boolean: the boolean that matches; None where none does.
     """
 
     needle: Scalar
     equal: Equals = field(init=False, repr=False)
-    _folded: str | None = field(init=False, repr=False)
-    _boolean: bool | None = field(init=False, repr=False)
+    folded: str | None = field(init=False, repr=False)
+    boolean: bool | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         meant = _meaning(self.needle)
         text = _text_of(self.needle)
         object.__setattr__(self, "equal", Equals(self.needle))
-        object.__setattr__(self, "_folded", None if text is None else text.casefold())
-        object.__setattr__(self, "_boolean", meant if isinstance(meant, bool) else None)
+        object.__setattr__(self, "folded", None if text is None else text.casefold())
+        object.__setattr__(self, "boolean", meant if isinstance(meant, bool) else None)
 
     @property
     def is_number(self) -> bool:
@@ -80,15 +85,15 @@ class Contains:
     @property
     def is_on_texts(self) -> bool:
         """Whether no boolean matches."""
-        return self._boolean is None
+        return self.boolean is None
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether a string of the value contains the needle, or a boolean equals it."""
         for leaf in leaves(value):
             if isinstance(leaf, str):
-                if self._folded is not None and self._folded in leaf.casefold():
+                if self.folded is not None and self.folded in leaf.casefold():
                     return True
-            elif isinstance(leaf, bool) and leaf is self._boolean:
+            elif isinstance(leaf, bool) and leaf is self.boolean:
                 return True
         return False
 
@@ -101,9 +106,9 @@ class Contains:
 
     def can_match(self, zone_map: ZoneMap) -> bool:
         """Returns whether some value of this zone map may contain the needle."""
-        if self._folded is not None and zone_map.can_contain_text(self._folded):
+        if self.folded is not None and zone_map.can_contain_text(self.folded):
             return True
-        return self._boolean is not None and zone_map.can_contain_boolean(self._boolean)
+        return self.boolean is not None and zone_map.can_contain_boolean(self.boolean)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,21 +118,26 @@ class Equals:
     1 and 0 equal true and false. A number equals itself and its float32 rounding, which is what a
     float32 field stores of it. Strings are compared without regard to case; one that spells a
     boolean or a number equals that too, since planners put values in quotes.
+
+    Attributes:
+        folded: the casefolded text that is equal; None where no text is.
+        boolean: the boolean that is equal; None where none is.
+        numbers: the numbers that are equal.
     """
 
     value: Scalar
-    _folded: str | None = field(init=False, repr=False, compare=False)
-    _boolean: bool | None = field(init=False, repr=False, compare=False)
-    _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
+    folded: str | None = field(init=False, repr=False, compare=False)
+    boolean: bool | None = field(init=False, repr=False, compare=False)
+    numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         meant = _meaning(self.value)
         boolean = bool(meant) if meant is not None and meant in (0, 1) else None
         numbers = () if meant is None else (meant, _float32(meant))
         folded = self.value.casefold() if isinstance(self.value, str) else None
-        object.__setattr__(self, "_folded", folded)
-        object.__setattr__(self, "_boolean", boolean)
-        object.__setattr__(self, "_numbers", numbers)
+        object.__setattr__(self, "folded", folded)
+        object.__setattr__(self, "boolean", boolean)
+        object.__setattr__(self, "numbers", numbers)
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any leaf at any depth is equal."""
@@ -135,32 +145,32 @@ class Equals:
 
     def can_match(self, zone_map: ZoneMap) -> bool:
         """Returns whether some value of this zone map may have such a leaf."""
-        if self._folded is not None and zone_map.can_contain_text(self._folded):
+        if self.folded is not None and zone_map.can_contain_text(self.folded):
             return True
-        if self._boolean is not None and zone_map.can_contain_boolean(self._boolean):
+        if self.boolean is not None and zone_map.can_contain_boolean(self.boolean):
             return True
-        return any(zone_map.can_contain_number(number) for number in self._numbers)
+        return any(zone_map.can_contain_number(number) for number in self.numbers)
 
     @property
     def number_bounds(self) -> tuple[float, float] | None:
         """Between which numbers (inclusive) a leaf must be; None where it may be no number."""
-        if isinstance(self.value, str) or self._boolean is not None:
+        if isinstance(self.value, str) or self.boolean is not None:
             return None
-        least, most = min(self._numbers), max(self._numbers)
+        least, most = min(self.numbers), max(self.numbers)
         return rounded(least, up=False), rounded(most, up=True)
 
     @property
     def is_on_texts(self) -> bool:
         """Whether no boolean and no number matches."""
-        return self._boolean is None and not self._numbers
+        return self.boolean is None and not self.numbers
 
     def is_leaf(self, leaf: JsonValue) -> bool:
         """Returns whether this leaf is equal."""
         if isinstance(leaf, bool):
-            return leaf is self._boolean
+            return leaf is self.boolean
         if isinstance(leaf, int | float):
-            return any(leaf == number for number in self._numbers)
-        return isinstance(leaf, str) and leaf.casefold() == self._folded
+            return any(leaf == number for number in self.numbers)
+        return isinstance(leaf, str) and leaf.casefold() == self.folded
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,11 +254,16 @@ class Condition:
     def counted(self, value: JsonValue) -> JsonValue:
         """Returns what of a value counts; see `without_low_scores`.
 
+        """
+        return value if self.min_score <= 0 else without_low_scores(value, self.least_score)
+
+    @property
+    def least_score(self) -> float:
+        """The score from which on detections count.
+
         A limit is met by its float32 rounding, too, which is what most detectors store.
         """
-        if self.min_score <= 0:
-            return value
-        return without_low_scores(value, min(self.min_score, _float32(self.min_score)))
+        return min(self.min_score, _float32(self.min_score))
 
     def _passes(self, value: JsonValue) -> bool:
         if self.field is None:

@@ -237,7 +237,14 @@ def _table(kinds: _Kinds, batch: Batch) -> Table:
     order = order_of(batch.log_times, batch.places)
     if order is not None:
         batch = batch.taken(order)
-    table = Table(batch.channel, batch.log_times, batch.publish_times, batch.places)
+    definition = kinds.reader.definition(batch.channel)
+    table = Table(
+        batch.channel,
+        batch.log_times,
+        batch.publish_times,
+        batch.places,
+        definition=definition,
+    )
     if kind.is_hashed:
         hashes = [zlib.crc32(batch.payload(nth)) for nth in range(len(table))]
         table = replace(table, payload_hashes=np.array(hashes, np.int64))

@@ -21,6 +21,7 @@ and where a sequence takes more than `MAX_RANGED_BYTES`.
 
 from __future__ import annotations
 
+import math
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -30,7 +31,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from ros2_memory.storage.base import Channel, IntArray
+    from ros2_memory.storage.base import Channel, Definition, IntArray
 
 Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
@@ -102,6 +103,23 @@ class Texts:
 Column: TypeAlias = "Numbers | Texts"
 
 
+class Zone(NamedTuple):
+    """What is known of a column without unpacking it.
+
+    Attributes:
+        least: of the values that are not NaN; infinity where there is none. False is 0.
+        greatest: likewise; minus infinity where there is none.
+        nulls: how many values are NaN.
+        words: the casefolded distinct texts of a column of strings, joined by line breaks; None of
+            any other column, and where there are too many.
+    """
+
+    least: float = math.inf
+    greatest: float = -math.inf
+    nulls: int = 0
+    words: str | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Elements:
     """The elements of a sequence, of all rows of a table (or of all elements around them).
@@ -152,6 +170,7 @@ class Table:
         payload_hashes: CRC-32 of each payload, where it was asked for.
         undecodable: messages that have no row, because they cannot be decoded.
         undecodable_reason: why the first of them cannot be.
+        definition: the fields of the type; None where they are not known.
     """
 
     channel: Channel
@@ -164,6 +183,21 @@ class Table:
     payload_hashes: IntArray | None = None
     undecodable: int = 0
     undecodable_reason: str = ""
+    definition: Definition | None = None
+
+    def error(self, path: str) -> float:
+        """Returns the most by which a value of a column is off; 0 where it is exact.
+
+        A column of elements is named as in `detections.score`, that of a list of texts or numbers
+        as the list.
+        """
+        del path
+        return 0.0
+
+    def zone(self, path: str) -> Zone | None:
+        """Returns what is known of a column, named likewise, before it is unpacked."""
+        del path
+        return None
 
     def __len__(self) -> int:
         """Returns the number of messages."""
@@ -240,6 +274,7 @@ def joined(tables: Sequence[Table]) -> Table:
         np.concatenate(hashes) if len(hashes) == len(tables) else None,
         sum(table.undecodable for table in tables),
         reasons[0] if reasons else "",
+        first.definition,
     ).sorted()
 
 

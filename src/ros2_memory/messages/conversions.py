@@ -28,7 +28,7 @@ from ros2_memory.messages.fields import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import Quaternion, Vector3
     from ros2_memory.messages.fields import FieldTable
@@ -69,9 +69,14 @@ def kind_of_class(cls: type) -> ValueKind:
     table = field_table_of_class(cls)
     if table is None:
         return ValueKind.PLAIN
-    kind, fields = _KINDS.get(table.type, (ValueKind.PLAIN, ""))
+    return kind_of_type(table.type, [*table.attributes])
+
+
+def kind_of_type(name: str, fields: Sequence[str]) -> ValueKind:
+    """Returns how the extracted view shows messages of a type with these fields."""
+    kind, known = _KINDS.get(name, (ValueKind.PLAIN, ""))
     # A bag may contain a definition of its own under the name of a standard type.
-    return kind if fields.split() == list(table.attributes) else ValueKind.PLAIN
+    return kind if known.split() == fields else ValueKind.PLAIN
 
 
 def view(node: object, name: str) -> object:
@@ -197,7 +202,7 @@ def nanoseconds(node: object) -> Ns | None:
 
 def _image(message: object, data: object) -> object:
     encoding = field_of(message, "encoding")
-    channels = _channels(str(encoding))
+    channels = channels_of(str(encoding))
     shape = [*_shape(message), channels] if channels is not None else _shape(message)
     return {**_bytes(data), "encoding": _or_null(encoding), "shape": shape}
 
@@ -208,7 +213,7 @@ def _shape(message: object, *path: str) -> list[int]:
     return [each for each in size if isinstance(each, int)]
 
 
-def _channels(encoding: str) -> int | None:
+def channels_of(encoding: str) -> int | None:
     """Returns the channels of an encoding of sensor_msgs/image_encodings.hpp; None for yuv."""
     typed = re.fullmatch(r"\d+[USF]C(\d{1,3})", encoding)
     if typed:
@@ -260,3 +265,8 @@ _SUMMARIES: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]
     "nav_msgs/msg/OccupancyGrid": {"data": _occupancy_grid},
     "sensor_msgs/msg/MagneticField": {"magnetic_field": _magnetic_field},
 }
+
+SUMMARIZED: Final[Mapping[str, str]] = {
+    name: field for name, fields in _SUMMARIES.items() for field in fields
+}
+"""The field that is summarized, by message type."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 NAMES: Final = ("label", "class_id", "class_name", "class", "object")
 SCORES: Final = ("score", "confidence", "probability")
+NOT_LABELLED: Final = frozenset({"stride"})
+"""An object with such a field is a std_msgs/MultiArrayDimension, whose label names an axis."""
 LISTS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 """A list of strings under one of these names is a list of detections."""
 
@@ -33,7 +35,8 @@ _POSITIONS: Final = (
     ("bbox", "center", "position"),
 )
 _MAX_JSON_CHARS: Final = 1 << 16
-_MAX_DEPTH: Final = 4
+MAX_DEPTH: Final = 4
+"""Lists, objects and texts that are JSON around a detection, and it."""
 _JSON: Final = frozenset("[{")
 
 
@@ -51,7 +54,7 @@ class Detection(NamedTuple):
 
 def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
     """Returns the detections in an extracted value, in order; `frame_id` is the message's own."""
-    return tuple(_detections(value, frame_id, _MAX_DEPTH))
+    return tuple(_detections(value, frame_id, MAX_DEPTH))
 
 
 def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
@@ -61,7 +64,7 @@ def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
     also the place of each that scores less. What has no score stays. A value without any such
     detection is returned as it is.
     """
-    return _without(value, min_score, _MAX_DEPTH)
+    return _without(value, min_score, MAX_DEPTH)
 
 
 def depends_on_numbers(value: JsonValue) -> bool:
@@ -167,7 +170,7 @@ def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
-    if "stride" in value:  # a std_msgs/MultiArrayDimension, whose label names an axis
+    if not NOT_LABELLED.isdisjoint(value):
         return None
     for name in NAMES:
         label = value.get(name)

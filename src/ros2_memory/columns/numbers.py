@@ -1,0 +1,108 @@
+"""The numbers of a field in all rows of a table."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.columns.shown import (
+    Group,
+    Limits,
+    Message,
+    Node,
+    Shape,
+    Spot,
+    UnknownShapeError,
+    leaves_below,
+    opened,
+    placed,
+)
+from ros2_memory.columns.values import Kind, Leaf, Values
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Floats, Ints
+    from ros2_memory.extract import SchemaExtractor
+
+_SUMMARY: Final = frozenset({"bytes", "numbers"})
+"""The keys of what is shown in place of an array."""
+_LARGEST_INT64: Final = 2**63 - 1
+
+
+class FieldNumbers(NamedTuple):
+    """The numbers of a field in the rows of a table.
+
+    Attributes:
+        rows: the row of each number, ascending; a row may have none, or several.
+        numbers: finite; int64 where all are integers that it holds, else float64.
+        error: the most by which one of them is off; 0 where they are exact. Angles that are
+            computed of exact quaternions may differ by their last digits.
+    """
+
+    rows: Ints
+    numbers: Ints | Floats
+    error: float
+
+
+def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumbers | None:
+    """Returns the numbers of a field: those in what `SchemaExtractor.exact_at` returns.
+
+    Booleans are none, nor are the sizes in the summary of an array.
+
+    Args:
+        table: the messages.
+        field: dot-path in the extracted value, or else in the message.
+        extractor: has the schema map.
+
+    Returns:
+        None where the columns do not hold them all: then the bag has to be read.
+    """
+    if table.definition is None:
+        return None
+    values = Values(table)
+    try:
+        found = Shape(table.definition, table.channel.type, extractor).find(field)
+        parts = [] if found is None else [*_number_parts(values, found)]
+    except UnknownShapeError:
+        return None
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        return None
+    if not known:
+        return FieldNumbers(np.empty(0, np.int64), np.empty(0, np.int64), 0.0)
+    rows = np.concatenate([part.rows for part in known])
+    joined = np.concatenate([part.numbers for part in known])
+    order = np.argsort(rows, kind="stable")
+    return FieldNumbers(rows[order], joined[order], max(part.error for part in known))
+
+
+def _number_parts(values: Values, found: Node) -> Iterator[FieldNumbers | None]:
+    """Yields the numbers of each leaf of a field; None for one that the table does not hold."""
+    for spot in opened(Spot(found)):
+        node = spot.node
+        if isinstance(node, Message | Group) and _SUMMARY.issuperset(node.names()):
+            continue
+        for _, leaf, limits in leaves_below(spot):
+            if leaf.kind in {Kind.INTEGER, Kind.REAL}:
+                yield _numbers_of(values, leaf, limits)
+
+
+def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | None:
+    known = values.numbers(leaf)
+    if known is None or not values.holds_all(leaf):
+        return None
+    everything = np.arange(len(known.values))
+    kept, rows = placed(values, leaf.level, everything, limits, surely=True)
+    if len(kept) < len(placed(values, leaf.level, everything, limits, surely=False)[0]):
+        return None
+    column = known.values[kept]
+    is_finite = np.isfinite(column)
+    column, rows = column[is_finite], rows[is_finite]
+    is_whole = column.dtype.kind in "iu" and not (column > _LARGEST_INT64).any()
+    error = float(np.max(known.error, initial=0.0))
+    if is_whole:
+        return FieldNumbers(rows, column.astype(np.int64), error)
+    return FieldNumbers(rows, column.astype(np.float64), error)

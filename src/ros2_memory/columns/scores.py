@@ -1,0 +1,261 @@
+"""Values without the detections of a low score, as trees over columns.
+
+The same as `messages.detections.without_low_scores` leaves of each value: it goes as deep, knows
+the same names, and puts null in place of a detection (or of one of its hypotheses). Where the
+messages of a type differ in whether an object is a detection at all (its label is empty in some),
+and more would have to be looked at then, the limits say that they do not know.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeGuard
+
+import numpy as np
+
+from ros2_memory.columns.shown import (
+    Choice,
+    Group,
+    Kept,
+    Listing,
+    Message,
+    Narrowed,
+    Node,
+    Spot,
+    children,
+    leaves_below,
+    opened,
+    unknown,
+)
+from ros2_memory.columns.values import Kind, Leaf, Level
+from ros2_memory.messages.detections import MAX_DEPTH, NAMES, NOT_LABELLED, SCORES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from ros2_memory.columns.table import Texts
+    from ros2_memory.columns.values import Floats, Ints, Mask, Values
+
+Object: TypeAlias = Message | Group
+
+_NO_ERROR: Final = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scored:
+    """An object that may be a detection: what names it, in order, and what its score is."""
+
+    level: Level
+    labels: tuple[Leaf, ...]
+    scores: tuple[Leaf, ...]
+
+    def labelled(self, values: Values) -> Mask | None:
+        """Returns which of a level's objects have a label; None where that is not held."""
+        found: Mask | None = None
+        for leaf in self.labels:
+            texts = values.texts(leaf)
+            if texts is None:
+                return None
+            has = _flags(texts, lambda word: bool(word.strip()))
+            found = has if found is None else found | has
+        return found
+
+    def score(self, values: Values) -> tuple[Floats, float] | None:
+        """Returns the score of each (NaN: none) and its error; None where that is not held."""
+        size = values.size(self.level)
+        if size is None:
+            return None
+        score, error = np.full(size, np.nan), _NO_ERROR
+        for leaf in self.scores:
+            found = values.numbers(leaf)
+            if found is None or not isinstance(found.error, float):
+                return None
+            number = found.values.astype(np.float64, copy=False)
+            score = np.where(np.isnan(score), number, score)
+            error = max(error, found.error)
+        return score, error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scores:
+    """Which detections score enough; `kept` and its kin are computed once for each table."""
+
+    scored: _Scored
+    least: float
+    texts: tuple[Leaf, ...]
+    has_inner: bool
+
+    @property
+    def level(self) -> Level:
+        """The level of the detections."""
+        return self.scored.level
+
+    def kept(self, values: Values, among: Ints) -> Kept:
+        """Returns where the detection stays."""
+        if self not in values.kept:
+            values.kept[self] = self._kept(values)
+        surely, perhaps = values.kept[self]
+        return Kept(surely[among], perhaps[among])
+
+    def _kept(self, values: Values) -> Kept:
+        labelled, found = self.scored.labelled(values), self.scored.score(values)
+        if labelled is None or found is None:
+            return unknown(values.size(self.level) or 0)
+        score, error = found
+        surely = ~(labelled & (score < self.least + error))
+        perhaps = ~(labelled & (score < self.least - error))
+        if self.has_inner or may_be_json(values, self.texts):
+            surely &= labelled
+        return Kept(surely, perhaps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BestScores:
+    """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
+
+    level: Level
+    hypotheses: _Scored
+    least: float
+    texts: tuple[Leaf, ...]
+    has_inner: bool
+
+    def kept(self, values: Values, among: Ints) -> Kept:
+        """Returns where the detection stays."""
+        if self not in values.kept:
+            values.kept[self] = self._kept(values)
+        surely, perhaps = values.kept[self]
+        return Kept(surely[among], perhaps[among])
+
+    def _kept(self, values: Values) -> Kept:
+        size = values.size(self.level) or 0
+        labelled, found = self.hypotheses.labelled(values), self.hypotheses.score(values)
+        results = values.elements(self.hypotheses.level)
+        if labelled is None or found is None or results is None or found[1]:
+            return unknown(size)  # also with rounded scores, of which another may be the best
+        score, _ = found
+        rank = np.where(np.isnan(score), -np.inf, score)
+        # The first of those of the highest score, for each detection.
+        order = np.lexsort((-rank, results.owners))
+        first = np.flatnonzero(np.diff(results.owners[order], prepend=-1))
+        best = order[first]
+        of = results.owners[best]
+        surely, perhaps = np.ones(size, np.bool_), np.ones(size, np.bool_)
+        if self.has_inner or may_be_json(values, self.texts):
+            surely[:] = False
+        is_low = score[best] < self.least
+        surely[of] = labelled[best] & ~is_low
+        perhaps[of] = ~(labelled[best] & is_low)
+        return Kept(surely, perhaps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hypotheses:
+    """Which of several hypotheses stay, in a detection that stays."""
+
+    best: _BestScores
+
+    @property
+    def level(self) -> Level:
+        """The level of the hypotheses."""
+        return self.best.hypotheses.level
+
+    def kept(self, values: Values, among: Ints) -> Kept:
+        """Returns where the hypothesis stays."""
+        found, results = self.best.hypotheses.score(values), values.elements(self.level)
+        if found is None or found[1] or results is None:
+            return unknown(len(among))
+        # Where it is not sure that the detection is one, neither is what stays of it.
+        is_one = self.best.kept(values, results.owners[among]).surely
+        is_low = found[0][among] < self.best.least
+        return Kept(~is_low & is_one, ~is_low | ~is_one)
+
+
+def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
+    """Returns a value's tree without the detections whose score is below a limit.
+
+    Raises:
+        UnknownShapeError: it depends on the message.
+    """
+    if depth == 0:
+        return node
+    if isinstance(node, Narrowed):
+        return Narrowed(node.limit, without_low(node.node, least, depth))
+    if isinstance(node, Choice):
+        return Choice(tuple(without_low(case, least, depth) for case in node.cases), node.array)
+    if isinstance(node, Listing):
+        # In lists, `without_low_scores` looks at objects alone.
+        has_objects = all(is_object(spot.node) for spot in opened(Spot(node.element)))
+        inner = without_low(node.element, least, depth - 1) if has_objects else node.element
+        return Listing(node.level, inner)
+    if isinstance(node, Leaf) and node.kind is Kind.TEXT:
+        return replace(node, json_depth=depth)
+    return _object_without_low(node, least, depth) if is_object(node) else node
+
+
+def is_object(node: Node) -> TypeGuard[Object]:
+    """Returns whether a node is an object that may be a detection, or have some in it."""
+    return isinstance(node, Message) or (isinstance(node, Group) and node.turned is None)
+
+
+def _object_without_low(node: Object, least: float, depth: int) -> Node:
+    fields = dict(children(node))
+    scored = _scored(fields)
+    if scored is not None:
+        return Narrowed(_Scores(scored, least, *_inside(fields, depth)), node)
+    results = fields.get("results")
+    if isinstance(results, Listing) and isinstance(results.element, Message | Group):
+        inner = dict(children(results.element))
+        named = inner.get("hypothesis")
+        hypotheses = _scored(dict(children(named)) if isinstance(named, Message | Group) else inner)
+        if hypotheses is not None:
+            others = {name: child for name, child in fields.items() if name != "results"}
+            texts, has_inner = _inside(others, depth)
+            level = hypotheses.level.parent or hypotheses.level
+            best = _BestScores(level, hypotheses, least, texts, has_inner)
+            kept = Narrowed(_Hypotheses(best), results.element)
+            return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
+    return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})
+
+
+def _scored(fields: Mapping[str, Node]) -> _Scored | None:
+    """Returns how an object is named and scored; None if none like it is a detection."""
+    if fields.keys() & NOT_LABELLED:
+        return None
+    labels = _leaves(fields, NAMES, lambda leaf: leaf.kind is Kind.TEXT)
+    numeric = {Kind.INTEGER, Kind.REAL}
+    scores = _leaves(fields, SCORES, lambda leaf: leaf.kind in numeric)
+    return _Scored(labels[0].level, labels, scores) if labels else None
+
+
+def _leaves(
+    fields: Mapping[str, Node], names: tuple[str, ...], takes: Callable[[Leaf], bool]
+) -> tuple[Leaf, ...]:
+    found = [fields[name] for name in names if name in fields]
+    return tuple(node for node in found if isinstance(node, Leaf) and takes(node))
+
+
+def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:
+    """Returns the texts in an object that may be JSON, and whether there are detections in it."""
+    texts: list[Leaf] = []
+    for node in fields.values():
+        found = without_low(node, 0.0, depth - 1)
+        for _, leaf, limits in leaves_below(Spot(found)):
+            if any(isinstance(limit, _Scores | _BestScores) for limit in limits):
+                return (), True
+            if leaf.json_depth:
+                texts.append(leaf)
+    return tuple(texts), False
+
+
+def may_be_json(values: Values, texts: tuple[Leaf, ...]) -> bool:
+    """Returns whether one of these texts looks like JSON, or is not held."""
+    columns = [values.texts(leaf) for leaf in texts]
+    return any(
+        column is None or any(word[:1] in {"[", "{"} for word in column.words) for column in columns
+    )
+
+
+def _flags(texts: Texts, meets: Callable[[str], bool]) -> Mask:
+    """Returns which rows have a word that meets something, tested once for each word."""
+    flags = np.fromiter(map(meets, texts.words), np.bool_, len(texts.words))
+    return flags[texts.codes] if len(flags) else np.zeros(0, np.bool_)

@@ -1,0 +1,585 @@
+"""The extracted value of a type's messages as a tree over its columns, without any message.
+
+`SchemaExtractor.exact` turns one decoded message into a value; here the same is said of all
+messages of a type at once, from the definition and the schema map alone: which leaves the value
+has, under which names, and the column that each is read or computed from. What is stored is not
+looked at, so one tree serves all tables of a type.
+
+A node is what may stand in the value: a `Leaf` (a number, boolean or text of each row or element),
+an object (`Message`, `Group`), a list (`Listing` over the elements of a level, `Items` of a short
+fixed array), or null (`NOTHING`). `Narrowed` and `Choice` say for which rows a node stands there.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+
+from ros2_memory.columns.table import MAX_NUMBERS
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values
+from ros2_memory.extract import POINTS
+from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
+from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
+from ros2_memory.storage.base import SEQUENCE, Definition
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Floats, Ints, Mask
+    from ros2_memory.extract import SchemaExtractor
+
+MAX_LEAVES: Final = 20_000
+"""Of one value: nested definitions of some lines can spell out more than memory holds."""
+
+_FILLER: Final = "structure_needs_at_least_one_member"
+_INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
+_BYTES: Final = frozenset({"uint8", "char"})
+"""What rosbags decodes to uint8, whose long arrays are shown as their length."""
+
+
+class UnknownShapeError(Exception):
+    """What the value looks like differs from message to message: the messages decide."""
+
+
+class Kept(NamedTuple):
+    """Of some rows or elements: where something surely stands, and where it may stand."""
+
+    surely: Mask
+    perhaps: Mask
+
+
+def unknown(size: int) -> Kept:
+    """Returns that nothing is known of so many rows or elements."""
+    return Kept(np.zeros(size, np.bool_), np.ones(size, np.bool_))
+
+
+class Limit(Protocol):
+    """For which rows or elements of a level something stands in the value."""
+
+    @property
+    def level(self) -> Level:
+        """The level that it is about."""
+
+    def kept(self, values: Values, among: Ints) -> Kept:
+        """Returns where it stands, for some rows or elements of the level."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pick:
+    """The element at this place of each list alone; negative from the end."""
+
+    level: Level
+    place: int
+
+    def kept(self, values: Values, among: Ints) -> Kept:
+        """Returns where the elements stand at the place."""
+        places = values.places(self.level, among, from_end=self.place < 0)
+        if places is None:
+            return unknown(len(among))
+        kept = places == self.place
+        return Kept(kept, kept)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LongerThan:
+    """Where a sequence of numbers has more elements than this; else where it has no more."""
+
+    level: Level
+    sequence: str
+    count: int
+    is_longer: bool
+
+    def kept(self, values: Values, among: Ints) -> Kept:
+        """Returns where the sequence is that long."""
+        lengths = values.numeric(self.level, f"{self.sequence}.length")
+        if lengths is None:
+            return unknown(len(among))
+        kept = (lengths[among] > self.count) == self.is_longer
+        return Kept(kept, kept)
+
+
+class Place(NamedTuple):
+    """A part of the message: a field, or the element of a list; `depth` of the value around it."""
+
+    level: Level
+    path: str
+    kind: str | Definition
+    length: int | None
+    depth: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Message:
+    """A message that is shown field by field; `plain`: as its definition has them."""
+
+    shape: Shape
+    level: Level
+    path: str
+    definition: Definition
+    depth: int
+    plain: bool = False
+
+    def names(self) -> list[str]:
+        """Returns the names of its fields."""
+        return [field.name for field in self.definition.fields if field.name != _FILLER]
+
+    def child(self, name: str) -> Node | None:
+        """Returns what stands under a name; None where no field has it."""
+        for field in self.definition.fields:
+            if field.name == name != _FILLER:
+                path = f"{self.path}.{name}" if self.path else name
+                place = Place(self.level, path, field.kind, field.length, self.depth + 1)
+                if self.plain:
+                    return self.shape.plain(place)
+                if name == SUMMARIZED.get(self.definition.type):
+                    return self.shape.summary(self, place)
+                return self.shape.shown(place)
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """An object that the conversions make. `turned`: the message, of a quaternion."""
+
+    fields: Mapping[str, Node]
+    turned: Message | None = None
+
+    def names(self) -> list[str]:
+        """Returns the names of its fields."""
+        return [*self.fields]
+
+    def child(self, name: str) -> Node | None:
+        """Returns what stands under a name; None where no field has it."""
+        return self.fields.get(name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Listing:
+    """A list of the elements of a level."""
+
+    level: Level
+    element: Node
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Items:
+    """A list of so many for all rows; `ragged`: of which the last may be absent."""
+
+    items: tuple[Node, ...]
+    ragged: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Narrowed:
+    """A node that stands in the value of some rows or elements alone, and null in the others."""
+
+    limit: Limit
+    node: Node
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """An array of numbers (`array`), which is shown as one of these, whichever holds for a row."""
+
+    cases: tuple[Node, ...]
+    array: Node
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nothing:
+    """Null."""
+
+
+NOTHING: Final = Nothing()
+
+Node: TypeAlias = Leaf | Message | Group | Listing | Items | Narrowed | Choice | Nothing
+Limits: TypeAlias = tuple["Limit", ...]
+
+
+class Spot(NamedTuple):
+    """A node, and the limits on what stands there."""
+
+    node: Node
+    limits: Limits = ()
+
+
+def placed(
+    values: Values, level: Level, among: Ints, limits: Limits, *, surely: bool
+) -> tuple[Ints, Ints]:
+    """Returns which of some rows or elements stand in the value, and the row of each.
+
+    Args:
+        values: of the table.
+        level: of the rows or elements.
+        among: their positions.
+        limits: on what stands there.
+        surely: whether those that may or may not stand there are left out.
+    """
+    here, kept, owners = level, among, among
+    while True:
+        for limit in limits:
+            if limit.level == here and len(kept):
+                mask = limit.kept(values, owners)[0 if surely else 1]
+                kept, owners = kept[mask], owners[mask]
+        found = values.elements(here)
+        if here.parent is None or found is None:
+            return kept, owners
+        owners, here = found.owners[owners], here.parent
+
+
+class Shape:
+    """The value that `extractor` shows of messages of a type.
+
+    Args:
+        definition: the type's fields.
+        type_name: the type as the channel names it.
+        extractor: has the schema map.
+    """
+
+    def __init__(self, definition: Definition, type_name: str, extractor: SchemaExtractor) -> None:
+        self._definition = definition
+        self._fields = extractor.fields_of(type_name)
+        self._limit = extractor.limit
+
+    @cached_property
+    def value(self) -> Node:
+        """The whole value, as `SchemaExtractor.exact` returns it.
+
+        Raises:
+            UnknownShapeError: it depends on the message.
+        """
+        found = {name: self._at(path) for name, path in self._fields.items()}
+        if all(node is None for node in found.values()):
+            return self._message()
+        return Group(
+            {
+                name: NOTHING if node is None else self._converted(name, node)
+                for name, node in found.items()
+            }
+        )
+
+    def find(self, path: str) -> Node | None:
+        """Returns what `SchemaExtractor.exact_at` returns for a path; None where nothing is.
+
+        Raises:
+            UnknownShapeError: it depends on the message.
+        """
+        segments = tuple(path.split("."))
+        mapped = self._fields.get(segments[0])
+        found: Node | None = None
+        if mapped is not None:
+            whole = self._at(mapped)
+            if whole is not None:
+                found = descend(self._converted(segments[0], whole), segments[1:])
+        elif not self._fields:
+            found = descend(self._message(), segments)
+        if found is not None:
+            return found
+        plain = self._at(segments)
+        return None if plain is None else _as_numbers(plain)
+
+    def shown(self, place: Place) -> Node:
+        """Returns a part of the message as the value shows it."""
+        if place.length is None and isinstance(place.kind, str):
+            return Leaf(place.level, (place.path,), _kind(place.kind))
+        if place.depth >= MAX_DEPTH:
+            raise UnknownShapeError(f"{place.path} lies {place.depth} levels deep")
+        if place.length is None and isinstance(place.kind, Definition):
+            return self._shown_message(place, place.kind)
+        return self._array(place)
+
+    def _shown_message(self, place: Place, definition: Definition) -> Node:
+        level, path = place.level, place.path
+        message = Message(self, level, path, definition, place.depth)
+        kind = kind_of_type(definition.type, [field.name for field in definition.fields])
+        if kind is ValueKind.TIME:
+            return Leaf(level, (path,), Kind.REAL, Made.SECONDS)
+        are_numbers = all(_is_number(field.kind, field.length) for field in definition.fields)
+        sources = [f"{path}.{field.name}" if path else field.name for field in definition.fields]
+        if kind is ValueKind.VECTOR and are_numbers:
+            return _vector(level, sources)
+        if kind is ValueKind.QUATERNION:
+            return _turned(level, sources, message) if are_numbers else NOTHING
+        return message
+
+    def plain(self, place: Place) -> Node:
+        """Returns a part of the message as its definition has it, to be walked further."""
+        level, path, kind, length, depth = place
+        if isinstance(kind, str):
+            return self.shown(place)
+        if length is not None:
+            inner = Level(level, path)
+            return Listing(inner, self.plain(Place(inner, "", kind, None, depth + 1)))
+        return Message(self, level, path, kind, depth, plain=True)
+
+    def summary(self, message: Message, place: Place) -> Node:
+        """Returns what the conversions make of the data of an image, a cloud, a map or a magnet.
+
+        Raises:
+            UnknownShapeError: the definition is not the standard one.
+        """
+        kind = message.definition.type.rpartition("/")[2]
+        if kind == "MagneticField":
+            node = self.shown(place)
+            if isinstance(node, Group) and node.turned is None:
+                return node
+            raise UnknownShapeError(f"{place.path} is no vector")
+        if not isinstance(place.kind, str) or place.length != SEQUENCE:
+            raise UnknownShapeError(f"{place.path} is no sequence of bytes")
+
+        def leaf(name: str, kind: Kind) -> Leaf:
+            found = descend(message, name.split("."))
+            if isinstance(found, Leaf) and found.kind is kind and found.made is Made.STORED:
+                return found
+            raise UnknownShapeError(f"{name} is not what it is in the standard definition")
+
+        def shape(prefix: str = "") -> tuple[Leaf, Leaf]:
+            height, width = (leaf(f"{prefix}{name}", Kind.INTEGER) for name in ("height", "width"))
+            return height, width
+
+        fields: dict[str, Node] = {
+            "bytes": Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
+        }
+        if kind == "CompressedImage":
+            return Group({**fields, "encoding": leaf("format", Kind.TEXT)})
+        if kind == "OccupancyGrid":
+            return Group({**fields, "shape": Items(shape("info."))})
+        sources = [each.sources[0] for each in shape()]
+        if kind == "PointCloud2":
+            points = Leaf(place.level, tuple(sources), Kind.INTEGER, Made.PRODUCT)
+            return Group({**fields, "points": points, "shape": Items(shape())})
+        encoding = leaf("encoding", Kind.TEXT)
+        channels = Leaf(place.level, encoding.sources, Kind.REAL, Made.CHANNELS)
+        sized = Items((*shape(), channels), ragged=True)
+        return Group({**fields, "encoding": encoding, "shape": sized})
+
+    def _message(self) -> Node:
+        return self.shown(Place(ROWS, "", self._definition, None, 0))
+
+    def _at(self, path: Sequence[str]) -> Node | None:
+        found = descend(self._message(), path)
+        if found is not None:
+            return found
+        plain = descend(self.plain(Place(ROWS, "", self._definition, None, 0)), path)
+        return None if plain is None else self._as_shown(plain)
+
+    def _as_shown(self, node: Node) -> Node:
+        """Returns the end of a walk through definitions as the value shows it."""
+        if isinstance(node, Message):
+            return self.shown(Place(node.level, node.path, node.definition, None, node.depth))
+        if isinstance(node, Listing):
+            return Listing(node.level, self._as_shown(node.element))
+        return (
+            Narrowed(node.limit, self._as_shown(node.node)) if isinstance(node, Narrowed) else node
+        )
+
+    def _array(self, place: Place) -> Node:
+        level, path, kind, length, depth = place
+        inner = Level(level, path)
+        element = self.shown(Place(inner, "", kind, None, depth + 1))
+        listing = Listing(inner, element)
+        if not isinstance(kind, str) or _kind(kind) is Kind.TEXT:
+            return listing
+        count, key = (self._limit, "bytes") if kind in _BYTES else (MAX_EXACT_NUMBERS, "numbers")
+        if length == SEQUENCE:
+            counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
+            longer = LongerThan(level, path, count, is_longer=True)
+            shorter = LongerThan(level, path, count, is_longer=False)
+            cases = (Narrowed(longer, Group({key: counted})), Narrowed(shorter, listing))
+            return Choice(cases, listing)
+        size = length or 0
+        array: Node = listing
+        if size <= MAX_NUMBERS:
+            array = Items(
+                tuple(Leaf(level, (f"{path}.{nth}",), _kind(kind)) for nth in range(size))
+            )
+        if size <= count:
+            return array
+        constant = Leaf(level, (), Kind.INTEGER, Made.CONSTANT, size)
+        return Choice((Group({key: constant}),), array)
+
+    def _converted(self, name: str, node: Node) -> Node:
+        """Returns the value of a name of the schema map: an array as the point or turn it is."""
+        if isinstance(node, Narrowed):
+            return Narrowed(node.limit, self._converted(name, node.node))
+        if name not in POINTS and name != "orientation":
+            return node
+        if isinstance(node, Choice):
+            if isinstance(node.array, Listing) and len(node.cases) > 1:
+                raise UnknownShapeError(f"{name} has another length in each message")
+            array = node.array
+        else:
+            array = node
+        if not isinstance(array, Items):
+            return node
+        leaves = [item for item in array.items if isinstance(item, Leaf)]
+        numeric = all(leaf.kind in {Kind.INTEGER, Kind.REAL} for leaf in leaves)
+        sources = [leaf.sources[0] for leaf in leaves]
+        if name in POINTS:
+            return _vector(leaves[0].level, sources) if numeric and len(leaves) == 3 else node
+        if len(leaves) != 4:
+            return node
+        # PX4 writes w first.
+        return _turned(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
+
+
+def descend(node: Node, path: Sequence[str]) -> Node | None:
+    """Returns what is at a path of the schema map, as `messages.fields.descend` finds it.
+
+    None where no field is.
+    """
+    for nth, segment in enumerate(path):
+        if isinstance(node, Choice):
+            node = node.array
+        if isinstance(node, Nothing):
+            return node
+        if isinstance(node, Narrowed):
+            inner = descend(node.node, path[nth:])
+            return None if inner is None else Narrowed(node.limit, inner)
+        if isinstance(node, Listing | Items) and segment.isascii() and segment.isdecimal():
+            node = _picked(node, int(segment[:10]))
+        elif isinstance(node, Listing):
+            inner = descend(node.element, path[nth:])
+            return None if inner is None else Listing(node.level, inner)
+        elif isinstance(node, Message | Group):
+            found = node.child(segment)
+            if found is None:
+                return None
+            node = found
+        else:
+            return None
+    return node
+
+
+def at_field(root: Node, dot_path: str) -> list[Spot]:
+    """Returns what is at a dot-path in the value, as `analysis.conditions.at_field` finds it.
+
+    Raises:
+        UnknownShapeError: it depends on the message.
+    """
+    spots = [Spot(root)]
+    for segment in dot_path.split("."):
+        spots = [target for spot in spots for target in _step(spot, segment)]
+    return spots
+
+
+def opened(spot: Spot) -> Iterator[Spot]:
+    """Yields a spot without `Narrowed` and `Choice`: their limits are the spot's own."""
+    node, limits = spot
+    if isinstance(node, Narrowed):
+        yield from opened(Spot(node.node, (*limits, node.limit)))
+    elif isinstance(node, Choice):
+        for case in node.cases:
+            yield from opened(Spot(case, limits))
+    else:
+        yield spot
+
+
+def leaves_below(
+    root: Spot, *, in_objects: bool = True, name: str = ""
+) -> Iterator[tuple[str, Leaf, Limits]]:
+    """Yields the leaves at or below a spot, with their dot-paths in the value.
+
+    Args:
+        root: the spot.
+        in_objects: whether to go into objects, or into lists alone.
+        name: the dot-path of the spot itself.
+
+    Raises:
+        UnknownShapeError: there are more than `MAX_LEAVES`, or it depends on the message.
+    """
+    waiting = [(name, root)]
+    count = 0
+    while waiting:
+        path, spot = waiting.pop()
+        count += 1
+        if count > MAX_LEAVES:
+            raise UnknownShapeError(f"the value has more than {MAX_LEAVES} parts")
+        for node, limits in opened(spot):
+            if isinstance(node, Leaf):
+                yield path, node, limits
+            elif isinstance(node, Listing):
+                waiting.append((path, Spot(node.element, limits)))
+            elif isinstance(node, Items):
+                waiting.extend((path, Spot(item, limits)) for item in reversed(node.items))
+            elif in_objects and isinstance(node, Message | Group):
+                waiting.extend(
+                    (f"{path}.{key}" if path else key, Spot(child, limits))
+                    for key, child in reversed(children(node))
+                )
+
+
+def children(node: Message | Group) -> list[tuple[str, Node]]:
+    """Returns the fields of an object in their order."""
+    named = [(name, node.child(name)) for name in node.names()]
+    return [(name, child) for name, child in named if child is not None]
+
+
+def _step(spot: Spot, segment: str) -> Iterator[Spot]:
+    for node, limits in opened(spot):
+        if isinstance(node, Message | Group):
+            child = node.child(segment)
+            if child is not None:
+                yield Spot(child, limits)
+        elif isinstance(node, Listing | Items) and _INDEX.fullmatch(segment):
+            yield Spot(_picked(node, int(segment)), limits)
+        elif isinstance(node, Listing):
+            yield from _step(Spot(node.element, limits), segment)
+
+
+def _picked(node: Listing | Items, index: int) -> Node:
+    if isinstance(node, Listing):
+        return Narrowed(Pick(node.level, index), node.element)
+    if node.ragged and index < 0:
+        raise UnknownShapeError("the list is not of the same length in all messages")
+    return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
+
+
+def _as_numbers(node: Node) -> Node:
+    """Returns what was found by its full path: a quaternion then stays x, y, z, w."""
+    if isinstance(node, Listing):
+        return Listing(node.level, _as_numbers(node.element))
+    if isinstance(node, Narrowed):
+        return Narrowed(node.limit, _as_numbers(node.node))
+    if isinstance(node, Group) and node.turned is not None:
+        message = node.turned
+        return Group(
+            {name: _real(message.level, f"{message.path}.{name}".lstrip(".")) for name in "xyzw"}
+        )
+    return node
+
+
+def _real(level: Level, source: str) -> Leaf:
+    return Leaf(level, (source,), Kind.REAL, Made.REAL)
+
+
+def _vector(level: Level, sources: Sequence[str]) -> Group:
+    return Group({axis: _real(level, each) for axis, each in zip("xyz", sources, strict=True)})
+
+
+def _turned(level: Level, sources: Sequence[str], message: Message | None) -> Group:
+    angles = (Made.ROLL, Made.PITCH, Made.YAW)
+    return Group(
+        {
+            name: Leaf(level, tuple(sources), Kind.REAL, made)
+            for name, made in zip(ANGLES, angles, strict=True)
+        },
+        message,
+    )
+
+
+def _kind(primitive: str) -> Kind:
+    if primitive == "bool":
+        return Kind.BOOLEAN
+    if primitive in {"string", "wstring"}:
+        return Kind.TEXT
+    return Kind.REAL if primitive.startswith("float") else Kind.INTEGER
+
+
+def _is_number(kind: str | Definition, length: int | None) -> bool:
+    return isinstance(kind, str) and length is None and _kind(kind) in {Kind.INTEGER, Kind.REAL}

@@ -1,0 +1,501 @@
+"""Which rows of a table meet a condition, from its columns alone.
+
+The same as `Condition.matches(extractor.exact(message))` for each message. Where the columns do not
+settle it (an array that is not held, a float that was rounded, a shape that differs from message to
+message) a row is unsure, never wrong: then the bag decides.
+
+What is known without unpacking a column (its zone) is looked at first.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.conditions import POSITION_KEYS, Beyond, Contains, Equals, NearPosition
+from ros2_memory.columns.scores import may_be_json, without_low
+from ros2_memory.columns.shown import (
+    MAX_LEAVES,
+    Group,
+    Kept,
+    Listing,
+    Message,
+    Nothing,
+    Shape,
+    Spot,
+    UnknownShapeError,
+    at_field,
+    children,
+    leaves_below,
+    opened,
+    placed,
+    unknown,
+)
+from ros2_memory.columns.table import MAX_NUMBERS, Texts
+from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values
+from ros2_memory.messages.detections import MAX_DEPTH, without_low_scores
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.columns.shown import Limits, Node
+    from ros2_memory.columns.table import Table, Zone
+    from ros2_memory.columns.values import Mask, Numeric
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import Definition
+
+_EXACT_BELOW: Final = 2**53
+_ROUNDING: Final = 1e-9
+"""How much a distance that numpy computes may differ, relative to the tolerance; far too much."""
+_TINY_M: Final = 1e-150
+"""The squares of shorter distances vanish."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Which rows meet a condition.
+
+    Attributes:
+        rows: how many there are.
+        some_met: which meet it; None where none does.
+        some_unsure: which may or may not, so that the bag must decide; None where all is settled.
+    """
+
+    rows: int
+    some_met: Mask | None = None
+    some_unsure: Mask | None = None
+
+    @property
+    def is_none(self) -> bool:
+        """Whether surely no row meets it."""
+        return self.some_met is None and self.some_unsure is None
+
+    @property
+    def met(self) -> Mask:
+        """Which rows surely meet it."""
+        return np.zeros(self.rows, np.bool_) if self.some_met is None else self.some_met
+
+    @property
+    def unsure(self) -> Mask:
+        """Which rows the bag must decide; none of those that are met."""
+        return np.zeros(self.rows, np.bool_) if self.some_unsure is None else self.some_unsure
+
+
+def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
+    """Returns which rows of a table meet a condition; of several tables use one `ColumnCondition`."""
+    return ColumnCondition(condition, extractor).truth(table)
+
+
+class ColumnCondition:
+    """Tests one condition on tables; remembers what it means for each type that it met.
+
+    Args:
+        condition: what is asked.
+        extractor: has the schema map.
+    """
+
+    def __init__(self, condition: Condition, extractor: SchemaExtractor) -> None:
+        self._condition = condition
+        self._extractor = extractor
+        self._plans: dict[tuple[Definition, str], _Plan | None] = {}
+
+    def truth(self, table: Table) -> Truth:
+        """Returns which rows of a table meet the condition."""
+        rows, definition = len(table), table.definition
+        plan = None if definition is None else self._plan(definition, table.channel.type)
+        if plan is None:
+            return _truth(rows, unknown(rows))
+        values = Values(table)
+        if rows == 0 or not any(test.may_match(values) for test in plan.whole):
+            return Truth(rows)
+        if plan.counted is None:
+            return _truth(rows, _any_of(plan.whole, values))
+        texts = tuple(
+            t.leaf for t in plan.counted if isinstance(t, _LeafTest) and t.leaf.json_depth
+        )
+        counted = _any_of(plan.counted, values)
+        if not may_be_json(values, texts):
+            return _truth(rows, counted)
+        # A text in which detections were left out is another text: both have to pass.
+        whole = _any_of(plan.whole, values)
+        surely, perhaps = counted.surely & whole.surely, counted.perhaps & whole.perhaps
+        return _truth(rows, Kept(surely, perhaps))
+
+    def _plan(self, definition: Definition, type_name: str) -> _Plan | None:
+        key = (definition, type_name)
+        if key not in self._plans:
+            try:
+                self._plans[key] = self._made(Shape(definition, type_name, self._extractor).value)
+            except UnknownShapeError:
+                self._plans[key] = None
+        return self._plans[key]
+
+    def _made(self, value: Node) -> _Plan:
+        condition = self._condition
+        whole = _tests(condition, value)
+        if condition.min_score <= 0:
+            return _Plan(whole, None)
+        return _Plan(whole, _tests(condition, without_low(value, condition.least_score)))
+
+
+class _Plan(NamedTuple):
+    """What is tested on a value, and on the value without detections of a low score."""
+
+    whole: Sequence[_LeafTest | _PlaceTest]
+    counted: Sequence[_LeafTest | _PlaceTest] | None
+
+
+def _truth(rows: int, kept: Kept) -> Truth:
+    unsure = kept.perhaps & ~kept.surely
+    return Truth(rows, kept.surely if kept.surely.any() else None, unsure if unsure.any() else None)
+
+
+def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
+    """Returns which rows pass any of the tests."""
+    surely, perhaps = np.zeros(values.rows, np.bool_), np.zeros(values.rows, np.bool_)
+    for test in tests:
+        if not test.may_match(values):
+            continue
+        for level, found, limits in test.found(values):
+            if found is None:
+                return Kept(surely, np.ones(values.rows, np.bool_))
+            certain = np.flatnonzero(found.surely)
+            surely[placed(values, level, certain, limits, surely=True)[1]] = True
+            possible = np.flatnonzero(found.perhaps)
+            perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
+        if surely.all():
+            break
+    return Kept(surely, perhaps)
+
+
+def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
+    test, field = condition.test, condition.field
+    spots = [Spot(value)] if field is None else at_field(value, field)
+    if isinstance(test, NearPosition):
+        return [
+            _PlaceTest(test, leaves, limits)
+            for spot in spots
+            for leaves, limits in _positions(spot)
+            if test.z is None or len(leaves) == 3
+        ]
+    found: list[_LeafTest | _PlaceTest] = []
+    for spot in spots:
+        for path, leaf, limits in leaves_below(spot):
+            # Elements of lists have no name of their own.
+            is_element = field is not None and not path
+            made = _LeafTest(test, leaf, limits, is_element, condition.least_score)
+            if made.is_needed:
+                found.append(made)
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LeafTest:
+    """`contains`, `equals`, `above` or `below`, on one leaf of a value.
+
+    Attributes:
+        test: what is asked.
+        leaf: on which leaf.
+        limits: where that stands in the value.
+        is_element: whether `Contains.has_element` looks at it.
+        least_score: for texts that are JSON.
+    """
+
+    test: Contains | Equals | Beyond
+    leaf: Leaf
+    limits: Limits
+    is_element: bool
+    least_score: float
+
+    @property
+    def numbers(self) -> tuple[int | float, ...]:
+        """The numbers that are equal."""
+        if isinstance(self.test, Contains):
+            return self.test.equal.numbers if self.is_element else ()
+        return self.test.numbers if isinstance(self.test, Equals) else ()
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether any value of the leaf's kind can pass."""
+        if self.leaf.kind is Kind.TEXT:
+            return self._folded is not None
+        if self.leaf.kind is Kind.BOOLEAN:
+            return self.passes(value=True) or self.passes(value=False)
+        return isinstance(self.test, Beyond) or bool(self.numbers)
+
+    def passes(self, value: bool | str) -> bool:
+        """Returns whether a boolean or a text passes."""
+        if self.test.matches(value):
+            return True
+        return isinstance(self.test, Contains) and self.is_element and self.test.has_element(value)
+
+    def may_match(self, values: Values) -> bool:
+        """Returns whether some value may pass, as far as it is known without reading any."""
+        zone = values.zone(self.leaf)
+        if zone is None or (self.leaf.json_depth and may_be_rewritten(zone)):
+            return True
+        if self.leaf.kind is Kind.TEXT:
+            return zone.words is None or (self._folded or "") in zone.words
+        if self.leaf.kind is Kind.BOOLEAN:
+            return any(
+                zone.least <= value <= zone.greatest and self.passes(value=value)
+                for value in (False, True)
+            )
+        if isinstance(self.test, Beyond):
+            limit = self.test.limit
+            return zone.greatest > limit if self.test.above else zone.least < limit
+        return any(zone.least <= number <= zone.greatest for number in self.numbers)
+
+    def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
+        """Yields which rows or elements of a level pass; None where the table cannot say."""
+        leaf = self.leaf
+        if leaf.kind is Kind.TEXT:
+            texts = values.texts(leaf)
+            yield leaf.level, None if texts is None else self._among_texts(texts), self.limits
+            return
+        numbers = values.numbers(leaf)
+        if numbers is not None:
+            yield leaf.level, self._among_numbers(numbers), self.limits
+        if leaf.is_of_array and leaf.level.parent is not None:
+            yield from self._in_long_arrays(values, leaf.level.parent, is_part=numbers is not None)
+        elif numbers is None:
+            yield leaf.level, None, self.limits
+
+    @property
+    def _folded(self) -> str | None:
+        return None if isinstance(self.test, Beyond) else self.test.folded
+
+    def _among_texts(self, texts: Texts) -> Kept:
+        words: Sequence[str] = texts.words
+        if self.leaf.json_depth:
+            words = [_without_low(word, self.least_score, self.leaf.json_depth) for word in words]
+        flags = np.fromiter(map(self.passes, words), np.bool_, len(words))
+        passed = flags[texts.codes] if words else np.zeros(0, np.bool_)
+        return Kept(passed, passed)
+
+    def _among_numbers(self, numbers: Numbers) -> Kept:
+        column, error, exactly = numbers
+        if column.dtype.kind == "b":
+            if_false, if_true = self.passes(value=False), self.passes(value=True)
+            passed = np.where(column, if_true, if_false)
+            return Kept(passed, passed)
+        passed = self._passed(column)
+        if isinstance(error, float) and error == 0.0:
+            return Kept(passed, passed)
+        near = np.isinf(error) | np.zeros(len(column), np.bool_)
+        for bound in (self.test.limit,) if isinstance(self.test, Beyond) else self.numbers:
+            near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
+        if exactly is None:
+            return Kept(passed & ~near, passed | near)
+        among = np.flatnonzero(near)
+        passed[among] = self._passed(exactly(among))
+        return Kept(passed, passed)
+
+    def _passed(self, column: Numeric) -> Mask:
+        if isinstance(self.test, Beyond):
+            return beyond(column, self.test.limit, above=self.test.above)
+        return equal_to_any(column, self.numbers)
+
+    def _in_long_arrays(
+        self, values: Values, level: Level, *, is_part: bool
+    ) -> Iterator[tuple[Level, Kept | None, Limits]]:
+        """Yields the rows or elements whose arrays are too long to be held, by what is known."""
+        path = self.leaf.level.name
+        lengths = values.numeric(level, f"{path}.length")
+        if lengths is None:
+            if not is_part:
+                yield level, None, self.limits
+            return
+        here = lengths > (MAX_NUMBERS if is_part else 0)
+        if not here.any():
+            return
+        least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))
+        kept = unknown(len(lengths))
+        if least is not None and greatest is not None and self.leaf.kind is not Kind.BOOLEAN:
+            kept = self._between(least, greatest)
+        limits = tuple(limit for limit in self.limits if limit.level != self.leaf.level)
+        # Of one that is picked from an array, what is known of all says only what it may be.
+        surely = here & kept.surely & (len(limits) == len(self.limits))
+        yield level, Kept(surely, here & kept.perhaps), limits
+
+    def _between(self, least: Numeric, greatest: Numeric) -> Kept:
+        """Returns in which arrays a number passes, by their least and greatest finite ones.
+
+        NaN where those are not known. Integers of more than 53 bits were rounded.
+        """
+        is_real = self.leaf.kind is Kind.REAL
+        surely, perhaps = np.zeros(len(least), np.bool_), np.isnan(least)
+        is_rounded = np.maximum(np.abs(least), np.abs(greatest)) >= _EXACT_BELOW
+        if not is_real:
+            perhaps |= is_rounded
+        if isinstance(self.test, Beyond):
+            ends = greatest if self.test.above else least
+            surely = beyond(ends, self.test.limit, above=self.test.above)
+            perhaps |= is_real  # infinities are not among the finite ones
+        for number in self.numbers:
+            at = _as_float(number)
+            surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
+            perhaps |= ((least <= at) & (at <= greatest)) | (is_real and math.isinf(at))
+        if not is_real:
+            surely &= ~is_rounded
+        return Kept(surely, perhaps | surely)
+
+
+def may_be_rewritten(zone: Zone) -> bool:
+    """Returns whether a text of a zone may be JSON."""
+    return zone.words is None or "[" in zone.words or "{" in zone.words
+
+
+def _without_low(word: str, least: float, depth: int) -> str:
+    """Returns a text of a value, which lies that deep in it, without detections of a low score."""
+    if word[:1] not in {"[", "{"}:
+        return word
+    around = MAX_DEPTH - depth
+    value: JsonValue = word
+    for _ in range(around):
+        value = {"": value}
+    found = without_low_scores(value, least)
+    while isinstance(found, dict):
+        found = found[""]
+    return str(found)
+
+
+def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
+    """Returns which numbers lie beyond a limit, compared as Python does: exactly."""
+    if column.dtype.kind in "iu" and math.isfinite(_as_float(limit)):
+        whole = math.floor(limit) if above else math.ceil(limit)
+        return column > whole if above else column < whole
+    # Not a Python float, to which float32 would be compared as float32.
+    nearest = _as_float(limit)
+    bound = np.float64(nearest)
+    if above:
+        return column >= bound if nearest > limit else column > bound
+    return column <= bound if nearest < limit else column < bound
+
+
+def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
+    """Returns which numbers equal one of these, compared as Python does: exactly."""
+    found = np.zeros(len(column), np.bool_)
+    for number in numbers:
+        as_float = _as_float(number)
+        if column.dtype.kind in "iu":
+            if math.isfinite(as_float) and number == math.floor(number):
+                found |= column == int(number)
+        elif as_float == number:
+            found |= column == np.float64(as_float)
+    return found
+
+
+def _as_float(number: float) -> float:
+    """Returns the float nearest to a number; infinite where it is too large for one."""
+    try:
+        return float(number)
+    except OverflowError:
+        return math.copysign(math.inf, 1 if number > 0 else -1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PlaceTest:
+    """`near_position`, on one position of a value: the leaves of its x, y and perhaps z."""
+
+    test: NearPosition
+    leaves: tuple[Leaf, ...]
+    limits: Limits
+
+    def may_match(self, values: Values) -> bool:
+        """Returns whether some position may be near, as far as known without reading any."""
+        reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
+        for leaf, center in zip(self.leaves, self._center, strict=False):
+            zone = values.zone(leaf)
+            if zone is not None and not (
+                _as_float(zone.least) - center <= reach
+                and center - _as_float(zone.greatest) <= reach
+            ):
+                return False
+        return True
+
+    def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
+        """Yields which rows or elements of a level are near; None where the table cannot say."""
+        leaves = self.leaves[: len(self._center)]
+        columns = [values.numbers(leaf) for leaf in leaves]
+        known = [column for column in columns if column is not None]
+        level = self.leaves[0].level
+        if len(known) < len(columns):
+            yield level, None, self.limits
+        else:
+            yield level, self._near(known), self.limits
+
+    @property
+    def _center(self) -> tuple[float, ...]:
+        test = self.test
+        return (test.x, test.y) if test.z is None else (test.x, test.y, test.z)
+
+    def _near(self, columns: Sequence[Numbers]) -> Kept:
+        tolerance = self.test.tolerance_m
+        axes = [column.values.astype(np.float64, copy=False) for column in columns]
+        with np.errstate(all="ignore"):
+            squared = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
+            apart = np.sqrt(np.add.reduce(squared))
+            error = np.sqrt(np.add.reduce([np.square(column.error) for column in columns]))
+            margin = error + tolerance * _ROUNDING
+            has_infinite = np.logical_or.reduce([np.isinf(axis) for axis in axes])
+            doubtful = (np.abs(apart - tolerance) <= margin) | (apart < _TINY_M)
+            doubtful |= np.isinf(apart) | has_infinite
+            near = apart <= tolerance
+        if np.any(error):
+            return Kept(near & ~doubtful, near | doubtful)
+        for nth in np.flatnonzero(doubtful).tolist():
+            x, y, z = (*(float(axis[nth]) for axis in axes), math.nan)[:3]
+            near[nth] = self.test.is_near(x, y, z)
+        return Kept(near, near)
+
+
+def _positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
+    """Yields the positions in a value, as `analysis.conditions.positions` finds them."""
+    for whole in opened(spot):
+        own = [*_own_positions(whole)]
+        yield from own or _positions_below(whole)
+
+
+def _positions_below(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
+    waiting, count = [spot], 0
+    while waiting:
+        for node, limits in opened(waiting.pop()):
+            count += 1
+            if count > MAX_LEAVES:
+                raise UnknownShapeError(f"the value has more than {MAX_LEAVES} parts")
+            if isinstance(node, Listing):
+                waiting.append(Spot(node.element, limits))
+            elif isinstance(node, Message | Group):
+                fields = dict(children(node))
+                for key in POSITION_KEYS:
+                    if key in fields:
+                        for inner in opened(Spot(fields[key], limits)):
+                            yield from _own_positions(inner)
+                waiting.extend(Spot(child, limits) for child in fields.values())
+
+
+def _own_positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
+    """Yields the position that an opened node is, or that the elements of a list are."""
+    node, limits = spot
+    if isinstance(node, Listing):
+        for inner in opened(Spot(node.element, limits)):
+            if not isinstance(inner.node, Listing):
+                yield from _own_positions(inner)
+    elif isinstance(node, Message | Group):
+        fields = dict(children(node))
+        found = [fields.get(axis) for axis in "xyz"]
+        is_position = all(
+            isinstance(axis, Nothing) or (isinstance(axis, Leaf) and axis.kind is not Kind.TEXT)
+            for axis in found[:2]
+        )
+        if is_position:
+            numeric = {Kind.INTEGER, Kind.REAL}
+            leaves = [axis for axis in found if isinstance(axis, Leaf) and axis.kind in numeric]
+            if all(axis in leaves for axis in found[:2]):
+                yield tuple(leaves), limits

@@ -1,0 +1,333 @@
+"""Reads the leaves of extracted values from the columns of a table.
+
+A `Leaf` says where a number, boolean or text of a value comes from; `Values` reads it for all rows
+(or elements) of one table at once, with the same numbers as the conversions of `messages/` give
+for each message. What the table does not hold is None: then the bag has to be read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
+
+import numpy as np
+
+from ros2_memory.columns.table import MAX_NUMBERS, Texts, Zone
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.messages.conversions import ANGLES, channels_of, euler_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from ros2_memory.columns.table import Column, Elements, Table
+
+    Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+    # Of any dtype: that of floats has the operations that all of them have.
+    Numeric: TypeAlias = Floats
+    Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
+    Mask: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
+
+_EXACT_BELOW: Final = 2**53
+"""Whole numbers below this are floats."""
+_UNIT_TOLERANCE: Final = 1e-12
+_GIMBAL_LOCK_SINE: Final = 1 - 1e-14
+_ROUNDING_DEG: Final = 1e-9
+"""More than numpy's arcsine and arctangent differ from those of the mathematical library."""
+_TURN_ERRORS: Final = 8.0
+"""An angle (rad) is off by at most this, times the error of the quaternion's parts, over the cosine
+of pitch: each argument of the arctangent is a sum of four products of two parts of at most 1, and
+scaling to unit length doubles that."""
+_LEAST_COSINE: Final = 1e-3
+"""Of a pitch so steep that roll and yaw say little."""
+
+
+class Kind(Enum):
+    """What a leaf is."""
+
+    BOOLEAN = auto()
+    INTEGER = auto()
+    REAL = auto()
+    TEXT = auto()
+
+
+class Made(Enum):
+    """How a leaf comes out of its sources."""
+
+    STORED = auto()  # the column itself
+    REAL = auto()  # as a float64
+    SECONDS = auto()  # of nanoseconds
+    ROLL = auto()  # degrees, of x, y, z, w; NaN where that is no rotation
+    PITCH = auto()
+    YAW = auto()
+    PRODUCT = auto()
+    CHANNELS = auto()  # of an image's encoding; NaN where that has no fixed number
+    CONSTANT = auto()
+
+
+_ANGLES: Final = {Made.ROLL: 0, Made.PITCH: 1, Made.YAW: 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Where values lie: in the rows of a table (no parent), or in the elements of a sequence.
+
+    `name` is the sequence's dot-path in the parent.
+    """
+
+    parent: Level | None
+    name: str
+
+    def full(self, path: str) -> str:
+        """Returns the dot-path, from the message on, of a column of this level."""
+        here = self
+        while here.parent is not None:
+            path = f"{here.name}.{path}" if path else here.name
+            here = here.parent
+        return path
+
+
+ROWS: Final = Level(None, "")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leaf:
+    """A number, a boolean or a text of each row or element of a level.
+
+    Attributes:
+        level: where it lies.
+        sources: dot-paths in that level of what it is made of.
+        kind: what it is.
+        made: how.
+        constant: its value, where that is the same everywhere.
+        json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
+            it; 0 for not at all.
+    """
+
+    level: Level
+    sources: tuple[str, ...]
+    kind: Kind
+    made: Made = Made.STORED
+    constant: int = 0
+    json_depth: int = 0
+
+    @property
+    def is_of_array(self) -> bool:
+        """Whether it is an element of an array of numbers, which a table may hold in part."""
+        return self.sources == ("",) and self.made is Made.STORED and self.kind is not Kind.TEXT
+
+
+class Numbers(NamedTuple):
+    """The numbers or booleans of a leaf; null is NaN.
+
+    Attributes:
+        values: one for each row or element; of angles, as numpy computes them.
+        error: the most by which they are off, of all or of each; 0 where they are exact.
+        exactly: returns some of them as the conversions compute them, where those may differ from
+            `values` by `error`; None where only the bag can say.
+    """
+
+    values: Numeric
+    error: float | Floats = 0.0
+    exactly: Callable[[Ints], Floats] | None = None
+
+
+class Values:
+    """Reads one table; unpacks a column when it is first asked for.
+
+    Args:
+        table: the table.
+
+    Attributes:
+        table: the table.
+        rows: how many it has.
+        kept: for limits on whole levels, what they found.
+    """
+
+    def __init__(self, table: Table) -> None:
+        self.table = table
+        self.rows = len(table.log_times)
+        self._levels: dict[Level, Elements | None] = {}
+        self.kept: dict[object, tuple[Mask, Mask]] = {}
+        self._angles: dict[tuple[Level, tuple[str, ...]], tuple[Floats, ...]] = {}
+
+    def elements(self, level: Level) -> Elements | None:
+        """Returns the elements of a sequence; None where the table does not hold them."""
+        if level in self._levels or level.parent is None:
+            return self._levels.get(level)
+        if level.parent.parent is None:
+            found = self.table.elements.get(level.name)
+        else:
+            above = self.elements(level.parent)
+            found = None if above is None else above.elements.get(level.name)
+        self._levels[level] = found
+        return found
+
+    def size(self, level: Level) -> int | None:
+        """Returns how many rows or elements a level has; None where that is not held."""
+        if level.parent is None:
+            return self.rows
+        found = self.elements(level)
+        return None if found is None else len(found.owners)
+
+    def places(self, level: Level, among: Ints, *, from_end: bool) -> Ints | None:
+        """Returns the places of some elements in their lists: 0, 1, ... or -1, -2, ..."""
+        found = self.elements(level)
+        if found is None:
+            return None
+        owners = found.owners
+        edge = np.searchsorted(owners, owners[among], side="right" if from_end else "left")
+        return among - edge
+
+    def column(self, level: Level, path: str) -> Column | None:
+        """Returns a column of a level; None where the table does not hold it."""
+        columns: Mapping[str, Column] | None
+        if level.parent is None:
+            columns = self.table.columns
+        else:
+            found = self.elements(level)
+            columns = None if found is None else found.columns
+        return None if columns is None else columns.get(path)
+
+    def texts(self, leaf: Leaf) -> Texts | None:
+        """Returns the texts of a leaf; None where the table does not hold them."""
+        found = self.column(leaf.level, leaf.sources[0])
+        return found if isinstance(found, Texts) else None
+
+    def numeric(self, level: Level, path: str) -> Numeric | None:
+        """Returns a column of numbers or booleans; None where the table does not hold it."""
+        found = self.column(level, path)
+        return None if found is None or isinstance(found, Texts) else cast("Numeric", found)
+
+    def numbers(self, leaf: Leaf) -> Numbers | None:
+        """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
+        if leaf.made is Made.CHANNELS:
+            texts = self.texts(leaf)
+            return None if texts is None else Numbers(_channels(texts))
+        if leaf.made is Made.CONSTANT:
+            size = self.size(leaf.level)
+            return None if size is None else Numbers(np.full(size, float(leaf.constant)))
+        columns = [self.numeric(leaf.level, path) for path in leaf.sources]
+        found = [column for column in columns if column is not None]
+        return self._made(leaf, found) if len(found) == len(columns) else None
+
+    def _made(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
+        if leaf.made in _ANGLES:
+            return self._turned(leaf, columns)
+        first, error = columns[0], self.error(leaf)
+        if leaf.made is Made.PRODUCT:
+            return Numbers(_product(first, columns[1]))
+        if leaf.made is Made.SECONDS:
+            return Numbers(seconds(first), error / NS_PER_S)
+        return Numbers(first.astype(np.float64) if leaf.made is Made.REAL else first, error)
+
+    def holds_all(self, leaf: Leaf) -> bool:
+        """Returns whether no array that a leaf is an element of is too long to be held."""
+        if not leaf.is_of_array or leaf.level.parent is None:
+            return True
+        lengths = self.numeric(leaf.level.parent, f"{leaf.level.name}.length")
+        return lengths is None or not (lengths > MAX_NUMBERS).any()
+
+    def error(self, leaf: Leaf) -> float:
+        """Returns the greatest error of the columns of a leaf, in their own unit."""
+        return max((self.table.error(leaf.level.full(path)) for path in leaf.sources), default=0.0)
+
+    def zone(self, leaf: Leaf) -> Zone | None:
+        """Returns what is known of a leaf without reading it."""
+        if leaf.made is Made.CONSTANT:
+            return Zone(leaf.constant, leaf.constant, 0)
+        if leaf.made in _ANGLES:
+            most = 90.0 if leaf.made is Made.PITCH else 180.0
+            return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
+        if len(leaf.sources) > 1 or leaf.made is Made.CHANNELS:
+            return None
+        zone = self.table.zone(leaf.level.full(leaf.sources[0]))
+        if zone is None or leaf.made is not Made.SECONDS:
+            return zone
+        return Zone(zone.least / NS_PER_S, zone.greatest / NS_PER_S, zone.nulls)
+
+    def _turned(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
+        """Returns one of the angles (degrees) of quaternions."""
+        key = (leaf.level, leaf.sources)
+        x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)
+        if key not in self._angles:
+            self._angles[key] = _euler(x, y, z, w)
+        *angles, length, cosine = self._angles[key]
+        which = _ANGLES[leaf.made]
+        error = self.error(leaf)
+        if error:
+            return Numbers(angles[which], _angle_error(error, length, cosine, angles[which]))
+
+        def exactly(among: Ints) -> Floats:
+            known: dict[tuple[float, float, float, float], float] = {}
+            found = np.empty(len(among))
+            rows = zip(*(part[among].tolist() for part in (x, y, z, w)), strict=True)
+            for nth, numbers in enumerate(rows):
+                if numbers not in known:
+                    angles_of = euler_of(numbers)
+                    known[numbers] = math.nan if angles_of is None else angles_of[ANGLES[which]]
+                found[nth] = known[numbers]
+            return found
+
+        # Zero is zero everywhere, and a robot in the plane has nothing else.
+        off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
+        return Numbers(angles[which], off, exactly)
+
+
+def seconds(times: Numeric) -> Floats:
+    """Returns nanoseconds as seconds, each as `unix_from_ns` rounds it."""
+    # A float that is divided was rounded before where it has more than 53 bits. Whole seconds and
+    # the rest are both exact, and their sum is rounded once: the rest is never so near to the
+    # middle between two floats that its own rounding decides.
+    whole = times // NS_PER_S
+    parts = whole.astype(np.float64) + (times - whole * NS_PER_S) / NS_PER_S
+    return np.where(np.abs(times) < _EXACT_BELOW, times / NS_PER_S, parts)
+
+
+def _product(one: Numeric, other: Numeric) -> Numeric:
+    return cast("Numeric", one.astype(np.uint64) * other.astype(np.uint64))
+
+
+def _channels(encodings: Texts) -> Floats:
+    known = [channels_of(word) for word in encodings.words]
+    table = np.array([math.nan if each is None else each for each in known], np.float64)
+    return table[encodings.codes] if known else np.empty(0)
+
+
+def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
+    """Returns roll, pitch and yaw (degrees), the length, and the cosine of pitch.
+
+    As `conversions.unit` and `geometry.rpy` compute them.
+    """
+    with np.errstate(all="ignore"):
+        squared = x * x + y * y + z * z + w * w
+        largest = np.maximum.reduce([np.abs(part) for part in (x, y, z, w)])
+        parts = [part / largest for part in (x, y, z, w)]
+        length = np.sqrt(sum((part * part for part in parts[1:]), parts[0] * parts[0]))
+        is_unit = np.abs(squared - 1) < _UNIT_TOLERANCE
+        is_turn = np.isfinite(largest) & (largest > 0)
+        x, y, z, w = (
+            np.where(is_unit, whole, np.where(is_turn, part / length, np.nan))
+            for whole, part in zip((x, y, z, w), parts, strict=True)
+        )
+        sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
+        locked = np.abs(sine) > _GIMBAL_LOCK_SINE
+        both = 2 * np.arctan2(z, w)
+        both -= math.tau * np.rint(both / math.tau)
+        roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        roll = np.where(locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
+        yaw = np.where(locked, both, yaw)
+        degrees = [np.degrees(angle) for angle in (roll, np.arcsin(sine), yaw)]
+        return (*degrees, length * largest, np.sqrt(1 - sine * sine))
+
+
+def _angle_error(error: float, length: Floats, cosine: Floats, angles: Floats) -> Floats:
+    """Returns by how much (degrees) angles may be off, given that of the quaternion's parts."""
+    with np.errstate(all="ignore"):
+        # Relative to the length: a quaternion need not be a unit one.
+        off = np.degrees(_TURN_ERRORS * error / (length * cosine)) + _ROUNDING_DEG
+        is_unsure = ~((cosine > _LEAST_COSINE) & (error < 1e-2 * length))
+        # Across the half turn an angle becomes its opposite.
+        return np.where(is_unsure | (180.0 - np.abs(angles) <= off), math.inf, off)

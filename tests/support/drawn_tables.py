@@ -1,0 +1,438 @@
+"""Messages drawn at random as tables, and conditions drawn from what the messages say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from hypothesis import strategies as st
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ros2_memory.analysis.conditions import (
+    Beyond,
+    Condition,
+    Contains,
+    Equals,
+    NearPosition,
+    at_field,
+    leaves,
+    positions,
+)
+from ros2_memory.columns.objects import level_of
+from ros2_memory.columns.plan import plan_of
+from ros2_memory.columns.table import Column, Elements, Table, Texts, Zone, joined
+from ros2_memory.columns.walk import NotWalkedError, walked
+from ros2_memory.storage.base import Channel, Record, Schema, batched
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from random import Random
+
+    from hypothesis.strategies import DrawFn
+    from rosbags.typesys.store import Typestore
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.storage.base import Batch
+
+VISION_MSGS: Final = {
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
+    "vision_msgs/msg/Pose2D": "Point2D position\nfloat64 theta\n",
+    "vision_msgs/msg/BoundingBox2D": "Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/Detection2D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\n"
+        "BoundingBox2D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nDetection2D[] detections\n",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\n"
+        "BoundingBox3D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+}
+UNMAPPED: Final = {
+    "own_msgs/msg/Seen": "string label\nstring class_name\nfloat32 confidence\nstring attributes\n",
+    "own_msgs/msg/Guess": "string label\nfloat64 score\nint8 probability\n",
+    "own_msgs/msg/Nested": "Seen seen\nGuess[] results\nSeen[] others\ngeometry_msgs/Point at\n",
+    "own_msgs/msg/Axis": "string label\nuint32 size\nuint32 stride\nfloat32 score\n",
+    "own_msgs/msg/Everything": (
+        "bool flag\nbyte octet\nchar letter\nint64 big\nuint64 huge\nfloat32 single\nfloat64 real\n"
+        "string text\nstring[] texts\nstring[2] pair\nbool[] flags\nbool[3] three\nuint8[4] bytes\n"
+        "uint8[] data\nfloat64[] numbers\nfloat32[12] long\nint64[] bigs\nuint8[60] many\n"
+        "builtin_interfaces/Time stamp\nbuiltin_interfaces/Duration[] lasted\n"
+        "geometry_msgs/Quaternion turn\ngeometry_msgs/Quaternion[] turns\n"
+        "geometry_msgs/Point[] points\ngeometry_msgs/Pose2D flat\ngeometry_msgs/Pose[] poses\n"
+        "Nested[] nested\nAxis[] axes\nSeen seen\nstd_msgs/Empty empty\nstring class\n"
+    ),
+    "own_msgs/msg/Label": "string label\nfloat32 score\nfloat64 x\nfloat64 y\n",
+}
+MAPPED: Final = (
+    "nav_msgs/msg/Odometry",
+    "nav_msgs/msg/Path",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/TransformStamped",
+    "geometry_msgs/msg/TwistStamped",
+    "tf2_msgs/msg/TFMessage",
+    "turtlesim/msg/Pose",
+    "px4_msgs/msg/VehicleOdometry",
+    "sensor_msgs/msg/LaserScan",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/NavSatFix",
+    "sensor_msgs/msg/JointState",
+    "ros2_vision_interfaces/msg/VisionDetectionArray",
+    "ros2_vision_interfaces/msg/StampedString",
+    "vision_msgs/msg/Detection2DArray",
+    "vision_msgs/msg/Detection3DArray",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "rcl_interfaces/msg/Log",
+    "std_msgs/msg/String",
+    "std_msgs/msg/Bool",
+    "std_msgs/msg/Int64",
+    "std_msgs/msg/Float32",
+)
+OTHERS: Final = (
+    "own_msgs/msg/Everything",
+    "own_msgs/msg/Nested",
+    "own_msgs/msg/Label",
+    "sensor_msgs/msg/MagneticField",
+    "nav_msgs/msg/OccupancyGrid",
+    "visualization_msgs/msg/MarkerArray",
+    "std_msgs/msg/Float64MultiArray",
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/CompressedImage",
+)
+ROWS: Final = 6
+
+_WORDS: Final = (
+    *(
+        "",
+        " ",
+        "cup",
+        "Cup",
+        "red cup",
+        "STRASSE",
+        "straße",
+        "a\nb",
+        "1",
+        "0.5",
+        "true",
+        "null",
+        "[",
+    ),
+    *("rgb8", "8UC4", "yuv422", "map", "[]", "{}"),
+    '[{"label": "cup", "score": 0.2}, {"label": "fork", "score": 0.9}]',
+    '{"detections": [{"class": "cup", "confidence": 0.5}], "text": "fork"}',
+    '{"label": "cup", "score": 0.3, "point": {"x": 1, "y": 2, "z": 0}}',
+)
+_REALS: Final = (0.0, -0.0, 1.0, -1.0, 0.5, 0.3, 0.1, 0.7071067811865476, 2.5, 1e9, 1e-300, 1e200)
+_ODD: Final = (math.nan, math.inf, -math.inf)
+_EXTENT: Final = {"int8": 7, "byte": 7, "int16": 15, "int32": 31, "int64": 63}
+_EXTENT_UNSIGNED: Final = {"uint8": 8, "char": 8, "uint16": 16, "uint32": 32, "uint64": 64}
+
+
+@cache
+def store() -> Typestore:
+    """The standard types, and those above."""
+    found = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in {**VISION_DEFINITIONS, **OTHER_ROBOTS, **VISION_MSGS, **UNMAPPED}.items():
+        found.register(get_types_from_msg(text, name))
+    return found
+
+
+@cache
+def _channel(type_name: str) -> Channel:
+    text = store().generate_msgdef(type_name, ros_version=2)[0]
+    return Channel("/drawn", "cdr", Schema(type_name, "ros2msg", text.encode()))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A table, and its messages as any reader decodes them."""
+
+    table: Table
+    messages: list[object]
+
+    @property
+    def type(self) -> str:
+        return self.table.channel.type
+
+
+def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
+    """Messages of one channel in the order of time, as a table."""
+    batches: list[Batch] = [*batched(enumerate(records))]  # type: ignore[arg-type]
+    table = joined([_table(batch, reader) for batch in batches])
+    return Drawn(table, [reader.decode(record) for record in records])
+
+
+def _table(batch: Batch, reader: McapReader) -> Table:
+    definition = reader.definition(batch.channel)
+    assert definition is not None
+    plan = plan_of(definition)
+    try:
+        level = walked(plan, batch)
+    except NotWalkedError:
+        level = level_of(
+            plan, [reader.decode(batch.record(nth)) for nth in range(len(batch.starts))]
+        )
+    return Table(
+        batch.channel,
+        batch.log_times,
+        batch.publish_times,
+        batch.places,
+        level.columns,
+        level.elements,
+        level.left_out,
+        definition=definition,
+    )
+
+
+_READER: Final = McapReader()
+
+
+class LazyColumns(Mapping[str, Column]):
+    """Columns that say which of them were unpacked."""
+
+    def __init__(self, prefix: str, columns: Mapping[str, Column], unpacked: set[str]) -> None:
+        self._prefix = prefix
+        self._columns = columns
+        self._unpacked = unpacked
+
+    def __getitem__(self, path: str) -> Column:
+        column = self._columns[path]
+        self._unpacked.add(f"{self._prefix}.{path}".strip("."))
+        return column
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+
+class StoredTable(Table):
+    """A table as it comes out of a store: floats rounded to a step, with zones."""
+
+    __slots__ = ("errors", "unpacked", "zones")
+    errors: dict[str, float]
+    unpacked: set[str]
+    zones: dict[str, Zone]
+
+    def error(self, path: str) -> float:
+        return self.errors.get(path, 0.0)
+
+    def zone(self, path: str) -> Zone | None:
+        return self.zones.get(path)
+
+
+def stored(table: Table, step: float, *, zones: bool = True) -> StoredTable:
+    """The table with floats rounded to a multiple of `step`; 0 for no rounding."""
+    errors: dict[str, float] = {}
+    known: dict[str, Zone] = {}
+    unpacked: set[str] = set()
+
+    def packed(prefix: str, columns: Mapping[str, Column]) -> LazyColumns:
+        found: dict[str, Column] = {}
+        for path, column in columns.items():
+            full = f"{prefix}.{path}".strip(".")
+            # A list of numbers is not always held whole.
+            if zones and path:
+                known[full] = zone_of(column)
+            found[path] = column
+            if step and not isinstance(column, Texts) and column.dtype.kind == "f":
+                found[path], errors[full] = rounded(column, step)
+        return LazyColumns(prefix, found, unpacked)
+
+    def elements(prefix: str, within: Mapping[str, Elements]) -> dict[str, Elements]:
+        return {
+            path: Elements(
+                inner.owners,
+                packed(f"{prefix}.{path}".strip("."), inner.columns),
+                elements(f"{prefix}.{path}".strip("."), inner.elements),
+            )
+            for path, inner in within.items()
+        }
+
+    made = {entry.name: getattr(table, entry.name) for entry in fields(Table)}
+    made["columns"] = packed("", table.columns)
+    made["elements"] = elements("", table.elements)
+    result = StoredTable(**made)
+    for name, value in (("errors", errors), ("zones", known), ("unpacked", unpacked)):
+        object.__setattr__(result, name, value)
+    return result
+
+
+def rounded(column: Any, step: float) -> tuple[Any, float]:
+    """Floats as multiples of a step, and the most by which they are off."""
+    with np.errstate(all="ignore"):
+        near = np.round(column.astype(np.float64) / step) * step
+        near = np.where(np.isfinite(near), near, column.astype(np.float64))
+        off = np.abs(near - column.astype(np.float64))
+    return near, float(np.max(off, initial=0.0, where=np.isfinite(off)))
+
+
+def zone_of(column: Column) -> Zone:
+    """What is known of a column without unpacking it."""
+    if isinstance(column, Texts):
+        return Zone(words="\n".join(sorted({word.casefold() for word in column.words})))
+    kept = column[~np.isnan(column)] if column.dtype.kind == "f" else column
+    if not kept.size:
+        return Zone(nulls=column.size)
+    least, greatest = (end.item() for end in (kept.min(), kept.max()))
+    return Zone(least, greatest, int(column.size - kept.size))
+
+
+@st.composite
+def drawn_tables(draw: DrawFn, types: Sequence[str] = (*MAPPED, *OTHERS)) -> Drawn:
+    """Some messages of a type as a table."""
+    type_name = draw(st.sampled_from(types))
+    random = draw(st.randoms(use_true_random=False))
+    is_odd = draw(st.booleans())
+    count = draw(st.integers(1, ROWS))
+    messages = [message(type_name, random, is_odd=is_odd) for _ in range(count)]
+    return drawn_of(type_name, messages)
+
+
+def drawn_of(type_name: str, messages: Sequence[object]) -> Drawn:
+    """These messages, one each nanosecond, as a table."""
+    payloads = [bytes(store().serialize_cdr(each, type_name)) for each in messages]
+    records = [Record(_channel(type_name), at, at, payload) for at, payload in enumerate(payloads)]
+    return table_of(records, _READER)
+
+
+def message(type_name: str, random: Random, *, is_odd: bool = True) -> object:
+    """A message with values that tests look for; `is_odd`: NaN and infinities among them."""
+    fields = store().fielddefs[type_name][1]
+    build: Any = store().types[type_name]
+    made = [_value(field, random, is_odd) for _, field in fields]
+    return build(*made)
+
+
+def _value(field: Any, random: Random, is_odd: bool) -> object:
+    node, about = field
+    if node == Nodetype.BASE:
+        return _scalar(about[0], random, is_odd)
+    if node == Nodetype.NAME:
+        if about == "geometry_msgs/msg/Quaternion":
+            return _quaternion(random)
+        return message(about, random, is_odd=is_odd)
+    element, size = about
+    if node == Nodetype.SEQUENCE:
+        size = min(random.choice([0, 1, 1, 2, 3, 10]), size or 10)
+        if element[0] == Nodetype.NAME:
+            size = min(size, 3)
+    values = [_value(element, random, is_odd) for _ in range(size)]
+    if element[0] == Nodetype.NAME or element[1][0] in {"string", "wstring"}:
+        return values
+    kind = {"byte": "int8", "char": "uint8"}.get(element[1][0], element[1][0])
+    return np.array(values, dtype=kind)
+
+
+def _scalar(kind: str, random: Random, is_odd: bool) -> object:
+    if kind == "bool":
+        return random.random() < 0.5
+    if kind in {"string", "wstring"}:
+        return random.choice(_WORDS)
+    if kind in {"float32", "float64"}:
+        pool = _REALS + _ODD if is_odd else _REALS
+        number = random.choice(pool) if random.random() < 0.7 else random.gauss(0, 2)
+        if kind == "float32":
+            with np.errstate(over="ignore"):
+                return float(np.float32(number))
+        return number
+    bits = _EXTENT.get(kind) or _EXTENT_UNSIGNED[kind]
+    least = -(2**bits) if kind in _EXTENT else 0
+    pool = [0, 1, 2, 3, 2**53 + 1, 2**bits - 1, least, least + 1]
+    return random.choice([number for number in pool if least <= number < 2**bits])
+
+
+def _quaternion(random: Random) -> object:
+    half = math.sqrt(0.5)
+    parts = random.choice(
+        [
+            (0.0, 0.0, 0.0, 1.0),
+            (0.0, 0.0, 0.0, 0.0),
+            (0.0, half, 0.0, half),  # gimbal lock
+            (0.0, 0.0, 1.0, 0.0),
+            (math.nan, 0.0, 0.0, 1.0),
+            (1e200, 0.0, 0.0, 1e200),
+            tuple(random.gauss(0, 1) for _ in range(4)),
+            (0.0, 0.0, math.sin(0.4), math.cos(0.4)),
+        ]
+    )
+    build: Any = store().types["geometry_msgs/msg/Quaternion"]
+    return build(*parts)
+
+
+def paths_of(value: JsonValue, path: str = "") -> Iterator[str]:
+    """The dot-paths of a value, through lists with and without a place."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            below = f"{path}.{name}" if path else name
+            yield below
+            yield from paths_of(inner, below)
+    elif isinstance(value, list) and value:
+        yield from paths_of(value[0], path)
+        for place in (0, len(value) - 1, -1):
+            if path:
+                yield f"{path}.{place}"
+                yield from paths_of(value[place], f"{path}.{place}")
+
+
+def condition_on(values: Sequence[JsonValue], random: Random) -> Condition:
+    """A condition that some of the values meet, or nearly."""
+    value = random.choice(values)
+    paths = [*dict.fromkeys(paths_of(value))]
+    field = random.choice(paths) if paths and random.random() < 0.75 else None
+    if field is not None and random.random() < 0.05:
+        field += random.choice([".nothing", ".1", ".-3"])
+    targets = [value] if field is None else at_field(value, field)
+    min_score = random.choice([0.0, 0.0, 0.2, 0.3, 0.5, 0.9])
+    if random.random() < 0.2:
+        return Condition(_near(targets, random), field, min_score)
+    found = [leaf for target in targets for leaf in leaves(target)]
+    leaf = random.choice(found) if found else random.choice([1.5, "cup", True, 0])
+    return Condition(_test(leaf, random), field, min_score)
+
+
+def _near(targets: Sequence[JsonValue], random: Random) -> NearPosition:
+    found = [place for target in targets for place in positions(target)]
+    place = random.choice(found) if found else (0.0, 0.0, 0.0)
+    x, y, z = (axis if math.isfinite(axis) else 0.0 for axis in place)
+    off = random.choice([0.0, 0.0, 0.1, 1.0])
+    tolerance = random.choice([0.0, off, 0.5, 1.0, 10.0, math.inf])
+    return NearPosition(x + off, y, random.choice([None, z]), tolerance)
+
+
+def _test(leaf: JsonValue, random: Random) -> Contains | Equals | Beyond:
+    if leaf is None or (isinstance(leaf, float) and math.isnan(leaf)):
+        leaf = 0
+    needle: bool | float | str = 0
+    if isinstance(leaf, str):
+        begin = random.randrange(max(len(leaf), 1))
+        part = leaf[begin : begin + random.randint(1, 8)] or "x"
+        needle = random.choice([leaf, leaf.upper(), part, f"{part}q"])
+    elif isinstance(leaf, bool):
+        needle = random.choice([leaf, str(leaf), int(leaf)])
+    elif isinstance(leaf, int | float):
+        near = (leaf, leaf, leaf + 1, leaf * (1 + 1e-12), leaf / 2, str(leaf), float(leaf))
+        needle = random.choice(near)
+    kind = random.choice(["contains", "equals", "above", "below"])
+    if kind in {"above", "below"}:
+        is_number = isinstance(needle, int | float) and not isinstance(needle, bool)
+        return Beyond(needle if is_number else 0.5, kind == "above")  # type: ignore[arg-type]
+    if kind == "contains":
+        return Contains(needle if not isinstance(needle, str) or needle.strip() else "cup")
+    return Equals(needle)

@@ -1,0 +1,250 @@
+"""Extracted values as trees over columns: the same leaves as in each extracted value."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from random import Random
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.columns.numbers import numbers
+from ros2_memory.columns.shown import Shape, Spot, leaves_below, placed
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values, seconds
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
+from ros2_memory.extract import SchemaExtractor
+from ros2_memory.insights.field_extremes import numbers_in
+from ros2_memory.messages.conversions import ANGLES, euler_of
+from tests.support.bags import make
+from tests.support.drawn_tables import (
+    MAPPED,
+    OTHERS,
+    Drawn,
+    drawn_of,
+    drawn_tables,
+    message,
+    paths_of,
+    stored,
+)
+from tests.support.examples import examples
+from tests.support.memories import shipped_extractor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.core.model import JsonValue, Quaternion
+
+EXTRACTOR = shipped_extractor()
+RANDOM = st.randoms(use_true_random=False)
+FULL_PATHS = (
+    "header.stamp",
+    "header.stamp.sec",
+    "pose.pose.orientation",
+    "pose.pose.orientation.w",
+    "twist.twist.linear.x",
+    "transforms.transform.rotation",
+    "poses.pose.orientation.w",
+    "detections.point",
+    "turns",
+    "turn.x",
+    "data",
+    "q",
+    "q.0",
+    "nothing",
+)
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def named_leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, object]]:
+    """The leaves of a value, with their paths; null and NaN are left out."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from named_leaves(inner, f"{path}.{name}" if path else name)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from named_leaves(inner, path)
+    elif value is not None and not (isinstance(value, float) and math.isnan(value)):
+        yield path, value
+
+
+def read_leaves(drawn: Drawn, extractor: SchemaExtractor) -> list[Counter[tuple[str, object]]]:
+    """The leaves of each message as the columns hold them."""
+    assert drawn.table.definition is not None
+    values = Values(drawn.table)
+    found: list[Counter[tuple[str, object]]] = [Counter() for _ in drawn.messages]
+    shape = Shape(drawn.table.definition, drawn.type, extractor)
+    for path, leaf, limits in leaves_below(Spot(shape.value)):
+        column = column_of(values, leaf)
+        size = values.size(leaf.level)
+        if column is None or size is None or not values.holds_all(leaf):
+            continue
+        kept, rows = placed(values, leaf.level, np.arange(size), limits, surely=True)
+        for at, row in zip(kept.tolist(), rows.tolist(), strict=True):
+            if column[at] == column[at]:
+                found[row][path, column[at]] += 1
+    return found
+
+
+def column_of(values: Values, leaf: Leaf) -> list[object] | None:
+    if leaf.kind is Kind.TEXT:
+        texts = values.texts(leaf)
+        return None if texts is None else [*texts.values()]
+    known = values.numbers(leaf)
+    if known is None:
+        return None
+    if known.exactly is not None:
+        return known.exactly(np.arange(len(known.values))).tolist()
+    return known.values.tolist()
+
+
+@pytest.mark.parametrize("limit", [50, 2])
+@settings(max_examples=examples(90), deadline=None)
+@given(drawn=drawn_tables())
+def test_leaves_of_columns_are_those_of_extracted_values(limit: int, drawn: Drawn) -> None:
+    extractor = shipped_extractor(limit)
+    for message_, found in zip(drawn.messages, read_leaves(drawn, extractor), strict=True):
+        expected = Counter(named_leaves(extractor.exact(message_, drawn.type)))
+        assert not found - expected
+        if not drawn.table.left_out:
+            assert not expected - found
+
+
+@settings(max_examples=examples(150), deadline=None)
+@given(drawn_tables(), RANDOM)
+def test_numbers_of_a_field_are_those_of_each_message(drawn: Drawn, random: Random) -> None:
+    value = EXTRACTOR.exact(drawn.messages[0], drawn.type)
+    for field in (random.choice([*paths_of(value), "nothing"]), random.choice(FULL_PATHS)):
+        found = numbers(drawn.table, field, EXTRACTOR)
+        if found is None:
+            continue
+        assert found.rows.tolist() == sorted(found.rows.tolist())
+        for row, message_ in enumerate(drawn.messages):
+            expected = sorted(numbers_in(EXTRACTOR.exact_at(message_, drawn.type, field)))
+            own = sorted(found.numbers[found.rows == row].tolist())
+            assert own == pytest.approx(expected, abs=found.error, rel=0.0), field
+
+
+def test_numbers_are_found_by_both_their_paths() -> None:
+    drawn = drawn_of(ODOMETRY, [message(ODOMETRY, Random(seed), is_odd=False) for seed in range(3)])
+    short = numbers(drawn.table, "position.x", EXTRACTOR)
+    full = numbers(drawn.table, "pose.pose.position.x", EXTRACTOR)
+    assert short is not None
+    assert full is not None
+    assert short.numbers.tolist() == full.numbers.tolist()
+    assert short.rows.tolist() == [0, 1, 2]
+    assert short.error == 0.0
+
+
+def test_numbers_state_the_error_of_rounded_columns() -> None:
+    random = Random(7)
+    drawn = drawn_of(ODOMETRY, [message(ODOMETRY, random, is_odd=False) for _ in range(20)])
+    table = stored(drawn.table, 0.01)
+    found = numbers(table, "position.x", EXTRACTOR)
+    exact = numbers(drawn.table, "position.x", EXTRACTOR)
+    assert found is not None
+    assert exact is not None
+    assert 0.0 < found.error <= 0.0050001
+    assert np.abs(found.numbers - exact.numbers).max() <= found.error
+    assert table.unpacked == {"pose.pose.position.x"}
+
+
+def test_numbers_of_arrays_that_are_not_held_are_left_to_the_bag() -> None:
+    drawn = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))])
+    assert numbers(drawn.table, "pose.covariance", EXTRACTOR) is None
+    kind = "sensor_msgs/msg/JointState"
+    joints = message(kind, Random(1), is_odd=False)
+    joints.position = np.arange(3.0)  # type: ignore[attr-defined]
+    found = numbers(drawn_of(kind, [joints]).table, "positions", EXTRACTOR)
+    assert found is not None
+    assert found.numbers.tolist() == [0.0, 1.0, 2.0]
+    joints.position = np.arange(12.0)  # type: ignore[attr-defined]
+    assert numbers(drawn_of(kind, [joints]).table, "positions", EXTRACTOR) is None
+
+
+def test_numbers_of_integers_are_integers_and_booleans_are_none() -> None:
+    whole = "std_msgs/msg/Int64"
+    drawn = drawn_of(whole, [make(whole, data=2**53 + 1), make(whole, data=-1)])
+    found = numbers(drawn.table, "value", EXTRACTOR)
+    assert found is not None
+    assert found.numbers.dtype == np.int64
+    assert found.numbers.tolist() == [2**53 + 1, -1]
+    flag = "std_msgs/msg/Bool"
+    none = numbers(drawn_of(flag, [make(flag, data=True)]).table, "value", EXTRACTOR)
+    assert none is not None
+    assert not none.numbers.size
+
+
+@given(st.lists(st.integers(MIN_NS, MAX_NS) | st.integers(-(2**54), 2**54), min_size=1))
+def test_seconds_are_rounded_as_those_of_each_message(times: list[int]) -> None:
+    found = seconds(np.array(times, np.int64))  # type: ignore[arg-type]
+    assert found.tolist() == [unix_from_ns(time) for time in times]
+
+
+PART = st.sampled_from([0.0, 1.0, -1.0, math.sqrt(0.5), 1e-9, 1e200, math.nan]) | st.floats(-1, 1)
+TURNS = st.lists(st.tuples(PART, PART, PART, PART), min_size=1, max_size=20)
+
+
+def turned(parts: list[Quaternion], error: float = 0.0) -> list[list[tuple[float, float, float]]]:
+    """Roll, pitch and yaw of quaternions: value, error, and value as the conversions have it."""
+    kind = "geometry_msgs/msg/Quaternion"
+    table = drawn_of(kind, [make(kind, x=x, y=y, z=z, w=w) for x, y, z, w in parts]).table
+    values = Values(table)
+    values.error = lambda leaf: error  # type: ignore[method-assign]
+    found = []
+    for made in (Made.ROLL, Made.PITCH, Made.YAW):
+        known = values.numbers(Leaf(ROWS, ("x", "y", "z", "w"), Kind.REAL, made))
+        assert known is not None
+        off = np.broadcast_to(known.error, known.values.shape)
+        exact = known.values if known.exactly is None else known.exactly(np.arange(len(parts)))
+        found.append([*zip(known.values.tolist(), off.tolist(), exact.tolist(), strict=True)])
+    return found
+
+
+@given(TURNS)
+def test_angles_are_those_of_each_quaternion(parts: list[Quaternion]) -> None:
+    for name, column in zip(ANGLES, turned(parts), strict=True):
+        for quaternion, (value, error, exact) in zip(parts, column, strict=True):
+            angles = euler_of(quaternion)
+            expected = math.nan if angles is None else angles[name]
+            assert exact == pytest.approx(expected, abs=0.0, rel=0.0, nan_ok=True)
+            assert value == pytest.approx(expected, abs=error, rel=0.0, nan_ok=True)
+
+
+@given(TURNS, st.sampled_from([1e-6, 1e-4, 1e-3]), st.integers(0, 2**32))
+def test_angles_of_rounded_quaternions_are_off_by_less_than_they_say(
+    parts: list[Quaternion], error: float, seed: int
+) -> None:
+    random = Random(seed)
+    moved = [
+        tuple(part + random.uniform(-error, error) for part in quaternion) for quaternion in parts
+    ]
+    for name, column in zip(ANGLES, turned(moved, error), strict=True):  # type: ignore[arg-type]
+        for quaternion, (value, off, _) in zip(parts, column, strict=True):
+            angles = euler_of(quaternion)
+            if angles is not None and math.isfinite(off):
+                assert abs(value - angles[name]) <= off
+
+
+def test_every_type_of_the_map_has_a_shape() -> None:
+    for kind in (*MAPPED, *OTHERS):
+        drawn = drawn_of(kind, [message(kind, Random(1))])
+        assert drawn.table.definition is not None
+        shape = Shape(drawn.table.definition, kind, EXTRACTOR)
+        assert [*leaves_below(Spot(shape.value))]
+
+
+def test_a_mapped_path_that_leads_into_times_is_left_to_the_bag() -> None:
+    extractor = SchemaExtractor({ODOMETRY: {"second": "header.stamp.sec"}}, 50)
+    table = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))]).table
+    assert numbers(table, "second", extractor) is None
+
+
+def test_the_full_path_of_a_level_names_its_columns() -> None:
+    results = Level(Level(ROWS, "detections"), "results")
+    assert results.full("hypothesis.score") == "detections.results.hypothesis.score"
+    assert results.full("") == "detections.results"
+    assert ROWS.full("position.x") == "position.x"

@@ -1,0 +1,354 @@
+"""Conditions over columns: the same as on each decoded message."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from random import Random
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals, NearPosition
+from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.table import Texts
+from ros2_memory.columns.truth import ColumnCondition, truth
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.bags import make, stamp
+from tests.support.drawn_tables import (
+    Drawn,
+    condition_on,
+    drawn_of,
+    drawn_tables,
+    message,
+    stored,
+)
+from tests.support.examples import LONG, examples
+from tests.support.memories import shipped_extractor
+from tests.support.shared_bags import BAGS, needs_real, needs_recorded
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.truth import Truth
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.storage.base import Record
+
+EXTRACTOR = shipped_extractor()
+VISION = "ros2_vision_interfaces/msg/VisionDetectionArray"
+STRING = "std_msgs/msg/String"
+PLAIN = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "tf2_msgs/msg/TFMessage",
+    "sensor_msgs/msg/BatteryState",
+    "rcl_interfaces/msg/Log",
+    "px4_msgs/msg/VehicleOdometry",
+    STRING,
+    "std_msgs/msg/Int64",
+    "std_msgs/msg/Float32",
+)
+RANDOM = st.randoms(use_true_random=False)
+SAMPLED_ROWS = 12
+
+
+def compared(found: Truth, condition: Condition, values: list[JsonValue]) -> int:
+    """Checks what is settled; returns how many rows are not."""
+    expected = np.array([condition.matches(value) for value in values])
+    assert not (found.met & found.unsure).any()
+    assert found.is_none == (not (found.met | found.unsure).any())
+    wrong = np.flatnonzero((found.met != expected) & ~found.unsure)
+    assert not wrong.size, (condition, values[wrong[0]])
+    return int(found.unsure.sum())
+
+
+def values_of(drawn: Drawn) -> list[JsonValue]:
+    return [EXTRACTOR.exact(message, drawn.type) for message in drawn.messages]
+
+
+@settings(max_examples=examples(150), deadline=None)
+@given(drawn_tables(), RANDOM)
+def test_truth_of_drawn_messages_is_that_of_each_message(drawn: Drawn, random: Random) -> None:
+    values = values_of(drawn)
+    for _ in range(4):
+        condition = condition_on(values, random)
+        compared(truth(condition, drawn.table, EXTRACTOR), condition, values)
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(drawn_tables(PLAIN), RANDOM)
+def test_truth_is_sure_where_columns_hold_the_whole_value(drawn: Drawn, random: Random) -> None:
+    values = values_of(drawn)
+    for _ in range(4):
+        condition = condition_on(values, random)
+        assert compared(truth(condition, drawn.table, EXTRACTOR), condition, values) == 0
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(drawn_tables(), st.sampled_from([0.0, 1e-4, 0.1]), RANDOM)
+def test_truth_of_rounded_columns_is_unsure_rather_than_wrong(
+    drawn: Drawn, step: float, random: Random
+) -> None:
+    values = values_of(drawn)
+    table = stored(drawn.table, step)
+    for _ in range(4):
+        condition = condition_on(values, random)
+        compared(truth(condition, table, EXTRACTOR), condition, values)
+
+
+@cache
+def shared_samples(folder: str) -> list[tuple[Table, list[JsonValue]]]:
+    """Some rows of each topic and type in the shared bags, and their extracted values."""
+    reader = Rosbag2Reader()
+    seen: set[tuple[str, str, bytes]] = set()
+    found = []
+    for path in sorted([*(BAGS / folder).rglob("*.mcap"), *(BAGS / folder).rglob("*.db3")]):
+        try:
+            tables = [table for group in decoded(reader, path) for table in group]
+        except BagError:
+            continue
+        for table in tables:
+            channel = table.channel
+            key = (channel.topic, channel.type, channel.schema.text)
+            if key in seen or "" in table.left_out or not len(table):
+                continue
+            seen.add(key)
+            found.append(sampled(reader, path, table))
+    return found
+
+
+def sampled(reader: Rosbag2Reader, path: Path, table: Table) -> tuple[Table, list[JsonValue]]:
+    rows = np.unique(np.linspace(0, len(table) - 1, SAMPLED_ROWS).astype(np.int64))
+    records = [
+        record
+        for record in reader.records(path, [table.channel.topic], TimeWindow.everything())
+        if record.channel.schema == table.channel.schema
+    ]
+    if table.undecodable:
+        records = [record for record in records if is_decodable(reader, record)]
+    assert len(records) == len(table)
+    messages = [reader.decode(records[row]) for row in rows]
+    return table.rows(rows), [EXTRACTOR.exact(each, table.channel.type) for each in messages]
+
+
+def is_decodable(reader: Rosbag2Reader, record: Record) -> bool:
+    try:
+        reader.decode(record)
+    except UndecodableError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [
+        pytest.param("recorded", marks=needs_recorded),
+        pytest.param("real", marks=needs_real),
+    ],
+)
+def test_truth_of_shared_bags_is_that_of_each_message(folder: str) -> None:
+    random = Random(folder)
+    unsure = rows = 0
+    for table, values in shared_samples(folder):
+        for _ in range(200 if LONG else 4):
+            condition = condition_on(values, random)
+            found = truth(condition, table, EXTRACTOR)
+            unsure += compared(found, condition, values)
+            rows += len(values)
+    # Long arrays alone (scans, covariances) are not in the columns.
+    assert 0 < unsure < rows / 10
+
+
+def detections(*scored: tuple[str, float]) -> object:
+    found = [
+        make(
+            "ros2_vision_interfaces/msg/VisionDetection",
+            label=label,
+            score=score,
+            point=make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=0.0),
+            bbox=np.zeros(4, np.int32),
+        )
+        for label, score in scored
+    ]
+    header = make("std_msgs/msg/Header", stamp=stamp(0), frame_id="map")
+    return make(VISION, header=header, skill="look", detections=found)
+
+
+def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
+    found = truth(condition, drawn_of(type_name, messages).table, EXTRACTOR)
+    assert not found.unsure.any()
+    return [bool(each) for each in found.met]
+
+
+@pytest.mark.parametrize(
+    ("value", "condition", "expected"),
+    [
+        (2**53 + 1, Equals(2**53 + 1), True),
+        (2**53 + 1, Equals(float(2**53)), False),
+        (2**53 + 1, Beyond(float(2**53), above=True), True),
+        (2**63 - 1, Beyond(2.0**63, above=False), True),
+        (2**63 - 1, Beyond(10**400, above=False), True),
+        (-5, Beyond(-(10**400), above=True), True),
+        (1, Equals(True), True),
+        (1, Equals("1"), True),
+        (3, Beyond(2.5, above=True), True),
+        (3, Beyond(3.0, above=True), False),
+        (3, Equals(math.inf), False),
+    ],
+)
+def test_integers_are_compared_exactly(
+    value: int, condition: Equals | Beyond, expected: bool
+) -> None:
+    kind = "std_msgs/msg/Int64"
+    assert met(Condition(condition, "value"), kind, make(kind, data=value)) == [expected]
+
+
+def test_a_float32_equals_the_number_that_was_meant() -> None:
+    kind = "std_msgs/msg/Float32"
+    messages = [make(kind, data=number) for number in (0.1, 0.2, math.nan, math.inf)]
+    assert met(Condition(Equals(0.1)), kind, *messages) == [True, False, False, False]
+    above = Condition(Beyond(float(np.float32(0.1)), above=True), "value")
+    assert met(above, kind, *messages) == [False, True, False, True]
+
+
+def test_texts_are_found_without_regard_to_case() -> None:
+    messages = [make(STRING, data=text) for text in ("Die STRASSE", "die Gasse", "")]
+    assert met(Condition(Contains("straße")), STRING, *messages) == [True, False, False]
+
+
+def test_detections_below_a_score_do_not_count() -> None:
+    messages = [detections(("cup", 0.9)), detections(("cup", 0.2), ("fork", 0.9)), detections()]
+    field = "detections.label"
+    assert met(Condition(Equals("cup"), field), VISION, *messages) == [True, True, False]
+    assert met(Condition(Equals("cup"), field, 0.5), VISION, *messages) == [True, False, False]
+    near = NearPosition(1.0, 2.0, 0.0, 0.0)
+    assert met(Condition(near, min_score=0.95), VISION, *messages) == [False, False, False]
+    assert met(Condition(near, min_score=0.9), VISION, *messages) == [True, True, False]
+
+
+def test_a_place_in_a_list_selects_one_element_from_either_end() -> None:
+    messages = [detections(("cup", 0.9), ("fork", 0.8)), detections(("fork", 0.7))]
+    for place, expected in (("0", [False, True]), ("-1", [True, True]), ("1", [True, False])):
+        condition = Condition(Equals("fork"), f"detections.{place}.label")
+        assert met(condition, VISION, *messages) == expected
+
+
+def test_detections_below_a_score_do_not_count_in_texts_that_are_json() -> None:
+    texts = (
+        '[{"label": "cup", "score": 0.2}]',
+        '[{"label": "cup", "score": 0.8}]',
+        '[{"label": "fork", "score": 0.2}]',
+        "a cup",
+    )
+    messages = [make(STRING, data=text) for text in texts]
+    condition = Condition(Contains("cup"), min_score=0.5)
+    assert met(condition, STRING, *messages) == [False, True, False, True]
+    # The text that is left has a null, which the message never had.
+    assert met(Condition(Contains("null"), min_score=0.5), STRING, *messages) == [False] * 4
+
+
+def test_the_best_of_several_hypotheses_names_a_detection() -> None:
+    kind = "vision_msgs/msg/Detection2DArray"
+    random = Random(1)
+    whole = message(kind, random, is_odd=False)
+    while not getattr(whole, "detections") or len(whole.detections[0].results) < 2:  # type: ignore[attr-defined]  # noqa: B009
+        whole = message(kind, random, is_odd=False)
+    del whole.detections[1:], whole.detections[0].results[2:]  # type: ignore[attr-defined]
+    for result, label, score in zip(
+        whole.detections[0].results,  # type: ignore[attr-defined]
+        ("cup", "fork"),
+        (0.3, 0.8),
+        strict=True,
+    ):
+        result.hypothesis.class_id, result.hypothesis.score = label, score
+    for least, expected in ((0.1, [True, True]), (0.5, [False, True]), (0.9, [False, False])):
+        found = [
+            met(Condition(Contains(label), "detections.results", least), kind, whole)[0]
+            for label in ("cup", "fork")
+        ]
+        assert found == expected
+
+
+def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
+    kind = "vision_msgs/msg/Detection2DArray"
+    random = Random(2)
+    while True:
+        whole = message(kind, random, is_odd=False)
+        found = [each for each in whole.detections if each.results]  # type: ignore[attr-defined]
+        if found:
+            break
+    whole.detections[:] = found[:1]  # type: ignore[attr-defined]
+    for result in found[0].results:
+        result.hypothesis.class_id, result.hypothesis.score = "", 0.1
+    condition = Condition(Beyond(-1e300, above=True), "detections.results.pose", 0.5)
+    table = drawn_of(kind, [whole]).table
+    assert truth(condition, table, EXTRACTOR).unsure.all()
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        Condition(Contains("zebra")),
+        Condition(Equals("zebra"), "detections.label"),
+        Condition(Contains("zebra"), min_score=0.5),
+        Condition(Beyond(5.0, above=True), "detections.score"),
+        Condition(Beyond(-1.0, above=False), "detections.0.score"),
+        Condition(Equals(7.5), "detections.point.x"),
+        Condition(NearPosition(50.0, 0.0, None, 1.0)),
+    ],
+)
+def test_a_column_that_its_zone_rules_out_is_not_unpacked(condition: Condition) -> None:
+    table = stored(drawn_of(VISION, [detections(("cup", 0.9)), detections()]).table, 0.0)
+    found = truth(condition, table, EXTRACTOR)
+    assert found.is_none
+    assert not table.unpacked
+    assert not found.met.any()
+    assert not found.unsure.any()
+    assert found.met.size == found.unsure.size == 2
+
+
+def test_only_the_columns_that_may_match_are_unpacked() -> None:
+    table = stored(drawn_of(VISION, [detections(("cup", 0.9))]).table, 0.0)
+    assert truth(Condition(Contains("cup")), table, EXTRACTOR).met.tolist() == [True]
+    assert table.unpacked == {"detections.label"}
+
+
+def test_a_limit_within_the_error_of_a_number_is_unsure() -> None:
+    kind = "std_msgs/msg/Float64"
+    drawn = drawn_of(kind, [make(kind, data=number) for number in (0.96, 1.04, 2.0)])
+    table = stored(drawn.table, 0.1, zones=False)
+    found = truth(Condition(Beyond(1.01, above=True), "value"), table, EXTRACTOR)
+    assert found.met.tolist() == [False, False, True]
+    assert found.unsure.tolist() == [True, True, False]
+
+
+def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:
+    kind = "sensor_msgs/msg/LaserScan"
+    scan = message(kind, Random(3), is_odd=False)
+    scan.ranges = np.linspace(1, 2, 100, dtype=np.float32)  # type: ignore[attr-defined]
+    table = drawn_of(kind, [scan]).table
+    near = truth(Condition(Beyond(1.5, above=False), "ranges"), table, EXTRACTOR)
+    assert near.met.all()
+    assert truth(Condition(Equals(3), "ranges"), table, EXTRACTOR).is_none
+    assert truth(Condition(Equals(1.5), "ranges"), table, EXTRACTOR).unsure.all()
+    assert truth(Condition(Beyond(1.5, above=False), "ranges.7"), table, EXTRACTOR).unsure.all()
+
+
+def test_one_tester_answers_for_tables_of_several_types() -> None:
+    tester = ColumnCondition(Condition(Contains("cup")), EXTRACTOR)
+    assert tester.truth(drawn_of(VISION, [detections(("cup", 1.0))]).table).met.all()
+    assert tester.truth(drawn_of(STRING, [make(STRING, data="Cup")]).table).met.all()
+    assert tester.truth(drawn_of(VISION, [detections(("fork", 1.0))]).table).is_none
+
+
+def test_a_table_without_a_definition_is_unsure() -> None:
+    table = drawn_of(STRING, [make(STRING, data="cup")]).table
+    assert isinstance(table.columns["data"], Texts)
+    object.__setattr__(table, "definition", None)
+    assert truth(Condition(Contains("cup")), table, EXTRACTOR).unsure.all()
