@@ -162,17 +162,12 @@ class Filling:
         first = next(groups, [])
         second = next(groups, None)
         key, is_current = self._key(bag), partial(self._may_be_stored, bag)
-        definition_of = self._reader.definition
         if second is None and bag.end - bag.start <= LONG_NS:
             tables = _sound(bag, first)
-            return self.store.put(
-                key, bag, tables, definition_of, hashed=hashed, is_current=is_current
-            )
+            return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
         every = (_sound(bag, tables) for tables in chain(begin, groups))
-        return self.store.put_long(
-            key, bag, every, definition_of, hashed=hashed, is_current=is_current
-        )
+        return self.store.put_long(key, bag, every, hashed=hashed, is_current=is_current)
 
     def _may_be_stored(self, bag: BagFile) -> bool:
         """Returns whether a bag is as the index found it, for a while now, and none of it goes."""

@@ -546,15 +546,16 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
     if name != "line":
         np.cumsum(numbers, out=numbers)
     # Differences wrap around, as those of the packed numbers did.
-    lift: Numbers = np.subtract(_wrapped(least), numbers.min(keepdims=True))
-    found: Numbers = np.add(numbers, lift, out=numbers)
-    return found
+    lowest: IntArray = numbers.min(keepdims=True)
+    numbers += np.subtract(_wrapped(least), lowest)
+    return numbers
 
 
 def _signed(numbers: Numbers) -> Numbers:
     """0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
-    signs = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
-    return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
+    signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
+    found: Numbers = np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
+    return found
 
 
 def _wrapped(number: int) -> np.int64:

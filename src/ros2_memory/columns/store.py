@@ -51,7 +51,7 @@ LONG_NS: Final[Ns] = 2 * PART_NS
 
 TABLES: Final = Tables(
     version=FORMAT,
-    names=("bag", "topic", "split", "part", "part_column", "deletion"),
+    names=("bag", "topic", "definition", "split", "part", "part_column", "deletion"),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
     pragmas=("page_size = 8192", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
     statements="""
@@ -59,9 +59,11 @@ CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQU
   size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
   hashed INTEGER NOT NULL, definitions TEXT NOT NULL);
-CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,
-  encoding TEXT NOT NULL, latched INTEGER NOT NULL, layout TEXT NOT NULL,
-  UNIQUE (name, type, encoding, latched, layout));
+CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, encoding TEXT NOT NULL,
+  latched INTEGER NOT NULL, definition INTEGER NOT NULL, layout TEXT NOT NULL,
+  UNIQUE (name, encoding, latched, definition, layout));
+CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TEXT NOT NULL,
+  text BLOB NOT NULL, UNIQUE (type, encoding, text));
 CREATE TABLE split (bag INTEGER PRIMARY KEY, tables BLOB NOT NULL);
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
@@ -144,6 +146,7 @@ class ColumnStore(Database):
         paths: where the file may lie; see `Database`.
         sources: other files that may be copied to a path that has none yet; only read.
         waits_for: a directory; until it exists, nothing is opened or made.
+        definition_of: returns the definition of a channel, as `BagReader.definition`.
         definitions: tells the configured message definitions apart. Bags with messages that these
             could not decode are stored only for them.
     """
@@ -151,12 +154,14 @@ class ColumnStore(Database):
     def __init__(
         self,
         paths: Sequence[Path] | Callable[[], Sequence[Path]],
+        definition_of: DefinitionOf,
         *,
         definitions: str = "",
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
     ) -> None:
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
+        self._definition_of = definition_of
         self._definitions = definitions
         self._topics: dict[int, Topic] = {}
 
@@ -226,8 +231,17 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> dict[int, Topic]:
             known = self._topics
-            rows = connection.execute("SELECT * FROM topic WHERE id > ?", (max(known, default=0),))
-            added = {row[0]: _topic(*row[1:]) for row in rows}
+            rows = connection.execute(
+                "SELECT topic.id, name, topic.encoding, latched, layout, type,"
+                " definition.encoding, text"
+                " FROM topic JOIN definition ON definition.id = definition WHERE topic.id > ?",
+                (max(known, default=0),),
+            )
+            added: dict[int, Topic] = {}
+            for number, name, encoding, latched, layout, *schema in rows:
+                channel = Channel(name, encoding, Schema(*schema), bool(latched))
+                definition = self._definition_of(channel)
+                added[number] = Topic(channel, Layout.from_json(layout), definition)
             self._topics = {**known, **added} if added else known
             return self._topics
 
@@ -308,7 +322,6 @@ class ColumnStore(Database):
         key: BagKey,
         bag: BagFile,
         tables: Sequence[Table],
-        definition_of: DefinitionOf,
         *,
         hashed: bool,
         is_current: Callable[[], bool] = lambda: True,
@@ -319,7 +332,6 @@ class ColumnStore(Database):
             key: of the bag.
             bag: the bag, for its times.
             tables: all of its messages.
-            definition_of: returns the definition of a channel, as `BagReader.definition`.
             hashed: whether all tables have the hashes of their payloads.
             is_current: whether the bag may be stored, asked once nobody else can write.
         """
@@ -333,9 +345,7 @@ class ColumnStore(Database):
             _delete(connection, [key.path])
             definitions = self._definitions if _lacks_definitions(tables) else ""
             number = _insert_bag(connection, key, bag, definitions, hashed=hashed)
-            entries = [
-                Entry(*_topic_of(connection, table, definition_of), table) for table in tables
-            ]
+            entries = [Entry(*_topic_of(connection, table), table) for table in tables]
             connection.execute(
                 "INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries, places=False))
             )
@@ -347,7 +357,6 @@ class ColumnStore(Database):
         key: BagKey,
         bag: BagFile,
         groups: Iterable[Sequence[Table]],
-        definition_of: DefinitionOf,
         *,
         hashed: bool,
         is_current: Callable[[], bool] = lambda: True,
@@ -379,8 +388,7 @@ class ColumnStore(Database):
         for tables in groups:
             lacks_definitions |= _lacks_definitions(tables)
             parts = [part for table in tables if len(table) for part in _in_parts(table)]
-            insert = partial(_insert_rows, parts=parts, bag=number, definition_of=definition_of)
-            if not self.write(insert):
+            if not self.write(partial(_insert_rows, parts=parts, bag=number)):
                 return False
         return self.write(end) and stored
 
@@ -455,11 +463,9 @@ def _in_parts(table: Table) -> Iterator[Table]:
         yield table.rows(rows)
 
 
-def _insert_rows(
-    connection: sqlite3.Connection, parts: Sequence[Table], bag: int, definition_of: DefinitionOf
-) -> None:
+def _insert_rows(connection: sqlite3.Connection, parts: Sequence[Table], bag: int) -> None:
     for table in parts:
-        topic, layout = _topic_of(connection, table, definition_of)
+        topic, layout = _topic_of(connection, table)
         part = pack_rows(layout, table, np.full(len(table), bag, np.int64))
         _insert_part(connection, topic, part)
 
@@ -513,30 +519,41 @@ def _storable(bound: int | float | None) -> int | float | None:  # noqa: PYI041 
     return bound
 
 
-def _topic_of(
-    connection: sqlite3.Connection, table: Table, definition_of: DefinitionOf
-) -> tuple[int, Layout]:
+def _topic_of(connection: sqlite3.Connection, table: Table) -> tuple[int, Layout]:
     """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
-    channel = table.channel
-    layout = Layout.of(table, definition_of(channel))
-    named = (channel.topic, channel.type, channel.encoding, channel.latched, layout.to_json())
-    row = connection.execute(
-        "SELECT id FROM topic"
-        " WHERE name = ? AND type = ? AND encoding = ? AND latched = ? AND layout = ?",
-        named,
-    ).fetchone()
-    if row is None:
-        cursor = connection.execute(
-            "INSERT INTO topic (name, type, encoding, latched, layout) VALUES (?, ?, ?, ?, ?)",
-            named,
-        )
-        return int(cursor.lastrowid or 0), layout
-    return int(row[0]), layout
+    channel, layout = table.channel, Layout.of(table, table.definition)
+    schema = channel.schema
+    definition = _number_of(
+        connection,
+        "definition",
+        {"type": schema.name, "encoding": schema.encoding, "text": schema.text},
+    )
+    topic = _number_of(
+        connection,
+        "topic",
+        {
+            "name": channel.topic,
+            "encoding": channel.encoding,
+            "latched": channel.latched,
+            "definition": definition,
+            "layout": layout.to_json(),
+        },
+    )
+    return topic, layout
 
 
-def _topic(name: str, type_name: str, encoding: str, latched: int, layout: str) -> Topic:
-    channel = Channel(name, encoding, Schema(type_name), bool(latched))
-    return Topic(channel, Layout.from_json(layout))
+def _number_of(
+    connection: sqlite3.Connection, table: str, values: Mapping[str, str | bytes | int]
+) -> int:
+    """Returns the id of the row with these values, which is inserted if it is new."""
+    given = tuple(values.values())
+    where = " AND ".join(f"{name} = ?" for name in values)
+    row = connection.execute(f"SELECT id FROM {table} WHERE {where}", given).fetchone()
+    if row is not None:
+        return int(row[0])
+    names, marks = ", ".join(values), ", ".join("?" * len(given))
+    cursor = connection.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", given)
+    return int(cursor.lastrowid or 0)
 
 
 def _delete(connection: sqlite3.Connection, paths: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
     from ros2_memory.columns.layout import Layout
-    from ros2_memory.storage.base import Channel, IntArray
+    from ros2_memory.storage.base import Channel, Definition, IntArray
 
 V = TypeVar("V")
 
@@ -99,6 +99,7 @@ def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:
         whole.payload_hashes,
         whole.undecodable,
         whole.undecodable_reason,
+        whole.definition,
         number=tables[0].number,
         known=known,
     )
@@ -121,6 +122,7 @@ class Topic(NamedTuple):
 
     channel: Channel
     layout: Layout
+    definition: Definition | None = None
 
 
 class Times(NamedTuple):
@@ -170,6 +172,7 @@ def lazy_table(
         elements_in(layout, ""),
         layout.left_out,
         times.payload_hashes,
+        definition=topic.definition,
         number=number,
         known=lambda path: known(path.rstrip(".")),
     )

@@ -59,6 +59,16 @@ class Zone(NamedTuple):
     nulls: int = 0
     words: str | None = None
 
+    @property
+    def low(self) -> float:
+        """The least value; infinity where there is none."""
+        return math.inf if self.least is None else self.least
+
+    @property
+    def high(self) -> float:
+        """The greatest value; minus infinity where there is none."""
+        return -math.inf if self.greatest is None else self.greatest
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texts:
@@ -101,23 +111,6 @@ class Texts:
 
 
 Column: TypeAlias = "Numbers | Texts"
-
-
-class Zone(NamedTuple):
-    """What is known of a column without unpacking it.
-
-    Attributes:
-        least: of the values that are not NaN; infinity where there is none. False is 0.
-        greatest: likewise; minus infinity where there is none.
-        nulls: how many values are NaN.
-        words: the casefolded distinct texts of a column of strings, joined by line breaks; None of
-            any other column, and where there are too many.
-    """
-
-    least: float = math.inf
-    greatest: float = -math.inf
-    nulls: int = 0
-    words: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,20 +177,6 @@ class Table:
     undecodable: int = 0
     undecodable_reason: str = ""
     definition: Definition | None = None
-
-    def error(self, path: str) -> float:
-        """Returns the most by which a value of a column is off; 0 where it is exact.
-
-        A column of elements is named as in `detections.score`, that of a list of texts or numbers
-        as the list.
-        """
-        del path
-        return 0.0
-
-    def zone(self, path: str) -> Zone | None:
-        """Returns what is known of a column, named likewise, before it is unpacked."""
-        del path
-        return None
 
     def __len__(self) -> int:
         """Returns the number of messages."""

@@ -87,7 +87,7 @@ class Truth:
 
 
 def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
-    """Returns which rows of a table meet a condition; of several tables use one `ColumnCondition`."""
+    """Returns which rows of a table meet a condition; for several use one `ColumnCondition`."""
     return ColumnCondition(condition, extractor).truth(table)
 
 
@@ -243,13 +243,13 @@ class _LeafTest:
             return zone.words is None or (self._folded or "") in zone.words
         if self.leaf.kind is Kind.BOOLEAN:
             return any(
-                zone.least <= value <= zone.greatest and self.passes(value=value)
+                zone.low <= value <= zone.high and self.passes(value=value)
                 for value in (False, True)
             )
         if isinstance(self.test, Beyond):
             limit = self.test.limit
-            return zone.greatest > limit if self.test.above else zone.least < limit
-        return any(zone.least <= number <= zone.greatest for number in self.numbers)
+            return zone.high > limit if self.test.above else zone.low < limit
+        return any(zone.low <= number <= zone.high for number in self.numbers)
 
     def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level pass; None where the table cannot say."""
@@ -413,8 +413,7 @@ class _PlaceTest:
         for leaf, center in zip(self.leaves, self._center, strict=False):
             zone = values.zone(leaf)
             if zone is not None and not (
-                _as_float(zone.least) - center <= reach
-                and center - _as_float(zone.greatest) <= reach
+                _as_float(zone.low) - center <= reach and center - _as_float(zone.high) <= reach
             ):
                 return False
         return True

@@ -245,7 +245,7 @@ class Values:
         zone = self.table.zone(leaf.level.full(leaf.sources[0]))
         if zone is None or leaf.made is not Made.SECONDS:
             return zone
-        return Zone(zone.least / NS_PER_S, zone.greatest / NS_PER_S, zone.nulls)
+        return Zone(zone.low / NS_PER_S, zone.high / NS_PER_S, zone.nulls)
 
     def _turned(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
         """Returns one of the angles (degrees) of quaternions."""

@@ -93,7 +93,13 @@ class LakeRobot:
         # Nothing is recorded here, and nothing deleted.
         own = replace(limits, kept=None, recording="", screened=False)
         self.memory = Memory(
-            self._index, self._reader, LakeExtractor(extractor), clock, own, recall, stated_in
+            self._index,
+            self._reader,
+            LakeExtractor(extractor),
+            clock,
+            own,
+            recall,
+            stated=stated_in,
         )
 
     @property
