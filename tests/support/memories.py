@@ -17,6 +17,7 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.columns.scan import Scanner
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
@@ -78,7 +79,9 @@ def memory_of(
         include_active=include_active,
         setting=setting,
     )
-    return Memory(index, reader, extractor(), timed, limits or QuerySettings())
+    settings = limits or QuerySettings()
+    columns = Scanner(None, bag_dir)
+    return Memory(index, reader, extractor(), timed, settings, columns=columns)
 
 
 SCHEMA_FILE = Path(__file__).resolve().parents[2] / "config" / "message_schemas.yaml"

@@ -179,6 +179,11 @@ class Rows:
         """The recording that the rows are of."""
         return self._unit.recording
 
+    @property
+    def last(self) -> Ns:
+        """A log time (ns) that none of the rows is later than."""
+        return self._unit.last
+
     def bag(self, row: int) -> BagFile:
         """Returns the bag of one of the rows that count."""
         at = row if self.index is None else int(self.index[row])

@@ -34,6 +34,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.history.candidates import CandidateRows
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
@@ -291,6 +292,8 @@ class ReverseSearch:
             NoDataError: no message could be decoded.
             QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
+        if self._view.memory.columns is not None:
+            return self._newest_by_columns(until)
         candidates = self.candidates(until)
         noted_before = self._view.notes.keys()
         searched_to: Ns | None = None
@@ -313,7 +316,28 @@ class ReverseSearch:
         self.close(candidates, TimeWindow(MIN_NS, until), found=False)
         return None
 
-    def close(self, candidates: CandidateBags, window: TimeWindow, *, found: bool) -> None:
+    def _newest_by_columns(self, until: Ns) -> StoredMessage | None:
+        """Does as `newest`: reads the messages whose columns may match, until one does."""
+        candidates = CandidateRows(self._view, self.topics, self.condition, until)
+        noted_before = self._view.notes.keys()
+        try:
+            for part in candidates.windows():
+                messages = self._view.stream.messages(part.topics, part.window, newest_first=True)
+                for found in filter(self.matches, messages):
+                    self._view.notes.retract_before(found.time, noted_before)
+                    self._view.stream.find_first_copy(found)
+                    self.note_undecodable()
+                    return found
+        except QueryTimeoutError as error:
+            if candidates.reached == until:
+                raise
+            raise out_of_time(self._view, candidates.reached) from error
+        self.close(candidates, TimeWindow(MIN_NS, until), found=False)
+        return None
+
+    def close(
+        self, candidates: CandidateBags | CandidateRows, window: TimeWindow, *, found: bool
+    ) -> None:
         """Ends a search that looked everywhere in a window, and notes what could not be tested.
 
         Raises:
