@@ -68,7 +68,8 @@ class Asked:
         decode: decodes a topic of a bag that is not stored.
         shared: the half-open spans in which different recordings may hold copies, in order.
         relatches: whether recordings may have received a message again, as of a latched topic.
-        check: is called before each table; raises where the call's time is over.
+        check: is called before each table with a log time that what is left does not lie behind
+            (with `newest_first`: is not later than); raises where the call's time is over.
     """
 
     topic: str
@@ -77,7 +78,7 @@ class Asked:
     decode: Decode
     shared: Sequence[tuple[Ns, Ns]] = ()
     relatches: bool = False
-    check: Callable[[], None] = lambda: None
+    check: Callable[[Ns], None] = lambda _: None
 
 
 class _Source(NamedTuple):
@@ -265,7 +266,7 @@ class _Scan:
         window = self._asked.window
         for source in sources:
             if window.overlaps(source.first, source.last):
-                self._asked.check()
+                self._asked.check(source.last if newest_first else source.first)
                 for unit in self._units(source):
                     found = self._counting(unit)
                     if found is not None:
@@ -399,7 +400,6 @@ class _Scan:
         stop = bisect_right(self._sources, window.stop - 1, key=lambda source: source.first)
         for source in self._sources[:stop]:
             if source.last >= window.start:
-                self._asked.check()
                 yield from self._units(source)
 
     def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:

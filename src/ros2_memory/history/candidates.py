@@ -38,13 +38,13 @@ class CandidateRows:
     Attributes:
         condition: what is searched for.
         ruled_out: whether a message was left out, because its columns do not meet the condition.
-        reached: the log time down to which all has been looked at, and what may match yielded.
     """
 
     def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
         self.condition = condition
         self.ruled_out = False
-        self.reached = until
+        self._left: dict[str, Ns] = dict.fromkeys(topics, until)
+        self._ready: list[tuple[Ns, int]] = []
         self._view = view
         self._topics = topics
         self._until = until
@@ -62,7 +62,12 @@ class CandidateRows:
             group.append((time, topic))
         if group:
             yield _together(group)
-        self.reached = MIN_NS
+
+    @property
+    def reached(self) -> Ns:
+        """The log time from which on all has been looked at, and what may match was yielded."""
+        waiting = [-time + 1 for time, _ in self._ready]
+        return max([*self._left.values(), *waiting], default=MIN_NS)
 
     def _times(self) -> Iterator[tuple[Ns, str]]:
         """Yields the log times of messages that may match, newest first, each once."""
@@ -75,12 +80,11 @@ class CandidateRows:
             for last, times in [found]
         ]
         heapq.heapify(waiting)
-        ready: list[tuple[Ns, int]] = []
+        ready = self._ready
         before: tuple[Ns, int] | None = None
         while waiting or ready:
             while waiting and (not ready or waiting[0][0] <= ready[0][0]):
-                newest, nth, times = heapq.heappop(waiting)
-                self.reached = min(self.reached, 1 - newest)
+                _, nth, times = heapq.heappop(waiting)
                 for time in times.tolist():
                     heapq.heappush(ready, (-time, nth))
                 if (found := next(sources[nth], None)) is not None:
@@ -94,8 +98,13 @@ class CandidateRows:
     def _of_topic(self, topic: str) -> Iterator[tuple[Ns, IntArray]]:
         """Yields for each table of a topic its last log time, and when messages may match."""
         window = TimeWindow(MIN_NS, self._until)
-        for rows in scan(self._view, topic, window, newest_first=True):
+
+        def reached(last: Ns) -> None:
+            self._left[topic] = min(last + 1, self._until)
+
+        for rows in scan(self._view, topic, window, newest_first=True, reached=reached):
             yield rows.last, self._candidates(rows)
+        self._left[topic] = MIN_NS
 
     def _candidates(self, rows: Rows) -> IntArray:
         truth = self._test.truth(rows.table)
