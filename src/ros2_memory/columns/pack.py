@@ -551,8 +551,9 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
 
 def _signed(numbers: Numbers) -> Numbers:
     """0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
-    signs = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
-    return np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
+    signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
+    halves: Numbers = np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
+    return halves
 
 
 def _wrapped(number: int) -> np.int64:
