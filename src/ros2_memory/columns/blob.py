@@ -9,7 +9,7 @@ compress best)::
     2       t, the number of tables
     t times:
       4     number of the topic, as the caller has it
-      1     which of these it has: 1 publish times, 2 places, 4 hashes of payloads
+      1     which of these it has: 1 publish times, 2 places (else all are 0), 4 hashes of payloads
       2     p, the number of its packed columns
       2     s, the number of its sequences, also of those within sequences
       4     rows
@@ -56,7 +56,7 @@ from ros2_memory.columns.stored import StoredTable, Times, Topic, lazy_table
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Zone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -76,7 +76,7 @@ class Entry(NamedTuple):
     table: Table
 
 
-def pack_tables(entries: Iterable[Entry], *, places: bool = True) -> bytes:
+def pack_tables(entries: Sequence[Entry], *, places: bool = False) -> bytes:
     """Returns the tables as one compressed blob.
 
     Publish times are packed where there are hashes, with which they tell copies of a message.
@@ -84,26 +84,30 @@ def pack_tables(entries: Iterable[Entry], *, places: bool = True) -> bytes:
 
     Args:
         entries: the tables, in any order.
-        places: whether places are packed; without them they come back as 0, 1, 2.
+        places: whether places are packed. Without them messages still have an order: they come back
+            as 0, 1, 2 among the messages of all these tables that have one log time.
 
     Raises:
         ValueError: a table has other columns than its layout.
     """
     heads: list[bytes] = []
     columns: list[_Source] = []
-    for topic, layout, table in entries:
+    tables = [entry.table for entry in entries]
+    orders = [table.places for table in tables] if places else _order_of_ties(tables)
+    for (topic, layout, table), order in zip(entries, orders, strict=True):
+        if not layout.fits(table):
+            raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
         published = table.payload_hashes is not None
-        flags = _PUBLISHED * published | _PLACES * places
-        first = [table.log_times]
+        flags, first = 0, [table.log_times]
         if published:
+            flags |= _PUBLISHED
             first = [table.log_times - table.publish_times, table.publish_times]
-        if places:
-            first.append(table.places)
+        if order is not None:
+            flags |= _PLACES
+            first.append(order)
         if table.payload_hashes is not None:
             flags |= _HASHES
             first.append(table.payload_hashes)
-        if not layout.fits(table):
-            raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
         sources = [*(_Source(times) for times in first), *_sources(layout, table)]
         counts = [len(one.column) for one in sources[len(first) :] if one.are_owners]
         sizes = (len(sources), len(counts), len(table), *counts)
@@ -112,6 +116,24 @@ def pack_tables(entries: Iterable[Entry], *, places: bool = True) -> bytes:
     packs = _packed(columns)
     head = struct.pack("<BH", FORMAT, len(heads)) + b"".join(heads)
     return compressed(head + _directory(packs) + b"".join(packed.data for packed in packs))
+
+
+def _order_of_ties(tables: Sequence[Table]) -> list[IntArray | None]:
+    """For each table the places of its messages among those of one log time; None if all are 0."""
+    if not tables:
+        return []
+    log_times = np.concatenate([table.log_times for table in tables])
+    places = np.concatenate([table.places for table in tables])
+    order = np.lexsort((places, log_times))
+    first = np.ones(len(order), np.bool_)
+    first[1:] = np.diff(log_times[order]) != 0
+    if first.all():
+        return [None] * len(tables)
+    nth = np.arange(len(order))
+    ranks = np.empty_like(nth)
+    ranks[order] = nth - np.maximum.accumulate(np.where(first, nth, 0))
+    parts = np.split(ranks, np.cumsum([len(table) for table in tables])[:-1])
+    return [part if part.any() else None for part in parts]
 
 
 def pack_table(layout: Layout, table: Table) -> dict[str, Packed]:
@@ -302,7 +324,7 @@ def _table(
     kept = Times(
         log_times,
         others.get(_PUBLISHED, log_times),
-        others.get(_PLACES, np.arange(head.rows)),
+        others.get(_PLACES, np.zeros(head.rows, np.int64)),
         others.get(_HASHES),
     )
     return lazy_table(head.topic, topic, kept, known, lambda path: unpacked(packed(path)))

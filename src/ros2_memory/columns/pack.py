@@ -70,7 +70,9 @@ Values = TypeVar("Values", "IntArray", "Floats")
 FORMAT: Final = 1
 """What bytes mean: to be raised with every change of what this module or `blob` writes."""
 MOST_WORDS_BYTES: Final = 4_096
-LEVEL: Final = 3
+LEVEL: Final = 4
+"""Of zstd. A blob of 10 s takes 83 us; level 3 takes 78 us and 1 % more bytes, level 12 eight times
+as long and 2 to 5 % fewer."""
 
 _ARRANGEMENTS: Final = ("flat", "line", "delta", "curve")
 _CONTAINERS: Final = ("<u1", "<u1", "<u2", "<u4", "<u4", "<u8", "<u8", "<u8", "<u8")
@@ -475,7 +477,7 @@ def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, round
 
 
 def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
-    """The columns, each arranged as its numbers are nearest to each other."""
+    """The columns, each arranged so that its numbers have the fewest bits on average."""
     lie = _InLine([column.numbers for column in columns])
     flat = np.concatenate([column.numbers for column in columns])
     flat -= lie.rows(np.array([_wrapped(column.least) for column in columns]))
@@ -487,19 +489,13 @@ def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
     delta[lie.starts] = 0
     curve = _differences(steps, lie.starts)
     curve[lie.starts + 1] = 0
-    costs = np.array(
-        [
-            lie.means(np.abs(flat - lie.rows(lie.means(flat)))),
-            lie.means(np.abs(line - lie.rows(lie.means(line)))),
-            lie.means(np.abs(delta)),
-            lie.means(np.abs(curve)),
-        ]
-    )
+    around = (flat - lie.rows(lie.means(flat)), line - lie.rows(lie.means(line)), delta, curve)
+    bits = np.array([lie.means(np.log2(2.0 * np.abs(1.0 * numbers) + 1.0)) for numbers in around])
     line -= lie.rows(np.minimum.reduceat(line, lie.starts))
     numbers = (flat, line, (delta << 1) ^ (delta >> 63), (curve << 1) ^ (curve >> 63))
     most = [np.maximum.reduceat(some.view(np.uint64), lie.starts).tolist() for some in numbers]
     found = []
-    for nth, (column, which) in enumerate(zip(columns, costs.argmin(axis=0).tolist(), strict=True)):
+    for nth, (column, which) in enumerate(zip(columns, bits.argmin(axis=0).tolist(), strict=True)):
         start, stop = int(lie.starts[nth]), int(lie.stops[nth])
         if column.greatest - column.least >= _FAR_APART:
             arrangement, data = "plain 8", _planes(flat[start:stop], 8)
@@ -554,8 +550,8 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
 def _signed(numbers: Numbers) -> Numbers:
     """0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
     signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
-    found: Numbers = np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
-    return found
+    halves: Numbers = np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
+    return halves
 
 
 def _wrapped(number: int) -> np.int64:
