@@ -17,7 +17,10 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.store import FILE as COLUMNS
+from ros2_memory.columns.store import ColumnStore
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
@@ -98,7 +101,7 @@ def shipped_extractor(max_array_length: int = 50) -> SchemaExtractor:
 
 
 def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
-    """The memory with a catalogue that knows the first `part` of the closed bags."""
+    """The memory with a catalogue and a store of the first `part` of the closed bags."""
     catalogue = Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test"))
     recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
@@ -116,7 +119,21 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
             assert catalogue.put(
                 BagKey.of(bag, bag_dir), digester.digest(bag.path, statics.of(bag))
             )
-    return replace(memory, recall=recall)
+    return replace(memory, recall=recall, columns=stored_columns(memory, bag_dir, part=part))
+
+
+def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scanner:
+    """A scanner over a store that has the first `part` of the closed bags."""
+    store = ColumnStore([bag_dir / FOLDER / COLUMNS], memory.reader.definition)
+    scanner = Scanner(store, bag_dir)
+    later = SettableClock(memory.clock.now())
+    filling = Filling(scanner, memory.reader, bag_dir, later, StoreLimits(max_share=1.0))
+    timeline = memory.index.snapshot().timeline
+    waiting = filling.waiting(timeline)[::-1]
+    for bag in waiting[: round(part * len(waiting))]:
+        filling.fill(bag, timeline)
+    filling.merge(timeline)
+    return scanner
 
 
 def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:

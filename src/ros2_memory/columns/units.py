@@ -180,6 +180,11 @@ class Rows:
         return self._unit.recording
 
     @property
+    def first(self) -> Ns:
+        """A log time (ns) that none of the rows is earlier than."""
+        return self._unit.first
+
+    @property
     def last(self) -> Ns:
         """A log time (ns) that none of the rows is later than."""
         return self._unit.last

@@ -38,11 +38,13 @@ class CandidateRows:
     Attributes:
         condition: what is searched for.
         ruled_out: whether a message was left out, because its columns do not meet the condition.
+        has_looked: whether any message was looked at.
     """
 
     def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
         self.condition = condition
         self.ruled_out = False
+        self.has_looked = False
         self._left: dict[str, Ns] = dict.fromkeys(topics, until)
         self._ready: list[tuple[Ns, int]] = []
         self._view = view
@@ -107,6 +109,7 @@ class CandidateRows:
         self._left[topic] = MIN_NS
 
     def _candidates(self, rows: Rows) -> IntArray:
+        self.has_looked = True
         truth = self._test.truth(rows.table)
         if truth.is_none:
             self.ruled_out = True

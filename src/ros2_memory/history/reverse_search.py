@@ -12,7 +12,7 @@ import re
 from collections import OrderedDict
 from itertools import chain, islice
 from threading import Lock
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.conditions import (
@@ -254,6 +254,12 @@ def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
     )
 
 
+class Searched(Protocol):
+    """What was searched; `ruled_out` says whether something in it was known to be no match."""
+
+    ruled_out: bool
+
+
 class ReverseSearch:
     """A search for one condition on the topics of a name or glob.
 
@@ -329,15 +335,13 @@ class ReverseSearch:
                     self.note_undecodable()
                     return found
         except QueryTimeoutError as error:
-            if candidates.reached == until:
+            if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
         self.close(candidates, TimeWindow(MIN_NS, until), found=False)
         return None
 
-    def close(
-        self, candidates: CandidateBags | CandidateRows, window: TimeWindow, *, found: bool
-    ) -> None:
+    def close(self, candidates: Searched, window: TimeWindow, *, found: bool) -> None:
         """Ends a search that looked everywhere in a window, and notes what could not be tested.
 
         Raises:

@@ -28,7 +28,6 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
 )
-from ros2_memory.counts.sighting_runs import known_sightings
 from ros2_memory.counts.tested import tested
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import matching_topics, require_recorded
@@ -43,6 +42,7 @@ from ros2_memory.history.transforms import connects, newest_in_session, transfor
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.insights.goals import goals_asked
+from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.pose_frames import placed, with_place
@@ -55,13 +55,13 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
-    from ros2_memory.counts.sighting_runs import KnownSightings
     from ros2_memory.counts.tested import Tested
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.history.view import View
     from ros2_memory.insights.goals import GoalRun
+    from ros2_memory.insights.sighting_search import Found
     from ros2_memory.messages.detections import Detection
     from ros2_memory.places.scope import WhileCondition
 
@@ -143,15 +143,12 @@ def find_matches(
     goals = goals_asked(view, matching_topics(view, topic), condition, scope)
     if goals is None:
         search = ReverseSearch(view, topic, condition)
-        known = None
-        if not scope.is_bounded and not any(map(view.snapshot.timeline.is_log, search.topics)):
-            known = known_sightings(
-                view, search, condition, window, limit, oldest_first=oldest_first
-            )
-        if known is None:
+        if scope.is_bounded or memory.columns is None:
             _collect(view, search, scope, collected)
         else:
-            collected.take(known)
+            enough = None if oldest_first else limit
+            is_log = view.snapshot.timeline.is_log
+            collected.take(find_runs(view, search, window, is_log, enough=enough), view)
     searched = window
     if collected.cut and collected.selected:
         searched = TimeWindow(collected.selected[-1].first, window.stop)
@@ -225,7 +222,13 @@ def read_sightings(
     goals = goals_asked(view, matching_topics(view, pattern), condition, scope)
     if goals is not None:
         return [(each.first, each.last) for each in reversed(goals)], None
-    found = _Sightings(MAX_COUNTED, view.snapshot.timeline.is_log, oldest_first=True)
+    is_log = view.snapshot.timeline.is_log
+    if view.memory.columns is not None and not scope.is_bounded:
+        search = ReverseSearch(view, pattern, condition)
+        runs = find_runs(view, search, scope.window, is_log, enough=None)
+        spans = [(run.first, run.last) for run in reversed(runs.runs)]
+        return spans, runs.searched_to
+    found = _Sightings(MAX_COUNTED, is_log, oldest_first=True)
     _collect(view, ReverseSearch(view, pattern, condition), scope, found)
     if found.count > MAX_COUNTED:
         view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
@@ -269,10 +272,7 @@ def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings)
         if not found.count:
             raise
         found.cut = True
-        view.notes.complete = False
-        view.notes.add(
-            f"the search ran out of time at {unix_text(before)}: to continue, pass that time as end"
-        )
+        _note_out_of_time(view, before)
         return
     for topic in found.open_topics():
         found.end(topic)
@@ -283,6 +283,13 @@ def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings)
         # What lies outside of a scope is not read, and may well be decodable.
         candidates.ruled_out |= scope.is_bounded
         search.close(candidates, window, found=bool(found.count))
+
+
+def _note_out_of_time(view: View, reached: Ns) -> None:
+    view.notes.complete = False
+    view.notes.add(
+        f"the search ran out of time at {unix_text(reached)}: to continue, pass that time as end"
+    )
 
 
 def _end_in_gap(view: View, found: _Sightings, gap: TimeWindow) -> None:
@@ -336,23 +343,16 @@ class _Sightings:
             matches.messages += 1
             self._open.move_to_end(topic)
 
-    def take(self, known: KnownSightings) -> None:
-        """Takes the sightings that were asked for, in order, in place of single matches."""
-        found = [
-            _Matches(
-                each.newest.record.channel.topic,
-                each.newest.time,
-                each.newest,
-                each.first,
-                each.first,
-                each.messages,
-                begun=True,
-            )
-            for each in known.sightings
-        ]
-        self._kept.extend(reversed(found) if self._oldest_first else found)
-        self.cut = known.total is None
-        self.count = len(found) + 1 if known.total is None else known.total
+    def take(self, found: Found, view: View) -> None:
+        """Takes runs of matches in place of single ones."""
+        self.cut = found.searched_to is not None
+        self.count = len(found.runs)
+        self._kept.extend(
+            _Matches(run.topic, run.last, None, run.first, run.first, run.messages, run.begun)
+            for run in found.runs
+        )
+        if found.is_over:
+            _note_out_of_time(view, found.searched_to or MIN_NS)
 
     def skip(self, found: Tested) -> None:
         """Adds a message that cannot be decoded: no match, but it ends no sighting either."""

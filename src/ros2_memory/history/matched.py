@@ -1,0 +1,210 @@
+"""Which messages of a topic meet a condition: by their columns, else by the messages themselves."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.columns.truth import ColumnCondition
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.scan import scan
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.history.reverse_search import ReverseSearch
+    from ros2_memory.history.view import View
+    from ros2_memory.storage.base import IntArray
+
+MET: Final = 1
+NOT_MET: Final = 0
+UNKNOWN: Final = 2
+"""The message cannot be decoded."""
+
+_TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
+"""Messages that the bag decides and are no farther apart are read at once."""
+
+
+class Tested(NamedTuple):
+    """Messages of a topic, ordered by log time, and which of them meet a condition.
+
+    Attributes:
+        times: log times (ns).
+        met: `MET`, `NOT_MET` or `UNKNOWN` for each.
+    """
+
+    times: IntArray
+    met: NDArray[np.uint8]
+
+
+class Block:
+    """Messages of a topic between two log times (inclusive); tested when that is asked for.
+
+    Attributes:
+        topic: its name.
+        first: no message is earlier.
+        last: none is later.
+        has_match: whether some message may meet the condition.
+    """
+
+    def __init__(
+        self, topic: str, first: Ns, last: Ns, *, has_match: bool, test: Callable[[], Tested]
+    ) -> None:
+        self.topic = topic
+        self.first = first
+        self.last = last
+        self.has_match = has_match
+        self.tested = test
+
+
+class Matching:
+    """Tests the messages of the topics of a search.
+
+    Attributes:
+        ruled_out: whether a message was seen not to match by its columns.
+    """
+
+    def __init__(self, view: View, search: ReverseSearch) -> None:
+        self.ruled_out = False
+        self._view = view
+        self._search = search
+        self._test = ColumnCondition(search.condition, view.memory.extractor)
+
+    def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
+        """Yields the messages of a topic in blocks that do not overlap, the newest block first.
+
+        Raises:
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
+        """
+        waiting: Block | None = None
+        for rows in scan(self._view, topic, window, newest_first=True):
+            block = self._block(topic, rows, window)
+            if waiting is None or block.last < waiting.first:
+                if waiting is not None:
+                    yield waiting
+                waiting = block
+                continue
+            newer, waiting = _parted(waiting, block)
+            if newer is not None:
+                yield newer
+        if waiting is not None:
+            yield waiting
+
+    def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
+        truth = self._test.truth(rows.table)
+        self.ruled_out |= truth.is_none
+        first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
+        if truth.is_none:
+            return Block(topic, first, last, has_match=False, test=lambda: _none_met(rows.times))
+        met, unsure = truth.met, truth.unsure
+        if rows.index is not None:
+            met, unsure = met[rows.index], unsure[rows.index]
+        self.ruled_out |= not (met | unsure).all()
+        test = partial(self._tested, topic, rows, met, unsure)
+        return Block(topic, first, last, has_match=bool((met | unsure).any()), test=test)
+
+    def _tested(
+        self, topic: str, rows: Rows, met: NDArray[np.bool_], unsure: NDArray[np.bool_]
+    ) -> Tested:
+        times, found = rows.times, met.astype(np.uint8)
+        undecided = np.flatnonzero(unsure)
+        if undecided.size:
+            edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
+            for some in np.split(undecided, edges):
+                found[some] = self._read(topic, times[some])
+        return Tested(times, found)
+
+    def _read(self, topic: str, times: IntArray) -> list[int]:
+        """Returns what the messages at some log times, which ascend, are found to be."""
+        window = TimeWindow(int(times[0]), int(times[-1]) + 1)
+        read: dict[Ns, list[int]] = defaultdict(list)
+        # The newest first, as a search reports what it cannot decode.
+        for each in self._view.stream.messages([topic], window, newest_first=True):
+            met = self._search.matches(each)
+            read[each.time].append(UNKNOWN if met is None else int(met))
+        # Those of one log time come in the order of the file.
+        return [read[time].pop() if read[time] else NOT_MET for time in times.tolist()]
+
+
+def _none_met(times: IntArray) -> Tested:
+    return Tested(times, np.zeros(times.size, np.uint8))
+
+
+def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
+    """Returns two blocks that overlap as those messages that are newer than both can share, if any.
+
+    And all others: what comes later in a scan is no newer than the last of `other`.
+    """
+    joined = _joined([one.tested(), other.tested()])
+    cut = int(np.searchsorted(joined.times, other.last, side="right"))
+    older = _of(one.topic, Tested(joined.times[:cut], joined.met[:cut]))
+    if cut == joined.times.size:
+        return None, older
+    return _of(one.topic, Tested(joined.times[cut:], joined.met[cut:])), older
+
+
+def _joined(parts: Sequence[Tested]) -> Tested:
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    return Tested(times[order], np.concatenate([part.met for part in parts])[order])
+
+
+def _of(topic: str, tested: Tested) -> Block:
+    first, last = int(tested.times[0]), int(tested.times[-1])
+    return Block(topic, first, last, has_match=bool(tested.met.any()), test=lambda: tested)
+
+
+class Runs(NamedTuple):
+    """Consecutive matches in a block, in order.
+
+    Attributes:
+        firsts: log time of the first match of each.
+        lasts: of the last.
+        counts: how many matches.
+        goes_back: whether an earlier match may belong to the first run.
+        goes_on: whether a later match may belong to the last run.
+        is_blank: whether it has neither a match nor a message that surely is none.
+    """
+
+    firsts: IntArray
+    lasts: IntArray
+    counts: IntArray
+    goes_back: bool
+    goes_on: bool
+    is_blank: bool
+
+
+def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
+    """Returns the runs of matches in some messages, of which there is at least one.
+
+    A run ends with a message that does not match, and where none comes for longer than
+    `silence_ns`. With `apart` each match is a run of its own.
+    """
+    times, met = tested
+    begins = np.empty(times.size, np.bool_)
+    begins[0], begins[1:] = False, np.diff(times) > silence_ns
+    # Of two matches, this differs where a message that is none, or a silence, lies between them.
+    ends = np.cumsum((met == NOT_MET) | begins)
+    rows = np.flatnonzero(met == MET)
+    blank = not rows.size and int(ends[-1]) == 0
+    if not rows.size:
+        none = np.empty(0, np.int64)
+        return Runs(none, none, none, goes_back=False, goes_on=False, is_blank=blank)
+    new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
+    starts = np.flatnonzero(new)
+    stops = np.r_[starts[1:], rows.size]
+    return Runs(
+        times[rows[starts]],
+        times[rows[stops - 1]],
+        stops - starts,
+        goes_back=not apart and int(ends[rows[0]]) == 0,
+        goes_on=not apart and ends[rows[-1]] == ends[-1],
+        is_blank=False,
+    )

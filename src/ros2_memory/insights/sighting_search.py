@@ -1,0 +1,172 @@
+"""Finds sightings: runs of matches on each topic, the newest first, over columns.
+
+A sighting is message after message of one topic that meets a condition; see `insights.sightings`.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.history.matched import Matching, Runs, runs_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.matched import Block
+    from ros2_memory.history.reverse_search import ReverseSearch
+    from ros2_memory.history.view import View
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Consecutive matches on one topic.
+
+    Attributes:
+        topic: its name.
+        first: log time of the first match.
+        last: of the last one.
+        messages: how many there are.
+        begun: whether what came before the first match is known.
+    """
+
+    topic: str
+    first: Ns
+    last: Ns
+    messages: int
+    begun: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a search found.
+
+    Attributes:
+        runs: the newest first.
+        searched_to: a log time; all that is newer was searched. None: all of the window was.
+        is_over: whether the search ended since its time was over.
+    """
+
+    runs: list[Run]
+    searched_to: Ns | None = None
+    is_over: bool = False
+
+
+class _OfTopic:
+    """The runs of one topic, from its newest block on."""
+
+    def __init__(self, topic: str, *, apart: bool) -> None:
+        self._topic = topic
+        self._apart = apart
+        self.runs: list[Run] = []
+        self._is_open = False
+        self._begins: Ns | None = None
+
+    @property
+    def closed(self) -> list[Run]:
+        """The runs to which no older match can belong."""
+        return self.runs[:-1] if self._is_open else self.runs
+
+    def add(self, block: Block) -> None:
+        """Adds the next older block."""
+        if not block.has_match and not self._is_open:
+            self._begins = block.first
+            return
+        runs = runs_of(block.tested(), SILENCE_NS, apart=self._apart)
+        is_near = self._begins is not None and self._begins - block.last <= SILENCE_NS
+        self._begins = block.first
+        if runs.is_blank:
+            self._is_open = self._is_open and is_near
+            return
+        found = self._listed(runs)
+        if self._is_open and is_near and runs.goes_on:
+            newer, older = self.runs.pop(), found.pop(0)
+            messages = newer.messages + older.messages
+            self.runs.append(replace(newer, first=older.first, messages=messages))
+        self.runs += found
+        self._is_open = bool(runs.counts.size) and runs.goes_back
+
+    def cut(self) -> list[Run]:
+        """Returns the runs, of which the oldest may have begun earlier than is known."""
+        if not self._is_open:
+            return self.runs
+        return [*self.runs[:-1], replace(self.runs[-1], begun=False)]
+
+    def _listed(self, runs: Runs) -> list[Run]:
+        """Returns the runs of a block, the newest first."""
+        rows = zip(runs.firsts.tolist(), runs.lasts.tolist(), runs.counts.tolist(), strict=True)
+        return [Run(self._topic, *row) for row in rows][::-1]
+
+
+def find_runs(
+    view: View,
+    search: ReverseSearch,
+    window: TimeWindow,
+    is_log: Callable[[str], bool],
+    *,
+    enough: int | None,
+) -> Found:
+    """Returns the runs of matches in a window, on all topics of a search.
+
+    Args:
+        view: what is searched.
+        search: which topics, and for what.
+        window: of log time.
+        is_log: whether each message of a topic is a run of its own.
+        enough: how many of the newest are wanted: the search ends when no older match can change
+            these, and there is one more. None: all of them.
+
+    Raises:
+        InvalidArgumentsError: no value of the topics can meet the condition.
+        NoDataError: none of the topics' messages can be decoded.
+        QueryTimeoutError: the call's time is over before the first match was found.
+    """
+    matching = Matching(view, search)
+    topics = {topic: _OfTopic(topic, apart=is_log(topic)) for topic in search.topics}
+    reached = window.stop
+    try:
+        for block in _blocks(matching, topics, window):
+            topics[block.topic].add(block)
+            reached = block.last
+            if enough is not None and _has_enough(topics, enough, reached):
+                search.note_undecodable(_newest_first(topics)[enough - 1].first)
+                return Found(_newest_first(topics), reached)
+    except QueryTimeoutError:
+        runs = [run for each in topics.values() for run in each.cut()]
+        if not runs:
+            raise
+        return Found(sorted(runs, key=_by_last), reached, is_over=True)
+    runs = _newest_first(topics)
+    search.close(matching, window, found=bool(runs))
+    return Found(runs)
+
+
+def _blocks(matching: Matching, topics: dict[str, _OfTopic], window: TimeWindow) -> Iterator[Block]:
+    """Returns the blocks of all topics, the newest first."""
+    sources = (matching.newest_first(topic, window) for topic in topics)
+    return heapq.merge(*sources, key=lambda block: -block.last)
+
+
+def _has_enough(topics: dict[str, _OfTopic], enough: int, reached: Ns) -> bool:
+    """Returns whether no match older than a moment can change the newest runs."""
+    if sum(len(each.runs) for each in topics.values()) <= enough:
+        return False
+    newest = _newest_first(topics)[:enough]
+    closed = {id(run) for each in topics.values() for run in each.closed}
+    return newest[-1].last >= reached and all(id(run) in closed for run in newest)
+
+
+def _newest_first(topics: dict[str, _OfTopic]) -> list[Run]:
+    if len(topics) == 1:
+        [only] = topics.values()
+        return only.runs
+    return sorted((run for each in topics.values() for run in each.runs), key=_by_last)
+
+
+def _by_last(run: Run) -> Ns:
+    return -run.last
