@@ -252,9 +252,7 @@ class Condition:
         return counted is value or self._passes(counted)
 
     def counted(self, value: JsonValue) -> JsonValue:
-        """Returns what of a value counts; see `without_low_scores`.
-
-        """
+        """Returns what of a value counts; see `without_low_scores`."""
         return value if self.min_score <= 0 else without_low_scores(value, self.least_score)
 
     @property

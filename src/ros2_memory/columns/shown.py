@@ -29,8 +29,7 @@ from ros2_memory.storage.base import SEQUENCE, Definition
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Floats, Ints, Mask
+    from ros2_memory.columns.values import Ints, Mask
     from ros2_memory.extract import SchemaExtractor
 
 MAX_LEAVES: Final = 20_000

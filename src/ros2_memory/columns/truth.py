@@ -87,7 +87,7 @@ class Truth:
 
 
 def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
-    """Returns which rows of a table meet a condition; of several tables use one `ColumnCondition`."""
+    """Returns which rows of a table meet a condition; for several tables, see `ColumnCondition`."""
     return ColumnCondition(condition, extractor).truth(table)
 
 
@@ -289,7 +289,8 @@ class _LeafTest:
             return Kept(passed, passed)
         near = np.isinf(error) | np.zeros(len(column), np.bool_)
         for bound in (self.test.limit,) if isinstance(self.test, Beyond) else self.numbers:
-            near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
+            with np.errstate(invalid="ignore"):  # infinity less infinity
+                near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
             return Kept(passed & ~near, passed | near)
         among = np.flatnonzero(near)
