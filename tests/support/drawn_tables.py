@@ -172,8 +172,8 @@ class Drawn:
 
 def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
     """Messages of one channel in the order of time, as a table."""
-    batches: list[Batch] = [*batched(enumerate(records))]  # type: ignore[arg-type]
-    table = joined([_table(batch, reader) for batch in batches])
+    found: Iterator[Batch] = batched(enumerate(records))
+    table = joined([_table(batch, reader) for batch in found])
     return Drawn(table, [reader.decode(record) for record in records])
 
 
@@ -346,8 +346,8 @@ def _scalar(kind: str, random: Random, is_odd: bool) -> object:
     if kind in {"string", "wstring"}:
         return random.choice(_WORDS)
     if kind in {"float32", "float64"}:
-        pool = _REALS + _ODD if is_odd else _REALS
-        number = random.choice(pool) if random.random() < 0.7 else random.gauss(0, 2)
+        reals = _REALS + _ODD if is_odd else _REALS
+        number = random.choice(reals) if random.random() < 0.7 else random.gauss(0, 2)
         if kind == "float32":
             with np.errstate(over="ignore"):
                 return float(np.float32(number))
@@ -403,7 +403,8 @@ def condition_on(values: Sequence[JsonValue], random: Random) -> Condition:
     if random.random() < 0.2:
         return Condition(_near(targets, random), field, min_score)
     found = [leaf for target in targets for leaf in leaves(target)]
-    leaf = random.choice(found) if found else random.choice([1.5, "cup", True, 0])
+    default: list[JsonValue] = [1.5, "cup", True, 0]
+    leaf = random.choice(found or default)
     return Condition(_test(leaf, random), field, min_score)
 
 
@@ -425,10 +426,11 @@ def _test(leaf: JsonValue, random: Random) -> Contains | Equals | Beyond:
         part = leaf[begin : begin + random.randint(1, 8)] or "x"
         needle = random.choice([leaf, leaf.upper(), part, f"{part}q"])
     elif isinstance(leaf, bool):
-        needle = random.choice([leaf, str(leaf), int(leaf)])
+        alike: list[bool | str | int] = [leaf, str(leaf), int(leaf)]
+        needle = random.choice(alike)
     elif isinstance(leaf, int | float):
-        near = (leaf, leaf, leaf + 1, leaf * (1 + 1e-12), leaf / 2, str(leaf), float(leaf))
-        needle = random.choice(near)
+        near: list[float | str] = [leaf, leaf + 1, leaf * (1 + 1e-12), leaf / 2, str(leaf)]
+        needle = random.choice([leaf, float(leaf), *near])
     kind = random.choice(["contains", "equals", "above", "below"])
     if kind in {"above", "below"}:
         is_number = isinstance(needle, int | float) and not isinstance(needle, bool)

@@ -87,7 +87,7 @@ class Truth:
 
 
 def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
-    """Returns which rows of a table meet a condition; for several use one `ColumnCondition`."""
+    """Returns which rows of a table meet a condition; for several tables, see `ColumnCondition`."""
     return ColumnCondition(condition, extractor).truth(table)
 
 
@@ -181,7 +181,8 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
             _PlaceTest(test, leaves, limits)
             for spot in spots
             for leaves, limits in _positions(spot)
-            if test.z is None or len(leaves) == 3
+            # A missing z is NaN, which is near only what is infinitely far away.
+            if test.z is None or len(leaves) == 3 or math.isinf(test.tolerance_m)
         ]
     found: list[_LeafTest | _PlaceTest] = []
     for spot in spots:
@@ -289,7 +290,8 @@ class _LeafTest:
             return Kept(passed, passed)
         near = np.isinf(error) | np.zeros(len(column), np.bool_)
         for bound in (self.test.limit,) if isinstance(self.test, Beyond) else self.numbers:
-            near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
+            with np.errstate(invalid="ignore"):  # infinity less infinity
+                near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
             return Kept(passed & ~near, passed | near)
         among = np.flatnonzero(near)
@@ -317,13 +319,15 @@ class _LeafTest:
         least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))
         kept = unknown(len(lengths))
         if least is not None and greatest is not None and self.leaf.kind is not Kind.BOOLEAN:
-            kept = self._between(least, greatest)
+            ends = [level.full(f"{path}.{end}") for end in ("least", "greatest")]
+            error = max(values.table.error(end) for end in ends)
+            kept = self._between(least, greatest, error)
         limits = tuple(limit for limit in self.limits if limit.level != self.leaf.level)
         # Of one that is picked from an array, what is known of all says only what it may be.
         surely = here & kept.surely & (len(limits) == len(self.limits))
         yield level, Kept(surely, here & kept.perhaps), limits
 
-    def _between(self, least: Numeric, greatest: Numeric) -> Kept:
+    def _between(self, least: Numeric, greatest: Numeric, error: float) -> Kept:
         """Returns in which arrays a number passes, by their least and greatest finite ones.
 
         NaN where those are not known. Integers of more than 53 bits were rounded.
@@ -334,13 +338,16 @@ class _LeafTest:
         if not is_real:
             perhaps |= is_rounded
         if isinstance(self.test, Beyond):
-            ends = greatest if self.test.above else least
-            surely = beyond(ends, self.test.limit, above=self.test.above)
+            limit, above = self.test.limit, self.test.above
+            surely = beyond(greatest - error if above else least + error, limit, above=above)
+            perhaps |= beyond(greatest + error if above else least - error, limit, above=above)
             perhaps |= is_real  # infinities are not among the finite ones
         for number in self.numbers:
             at = _as_float(number)
-            surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
-            perhaps |= ((least <= at) & (at <= greatest)) | (is_real and math.isinf(at))
+            if error == 0.0:
+                surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
+            perhaps |= (least - error <= at) & (at <= greatest + error)
+            perhaps |= is_real and math.isinf(at)
         if not is_real:
             surely &= ~is_rounded
         return Kept(surely, perhaps | surely)
@@ -437,6 +444,7 @@ class _PlaceTest:
     def _near(self, columns: Sequence[Numbers]) -> Kept:
         tolerance = self.test.tolerance_m
         axes = [column.values.astype(np.float64, copy=False) for column in columns]
+        axes += [np.full(len(axes[0]), np.nan)] * (len(self._center) - len(axes))
         with np.errstate(all="ignore"):
             squared = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
             apart = np.sqrt(np.add.reduce(squared))

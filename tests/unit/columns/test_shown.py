@@ -34,7 +34,7 @@ from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Quaternion
 
@@ -89,7 +89,7 @@ def read_leaves(drawn: Drawn, extractor: SchemaExtractor) -> list[Counter[tuple[
     return found
 
 
-def column_of(values: Values, leaf: Leaf) -> list[object] | None:
+def column_of(values: Values, leaf: Leaf) -> Sequence[object] | None:
     if leaf.kind is Kind.TEXT:
         texts = values.texts(leaf)
         return None if texts is None else [*texts.values()]
@@ -102,7 +102,7 @@ def column_of(values: Values, leaf: Leaf) -> list[object] | None:
 
 
 @pytest.mark.parametrize("limit", [50, 2])
-@settings(max_examples=examples(90), deadline=None)
+@settings(max_examples=examples(40), deadline=None)
 @given(drawn=drawn_tables())
 def test_leaves_of_columns_are_those_of_extracted_values(limit: int, drawn: Drawn) -> None:
     extractor = shipped_extractor(limit)
@@ -113,7 +113,7 @@ def test_leaves_of_columns_are_those_of_extracted_values(limit: int, drawn: Draw
             assert not expected - found
 
 
-@settings(max_examples=examples(150), deadline=None)
+@settings(max_examples=examples(90), deadline=None)
 @given(drawn_tables(), RANDOM)
 def test_numbers_of_a_field_are_those_of_each_message(drawn: Drawn, random: Random) -> None:
     value = EXTRACTOR.exact(drawn.messages[0], drawn.type)
@@ -180,7 +180,7 @@ def test_numbers_of_integers_are_integers_and_booleans_are_none() -> None:
 
 @given(st.lists(st.integers(MIN_NS, MAX_NS) | st.integers(-(2**54), 2**54), min_size=1))
 def test_seconds_are_rounded_as_those_of_each_message(times: list[int]) -> None:
-    found = seconds(np.array(times, np.int64))  # type: ignore[arg-type]
+    found = seconds(np.array(times, np.int64))
     assert found.tolist() == [unix_from_ns(time) for time in times]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from itertools import chain
 from random import Random
 from typing import TYPE_CHECKING
 
@@ -33,12 +34,10 @@ from tests.support.memories import shipped_extractor
 from tests.support.shared_bags import BAGS, needs_real, needs_recorded
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.truth import Truth
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.storage.base import Record
+    from ros2_memory.storage.base import Channel, Record
 
 EXTRACTOR = shipped_extractor()
 VISION = "ros2_vision_interfaces/msg/VisionDetectionArray"
@@ -72,7 +71,7 @@ def values_of(drawn: Drawn) -> list[JsonValue]:
     return [EXTRACTOR.exact(message, drawn.type) for message in drawn.messages]
 
 
-@settings(max_examples=examples(150), deadline=None)
+@settings(max_examples=examples(90), deadline=None)
 @given(drawn_tables(), RANDOM)
 def test_truth_of_drawn_messages_is_that_of_each_message(drawn: Drawn, random: Random) -> None:
     values = values_of(drawn)
@@ -110,26 +109,32 @@ def shared_samples(folder: str) -> list[tuple[Table, list[JsonValue]]]:
     found = []
     for path in sorted([*(BAGS / folder).rglob("*.mcap"), *(BAGS / folder).rglob("*.db3")]):
         try:
-            tables = [table for group in decoded(reader, path) for table in group]
+            tables = {key_of(table.channel): table for table in chain(*decoded(reader, path))}
         except BagError:
             continue
-        for table in tables:
-            channel = table.channel
-            key = (channel.topic, channel.type, channel.schema.text)
-            if key in seen or "" in table.left_out or not len(table):
-                continue
-            seen.add(key)
-            found.append(sampled(reader, path, table))
+        new = {
+            key: table
+            for key, table in tables.items()
+            if key not in seen and "" not in table.left_out and len(table)
+        }
+        seen |= new.keys()
+        records: dict[tuple[str, str, bytes], list[Record]] = {key: [] for key in new}
+        topics = {table.channel.topic for table in new.values()}
+        for record in reader.records(path, topics, TimeWindow.everything()) if topics else ():
+            if key_of(record.channel) in records:
+                records[key_of(record.channel)].append(record)
+        found += [sampled(reader, table, records[key]) for key, table in new.items()]
     return found
 
 
-def sampled(reader: Rosbag2Reader, path: Path, table: Table) -> tuple[Table, list[JsonValue]]:
+def key_of(channel: Channel) -> tuple[str, str, bytes]:
+    return channel.topic, channel.type, channel.schema.text
+
+
+def sampled(
+    reader: Rosbag2Reader, table: Table, records: list[Record]
+) -> tuple[Table, list[JsonValue]]:
     rows = np.unique(np.linspace(0, len(table) - 1, SAMPLED_ROWS).astype(np.int64))
-    records = [
-        record
-        for record in reader.records(path, [table.channel.topic], TimeWindow.everything())
-        if record.channel.schema == table.channel.schema
-    ]
     if table.undecodable:
         records = [record for record in records if is_decodable(reader, record)]
     assert len(records) == len(table)
