@@ -227,7 +227,7 @@ class Scanner:
             return column
         assert self.store is not None  # noqa: S101 - as above
         data = b""
-        if not packed.codec.endswith(" constant"):
+        if not packed.codec.endswith(" constant") or packed.codec.startswith("text"):
             stored = self.store.part_data(part, path)
             if stored is None:
                 raise GoneError

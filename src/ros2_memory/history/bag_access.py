@@ -17,7 +17,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.core.timebase import MIN_NS, Deadline
 from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
@@ -61,8 +61,13 @@ class BagAccess:
         with call.stages.timed("index"):
             self.snapshot = memory.index.snapshot(reach)
         self.notes = Notes()
+        self._deadline = call.deadline
         self._as_of: int | None = None
         self._answers: dict[str, Mapping[tuple[int, ...], str]] = {}
+
+    def finish_within(self, budget_s: float) -> None:
+        """Gives a call whose time is over some more, to say what it found."""
+        self._deadline = Deadline.after(budget_s)
 
     def check_deadline(self) -> None:
         """Checks that the call has time left.
@@ -70,10 +75,10 @@ class BagAccess:
         Raises:
             QueryTimeoutError: it has none.
         """
-        deadline = self.call.deadline
-        if deadline.expired():
+        if self._deadline.expired():
+            budget_s = self.call.deadline.budget_s
             raise QueryTimeoutError(
-                f"the question needs more than {deadline.budget_s:g} s; {self.backfill_progress()}"
+                f"the question needs more than {budget_s:g} s; {self.backfill_progress()}"
                 "ask about a shorter window or a single topic"
             )
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.truth import ColumnCondition
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.scan import scan
@@ -84,16 +85,21 @@ class Matching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         waiting: Block | None = None
-        for rows in scan(self._view, topic, window, newest_first=True):
-            block = self._block(topic, rows, window)
-            if waiting is None or block.last < waiting.first:
-                if waiting is not None:
-                    yield waiting
-                waiting = block
-                continue
-            newer, waiting = _parted(waiting, block)
-            if newer is not None:
-                yield newer
+        try:
+            for rows in scan(self._view, topic, window, newest_first=True):
+                block = self._block(topic, rows, window)
+                if waiting is None or block.last < waiting.first:
+                    if waiting is not None:
+                        yield waiting
+                    waiting = block
+                    continue
+                newer, waiting = _parted(waiting, block)
+                if newer is not None:
+                    yield newer
+        except QueryTimeoutError:
+            if waiting is not None:
+                yield waiting
+            raise
         if waiting is not None:
             yield waiting
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.matched import Matching, Runs, runs_of
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class _OfTopic:
         self._apart = apart
         self.runs: list[Run] = []
         self._is_open = False
-        self._begins: Ns | None = None
+        self._begins: Ns = MAX_NS
 
     @property
     def closed(self) -> list[Run]:
@@ -75,11 +76,11 @@ class _OfTopic:
     def add(self, block: Block) -> None:
         """Adds the next older block."""
         if not block.has_match and not self._is_open:
-            self._begins = block.first
             return
-        runs = runs_of(block.tested(), SILENCE_NS, apart=self._apart)
-        is_near = self._begins is not None and self._begins - block.last <= SILENCE_NS
-        self._begins = block.first
+        tested = block.tested()
+        runs = runs_of(tested, SILENCE_NS, apart=self._apart)
+        is_near = self._begins - int(tested.times[-1]) <= SILENCE_NS
+        self._begins = int(tested.times[0])
         if runs.is_blank:
             self._is_open = self._is_open and is_near
             return
@@ -142,6 +143,10 @@ def find_runs(
             raise
         return Found(sorted(runs, key=_by_last), reached, is_over=True)
     runs = _newest_first(topics)
+    if enough is not None and len(runs) > enough:
+        # Whether more was searched than had to be depends on how the rows are stored.
+        search.note_undecodable(runs[enough - 1].first)
+        return Found(runs, reached)
     search.close(matching, window, found=bool(runs))
     return Found(runs)
 

@@ -69,6 +69,8 @@ NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 """The robot may have moved since an older pose."""
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
+_LEFT_TO_SAY_S: Final = 2.0
+"""How long the messages of what was found are read after a search ran out of time."""
 MAX_COUNTED: Final = 20_000
 """Sightings that are counted over time."""
 
@@ -352,6 +354,7 @@ class _Sightings:
             for run in found.runs
         )
         if found.is_over:
+            view.bags.finish_within(_LEFT_TO_SAY_S)
             _note_out_of_time(view, found.searched_to or MIN_NS)
 
     def skip(self, found: Tested) -> None:
