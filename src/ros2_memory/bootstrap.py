@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.catalogue.digest_config import DigestConfig
+    from ros2_memory.columns.fill import Filling
+    from ros2_memory.columns.store import ColumnStore
     from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place, Region
@@ -388,6 +391,7 @@ def build_memory(
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
+    from ros2_memory.columns.scan import Scanner
     from ros2_memory.history.context import Memory
     from ros2_memory.index.scan import BAG_DIR_SETTING
     from ros2_memory.recorder.index_manager import IndexManager
@@ -416,7 +420,9 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
-    return Memory(index, reader, shared.extractor, clock, query_settings_of(settings), recall)
+    scanner = Scanner(build_columns(settings, reader), bag_dir)
+    limits = query_settings_of(settings)
+    return Memory(index, reader, shared.extractor, clock, limits, recall, scanner)
 
 
 def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
@@ -443,6 +449,47 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     return (*beside, cache / PACKAGE / name / file) if cache.is_absolute() else beside
 
 
+def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
+    """Returns the store of columns; None where the configuration wants none.
+
+    `reader` applies what the bag directory says of its bags.
+    """
+    from ros2_memory.bag_dir.layout import OWN_FOLDER
+    from ros2_memory.columns.store import FILE, ColumnStore
+
+    if not settings.store.enabled:
+        return None
+    bag_dir = settings.recording.bag_dir
+    return ColumnStore(
+        partial(column_paths, settings),
+        reader.definition,
+        definitions=_hash_of(_definitions_of(settings)),
+        # What a recorder's server stored serves who only looks, too.
+        sources=(bag_dir / OWN_FOLDER / FILE,),
+        waits_for=bag_dir,
+    )
+
+
+def column_paths(settings: Settings) -> tuple[Path, ...]:
+    """Returns the paths that the store of columns may have now, best first: beside the catalogues.
+
+    Columns do not depend on the configuration, so one file serves all of a bag directory.
+    """
+    from ros2_memory.columns.store import FILE
+
+    of_all = replace(settings, data=replace(settings.data, recording=None))
+    return tuple(path.with_name(FILE) for path in catalogue_paths(of_all))
+
+
+def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
+    """Returns what tells the configured message definitions apart: paths, sizes and mtimes."""
+    return [
+        (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
+        for folder in settings.storage.custom_msg_paths
+        for path in sorted(directories.files_below(Path(folder), ".msg"))
+    ]
+
+
 def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> DigestConfig:
     """Returns all that digests depend on besides the bags.
 
@@ -454,17 +501,12 @@ def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) 
     from ros2_memory.catalogue.digest_config import DigestConfig
 
     storage = settings.storage
-    definitions = [
-        (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
-        for folder in storage.custom_msg_paths
-        for path in sorted(directories.files_below(Path(folder), ".msg"))
-    ]
     base = (
         package_version(),
         DIGEST_VERSION,
         None if storage.target in _READ_ALIKE else storage.target,
         settings.reader.max_chunk_mb,
-        definitions,
+        _definitions_of(settings),
         settings.data.max_array_length,
         settings.data.max_plausible_speed_mps,
         settings.data.pose_topic,
@@ -481,10 +523,26 @@ def _hash_of(value: object) -> str:
 
 
 def build_backfill(settings: Settings, memory: Memory) -> Backfill:
-    """Returns what fills the catalogue of a memory."""
+    """Returns what fills the catalogue of a memory, and its store of columns."""
     from ros2_memory.serving.backfill import Backfill
 
-    return Backfill(memory, build_digester(memory), settings.recording.bag_dir)
+    return Backfill(
+        memory,
+        build_digester(memory),
+        settings.recording.bag_dir,
+        build_filling(settings, memory),
+    )
+
+
+def build_filling(settings: Settings, memory: Memory) -> Filling | None:
+    """Returns what fills the store of columns of a memory; None where it has none."""
+    from ros2_memory.columns.fill import Filling, StoreLimits
+
+    scanner, store = memory.columns, settings.store
+    if scanner is None or scanner.store is None:
+        return None
+    limits = StoreLimits(store.max_share, round(store.max_gb * GB))
+    return Filling(scanner, memory.reader, settings.recording.bag_dir, memory.clock, limits)
 
 
 def build_digester(memory: Memory) -> Digester:

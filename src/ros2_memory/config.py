@@ -273,6 +273,19 @@ class ReaderSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class StoreSettings:
+    """How much of the bags is also stored as columns, which changes how long answers take alone.
+
+    `max_share` is of the bags' bytes. `max_gb` is for a store in a cache folder; beside the bags
+    retention bounds it.
+    """
+
+    enabled: Flag
+    max_share: Annotated[float, Field(strict=True, ge=0, le=1)]
+    max_gb: Positive
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class RetentionSettings:
     """How much history is kept.
 
@@ -577,6 +590,7 @@ class Settings:
     recording: RecordingSettings
     data: DataSettings
     reader: ReaderSettings
+    store: StoreSettings
     retention: RetentionSettings
     server: ServerSettings
     fleet: FleetSettings

@@ -35,6 +35,8 @@ ROW_ID_BITS: Final = 40
 
 So the number of a row in a file that was lost never means a row of the file that replaced it.
 """
+_FEW_PAGES: Final = 256
+"""Unused pages that stay in the file, for what is written next."""
 _SUFFIXES: Final = ("-wal", "-shm")
 """The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
 T = TypeVar("T")
@@ -228,6 +230,24 @@ class Database:
                 opened.connection.execute("VACUUM")
                 # The copy went through the write-ahead log, which would keep that size.
                 opened.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
+    def give_back(self) -> None:
+        """Returns unused pages to the disk where many are, a few at a time: nobody waits for long.
+
+        The file must have been made with `auto_vacuum = INCREMENTAL`.
+        """
+        while True:
+            with self._lock:
+                opened = self._ready()
+                if opened is None or opened.path is None:
+                    return
+                with suppress(sqlite3.Error):
+                    [unused] = opened.connection.execute("PRAGMA freelist_count").fetchone()
+                    if unused > _FEW_PAGES:
+                        # A script: a statement alone would free one page, whatever it asks for.
+                        opened.connection.executescript(f"PRAGMA incremental_vacuum({_FEW_PAGES})")
+                        continue
+            return
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Reopens the file where it was deleted, replaced, or could not be opened before.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scan import Scanner
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import BagReader, Channel
@@ -39,6 +39,10 @@ RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be stored is tried again: the disk may have failed."""
 LEAST_BYTES_PER_S: Final = 200
 """What the columns of a second may take however small the bags are."""
+IN_MEMORY_BYTES: Final = 64 << 20
+"""What the store may take where no file can be written."""
+_TRIMMED_TO: Final = 0.9
+"""To which part of what it may take the store is trimmed."""
 _MOST_REFUSED: Final = 10_000
 
 
@@ -48,11 +52,11 @@ class StoreLimits:
 
     Attributes:
         max_share: of the bytes of the bags; or `LEAST_BYTES_PER_S`, whichever is more.
-        max_bytes: in all; None: no limit. Bags that are older than those that fit are not stored.
+        max_bytes: in all, where the file is not in the bag directory. The oldest bags go first.
     """
 
     max_share: float = 0.15
-    max_bytes: int | None = None
+    max_bytes: int = 2 * 10**9
 
 
 class Filling:
@@ -83,7 +87,7 @@ class Filling:
         self._clock = clock
         self._limits = limits
         self._refused: dict[BagKey, Ns] = {}
-        self._shared: tuple[Timeline, list[TimeWindow]] | None = None
+        self._shared: tuple[Timeline, frozenset[str]] | None = None
 
     def waiting(self, timeline: Timeline) -> list[BagFile]:
         """Returns the bags to be stored, the newest first.
@@ -97,10 +101,7 @@ class Filling:
         found = [bag for bag in coverage.missing if bag.state is BagState.CLOSED]
         found += [bag for bag in coverage.unhashed() if self._is_shared(bag, timeline)]
         found = [bag for bag in found if not self._is_refused(self._key(bag))]
-        if self._is_full():
-            oldest = self.store.oldest()
-            found = [bag for bag in found if oldest is not None and bag.end >= oldest]
-        return sorted(found, key=in_time, reverse=True)
+        return self._fitting(sorted(found, key=in_time, reverse=True))
 
     def fill(self, bag: BagFile, timeline: Timeline) -> bool:
         """Stores one bag; returns False if it must wait, has changed meanwhile, or is refused."""
@@ -146,15 +147,37 @@ class Filling:
         return done
 
     def prune(self, timeline: Timeline) -> None:
-        """Deletes the bags whose files are gone, or that only another preset reads."""
+        """Deletes the bags whose files are gone; nothing where no bag is left.
+
+        Then the disk of the bags is more likely missing than empty.
+        """
         present = {self._key(bag).path for bag in timeline.bags}
-        gone = [
-            path
-            for path in self.store.bags()
-            if path not in present and not (self._bag_dir / path).exists()
-        ]
+        if not present:
+            return
+        absent = (path for path in self.store.paths() if path not in present)
+        gone = [path for path in absent if not (self._bag_dir / path).exists()]
         if gone:
             self.store.delete(gone)
+        self.store.give_back()
+
+    def trim(self) -> None:
+        """Deletes the oldest bags where the store takes more than it may."""
+        most = self._most_bytes()
+        if most is None or self.store.used_bytes() <= most:
+            return
+        while self.store.used_bytes() > _TRIMMED_TO * most:
+            oldest = self.store.oldest()
+            if oldest is None:
+                break
+            # A part goes with the last of its bags, so these go together.
+            before = oldest // PART_NS * PART_NS + PART_NS
+            keys = self.store.beginning_before(before)
+            if not self.store.delete([key.path for key in keys]):
+                break
+            now = self._clock.now()
+            self._refused |= dict.fromkeys(keys, now)
+            log.info("oldest_columns_deleted", bags=len(keys))
+        self.store.give_back()
 
     def _store(self, bag: BagFile, *, hashed: bool) -> bool:
         is_hashed = partial(_is_hashed, everything=hashed)
@@ -187,8 +210,10 @@ class Filling:
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""
         if self._shared is None or self._shared[0] is not timeline:
-            self._shared = timeline, shared_times(timeline)
-        return any(span.overlaps(bag.start, bag.end) for span in self._shared[1])
+            spans = shared_times(timeline)
+            files = (bag.file for span in spans for bag in timeline.overlapping(span))
+            self._shared = timeline, frozenset(files)
+        return bag.file in self._shared[1]
 
     def _is_over(self, begin: Ns, timeline: Timeline) -> bool:
         """Returns whether no bag that belongs to ten minutes is to be expected."""
@@ -198,9 +223,32 @@ class Filling:
     def _slot(self, bag: BagFile) -> tuple[str, Ns]:
         return bag.file.rpartition("/")[0], bag.start // PART_NS * PART_NS
 
-    def _is_full(self) -> bool:
-        most = self._limits.max_bytes
-        return most is not None and self.store.used_bytes() > most
+    def _fitting(self, bags: Sequence[BagFile]) -> list[BagFile]:
+        """Returns which of these bags may be stored, the newest first.
+
+        Those that are newer than what is stored take the place of the oldest. An older one is
+        stored only where it fits without that, even if its columns take as much as the bag: else
+        it would be deleted, and stored again, for ever.
+        """
+        most = self._most_bytes()
+        if most is None or not bags:
+            return [*bags]
+        most = round(_TRIMMED_TO * most)
+        oldest, used = self.store.oldest(), self.store.used_bytes()
+        found: list[BagFile] = []
+        for bag in bags:
+            is_newer = oldest is not None and bag.start >= oldest
+            used += 0 if is_newer else bag.size
+            if (bag.size if is_newer else used) <= most:
+                found.append(bag)
+        return found
+
+    def _most_bytes(self) -> int | None:
+        """Returns how much the store may take; None: beside the bags, retention sees to that."""
+        path = self.store.path
+        if path is None:
+            return min(IN_MEMORY_BYTES, self._limits.max_bytes)
+        return None if path.is_relative_to(self._bag_dir) else self._limits.max_bytes
 
     def _refuse(self, bag: BagFile, reason: str) -> None:
         log.warning("bag_not_stored", path=str(bag.path), reason=reason)

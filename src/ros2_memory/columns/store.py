@@ -226,6 +226,25 @@ class ColumnStore(Database):
 
         return self.read(ask, None)
 
+    def beginning_before(self, before: Ns) -> list[BagKey]:
+        """Returns the bags whose first message is earlier than a log time (ns)."""
+
+        def ask(connection: sqlite3.Connection) -> list[BagKey]:
+            rows = connection.execute(
+                "SELECT path, size, mtime_ns, sidecar_ns FROM bag WHERE first_ns < ?", (before,)
+            )
+            return [BagKey(*row) for row in rows]
+
+        return self.read(ask, [])
+
+    def paths(self) -> list[str]:
+        """Returns the paths of all bags, also of those that are stored in part."""
+
+        def ask(connection: sqlite3.Connection) -> list[str]:
+            return [path for (path,) in connection.execute("SELECT path FROM bag")]
+
+        return self.read(ask, [])
+
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
 

@@ -1,4 +1,4 @@
-"""Fills the catalogue: digests every closed bag that has no entry, the newest first.
+"""Fills the catalogue and the store of columns with every closed bag, the newest first.
 
 A kill at any moment loses at most the bag that is being digested: entries are written whole or not
 at all.
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.handover_file import Handover
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.catalogue.map_digest import Statics
+    from ros2_memory.columns.fill import Filling
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.context import Memory
@@ -96,19 +97,27 @@ class Backfill:
 
     Attributes:
         catalogue: what is filled.
+        filling: fills the store of columns; None where there is none.
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
 
     Raises:
         ValueError: the memory has no catalogue.
     """
 
-    def __init__(self, memory: Memory, digester: Digester, bag_dir: Path) -> None:
+    def __init__(
+        self,
+        memory: Memory,
+        digester: Digester,
+        bag_dir: Path,
+        filling: Filling | None = None,
+    ) -> None:
         if memory.recall is None:
             raise ValueError("a memory without a catalogue has nothing to fill")
         self._memory = memory
         self._digests = memory.recall
         self.catalogue = memory.recall.catalogue
         self._digester = digester
+        self.filling = filling
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
@@ -178,6 +187,25 @@ class Backfill:
         refused = sum(self._is_refused(key) for key in list(self._refused))
         return Progress(closed, len(self._waiting(guesses=True)[0]), refused)
 
+    def not_stored(self) -> list[BagFile]:
+        """Returns the bags of which columns are to be stored, the newest first."""
+        snapshot = self._memory.index.snapshot()
+        if self.filling is None or snapshot.problem is not None:
+            return []
+        return self.filling.waiting(snapshot.timeline)
+
+    def store(self, bag: BagFile) -> bool:
+        """Stores the columns of one bag; as `Filling.fill`."""
+        timeline = self._memory.index.snapshot().timeline
+        return self.filling is not None and self.filling.fill(bag, timeline)
+
+    def merge(self) -> None:
+        """Makes parts of what is stored and over, and keeps the store within what it may take."""
+        snapshot = self._memory.index.snapshot()
+        if self.filling is not None and snapshot.problem is None:
+            self.filling.merge(snapshot.timeline)
+            self.filling.trim()
+
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""
         if not self._is_unchanged(bag):
@@ -244,6 +272,8 @@ class Backfill:
         """
         if self._memory.index.snapshot().problem is None:
             self.catalogue.look_after(thorough=thorough)
+            if self.filling is not None:
+                self.filling.store.look_after(thorough=thorough)
 
     def precompute(self) -> None:
         """Computes what overlapping recordings hold together, before a client asks.
@@ -300,6 +330,8 @@ class Backfill:
         ]
         self.catalogue.forget(gone)
         self.catalogue.forget_older_configurations()
+        if self.filling is not None:
+            self.filling.prune(snapshot.timeline)
 
     def _is_unchanged(self, bag: BagFile) -> bool:
         """Returns whether the file and its sidecar are as the index found them, for a while now."""
@@ -447,11 +479,17 @@ class Filler:
         find = partial(backfill.waiting, guesses=True)
         waiting = await _in_thread(find)
         waiting = await _in_thread(partial(backfill.renew, waiting))
+        unstored = await _in_thread(backfill.not_stored)
         # A catalogue that is in memory cannot be filled by another process.
         has_file = backfill.catalogue.path is not None
-        if len(waiting) > BACKLOG and has_file and await _run_helper(self._helper):
+        most = max(len(waiting), len(unstored))
+        if most > BACKLOG and has_file and await _run_helper(self._helper):
             # Bags that the helper could not digest are tried here, and refused if they fail.
             waiting = await _in_thread(find)
+            unstored = await _in_thread(backfill.not_stored)
+        for bag in unstored[:BACKLOG]:
+            await _in_thread(partial(backfill.store, bag))
+        await _in_thread(backfill.merge)
         done = await _digest(backfill, waiting[:BACKLOG])
         # Earlier, bags without a digest would be read for it.
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:

@@ -187,6 +187,7 @@ def fill_catalogue(
     while a core is free for it.
     """
     with _garbage_collected_rarely():
+        _store(backfill, show)
         total = _digest(backfill, _every if second is None else second.share, show)
         if second is not None:
             second.stop()
@@ -197,6 +198,18 @@ def fill_catalogue(
     if total >= _COMPACTED:
         backfill.catalogue.compact()
     return backfill.progress()
+
+
+def _store(backfill: Backfill, show: Callable[[Progress], None]) -> None:
+    """Stores the columns of bags until none waits that can be stored."""
+    done = True
+    while done:
+        waiting = backfill.not_stored()
+        done = False
+        for number, bag in enumerate(waiting[:_BATCH]):
+            show(Progress(len(waiting), len(waiting) - number, 0))
+            done |= backfill.store(bag)
+        backfill.merge()
 
 
 @contextmanager
