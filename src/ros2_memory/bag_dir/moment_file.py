@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 from pydantic import AfterValidator, ConfigDict, Field, StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import Count, json_object, validated
+from ros2_memory.bag_dir.json_files import Count, json_object, validated
 from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -173,7 +173,7 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
 
 def read_saved_moment(folder: Path) -> SavedMoment | None:
     """Returns the moment of a folder; None where there is no file, or no valid one."""
-    with suppress(OSError, ValueError, RecursionError):
+    with suppress(OSError, ValueError):
         fields = json_object(read_small_file(folder / MOMENT_FILE), FORMAT)
         # The keys of the request lie among those of the moment.
         return validated(_MOMENT, {**fields, "request": fields})

@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import structlog
 
+from ros2_memory.bag_dir import state_files
 from ros2_memory.bag_dir.layout import DELETED_FILE
-from ros2_memory.bag_dir.state import deleted_file
-from ros2_memory.bag_dir.state.deleted_file import (
+from ros2_memory.bag_dir.state_files import (
+    DELETED,
+    EVERY_TOPIC,
+    Loss,
     append_deleted,
+    append_losses,
     deleted_of,
     deleted_spans,
     read_deleted,
 )
-from ros2_memory.bag_dir.state.lost_file import EVERY_TOPIC, Loss, append_losses
 from ros2_memory.index.listed_splits import absent_splits
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept, recording, size_of
@@ -136,7 +139,7 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
-        patched.setattr(deleted_file, "append_durably", full)
+        patched.setattr(DELETED, "append", full)
         house.apply()
     assert "deletions_not_written" in {each["event"] for each in captured}
     assert not any(path.exists() for path in old)
@@ -149,7 +152,7 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
 def test_the_list_stays_short_however_long_the_robot_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(deleted_file, "_MOST_BYTES", 20_000)
+    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 20_000)
     (tmp_path / "here").mkdir()
     append_deleted(tmp_path, [deleted_of("here", [("here_0.mcap", T0 - 50 * S, T0 - 40 * S)])])
     for n in range(1000):
