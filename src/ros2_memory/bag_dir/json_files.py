@@ -77,7 +77,7 @@ class JsonLog(Generic[_T]):
     def __init__(
         self, name: str, row: type[_T], *, most_bytes: int = _MOST_BYTES, is_brief: bool = False
     ) -> None:
-        self._name = name
+        self.name = name
         self._adapter = TypeAdapter(row)
         self._most_bytes = most_bytes
         self._is_brief = is_brief
@@ -89,7 +89,7 @@ class JsonLog(Generic[_T]):
             OSError: the file cannot be read, or there is none.
             ValueError: it is not a regular file.
         """
-        with open_plain(bag_dir / self._name) as stream:
+        with open_plain(bag_dir / self.name) as stream:
             if stream.seek(0, os.SEEK_END) > self._most_bytes:
                 yield Line(0, b"", None, ValueError(f"it is larger than {self._most_bytes} bytes"))
                 stream.seek(-self._most_bytes, os.SEEK_END)
@@ -127,7 +127,7 @@ class JsonLog(Generic[_T]):
         Raises:
             OSError: they cannot be written, and none is appended.
         """
-        target = bag_dir / self._name
+        target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         append_durably(target, self.text(rows))
         return target.stat().st_size
@@ -138,7 +138,7 @@ class JsonLog(Generic[_T]):
         Raises:
             OSError: it cannot be written; the old one remains.
         """
-        target = bag_dir / self._name
+        target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         write_durably(target, self.text(rows))
 
@@ -153,7 +153,7 @@ class JsonDocument(Generic[_T]):
     """
 
     def __init__(self, name: str, content: type[_T], *, is_ascii: bool = True) -> None:
-        self._name = name
+        self.name = name
         self._adapter = TypeAdapter(content)
         self._is_ascii = is_ascii
 
@@ -165,7 +165,7 @@ class JsonDocument(Generic[_T]):
             ValueError: it is damaged, or of another format.
         """
         try:
-            text = read_small_file(bag_dir / self._name)
+            text = read_small_file(bag_dir / self.name)
         except (FileNotFoundError, NotADirectoryError):
             return None
         return parsed(self._adapter, text, _FORMAT)
@@ -176,7 +176,7 @@ class JsonDocument(Generic[_T]):
         Raises:
             OSError: it cannot be written; the old one remains.
         """
-        target = bag_dir / self._name
+        target = bag_dir / self.name
         directories.make(bag_dir, target.parent)
         content = {"format": _FORMAT, **self._adapter.dump_python(value)}
         text = json.dumps(content, ensure_ascii=self._is_ascii, separators=(",", ":"))
@@ -188,7 +188,7 @@ class JsonDocument(Generic[_T]):
         Raises:
             OSError: it cannot be removed.
         """
-        target = bag_dir / self._name
+        target = bag_dir / self.name
         target.unlink(missing_ok=True)
         flush(target.parent)
 
@@ -220,18 +220,11 @@ def until_changed(name: str) -> Callable[[Callable[[Path], _T]], Callable[[Path]
 def parsed(adapter: TypeAdapter[_T], text: str | bytes, version: int | None = None) -> _T:
     """Returns the value that a JSON object describes; keys of other versions are ignored.
 
-    Raises:
-        ValueError: it is none, is of another format than this version, or a key is missing or
-            wrong; the sentence names the first one.
-    """
-    return validated(adapter, json_object(text, version))
-
-
-def json_object(text: str | bytes, version: int | None = None) -> dict[object, object]:
-    """Returns the JSON object in a text; its `format` must be the version, where one is given.
+    Its `format` must be the version, where one is given.
 
     Raises:
-        ValueError: there is none, or it is of another format.
+        ValueError: it is none, or of another format, or a key is missing or wrong; the sentence
+            names the first one.
     """
     try:
         value: object = json.loads(text)
@@ -241,17 +234,8 @@ def json_object(text: str | bytes, version: int | None = None) -> dict[object, o
         raise ValueError("it is not a JSON object")  # noqa: TRY004 - a value in a text
     if version is not None and value.get("format") != version:
         raise ValueError(f"its format is {value.get('format')!r}, and only {version} is known")
-    return value
-
-
-def validated(adapter: TypeAdapter[_T], fields: Mapping[object, object]) -> _T:
-    """Returns the value that JSON fields describe; keys of other versions are ignored.
-
-    Raises:
-        ValueError: a key is missing or wrong; the sentence names the first one.
-    """
     try:
-        return adapter.validate_python(fields)
+        return adapter.validate_python(value)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))

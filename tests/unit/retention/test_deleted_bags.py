@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from typing import TYPE_CHECKING, Any
 
@@ -169,13 +168,3 @@ def test_a_split_in_which_the_clock_was_set_shows_no_time(tmp_path: Path) -> Non
     append_deleted(tmp_path, [deleted_of("a", splits)])
     assert deleted_spans(tmp_path) == ((T0, T0 + 9 * S + 1),)
     assert len(read_deleted(tmp_path)["a"].files) == 3
-
-
-@pytest.mark.parametrize("line", ["", "{", "[" * 5000, '{"recording": 1}', '{"recording": "a"'])
-def test_lines_that_mean_nothing_are_ignored(tmp_path: Path, line: str) -> None:
-    append_deleted(tmp_path, [deleted_of("a", [("a_0.mcap", T0, T0 + S)])])
-    with (tmp_path / DELETED_FILE).open("a") as stream:
-        stream.write(line)
-    append_deleted(tmp_path, [deleted_of("b", [("b_0.mcap", T0, T0 + S)])])
-    assert [*read_deleted(tmp_path)] == ["a", "b"]
-    assert json.loads((tmp_path / DELETED_FILE).read_text().splitlines()[0])["recording"] == "a"
