@@ -26,7 +26,7 @@ from tests.support import stub_ros2
 from benchmarks.bags import QOS, SPLIT_NS, SPLITS_OF_A_RECORDING, WEEK
 from benchmarks.footprint import resident_mb
 from benchmarks.report import machine
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import identity_of
 
 if TYPE_CHECKING:

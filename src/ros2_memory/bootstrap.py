@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.catalogue.digest_config import DigestConfig
     from ros2_memory.columns.fill import Filling
@@ -74,7 +74,7 @@ _READ_ALIKE = (
     "ros2_memory.storage.rosbag2_reader.Rosbag2Reader",
 )
 _MOST_SPLITS = 5000
-"""The splits of one recording that `bag_dir.state.screened_file` takes."""
+"""The splits of one recording that `bag_dir.state_files` takes."""
 
 
 def build_reader(settings: Settings, *, cache_mb: int | None = None) -> BagReader:
@@ -145,7 +145,7 @@ def build_housekeeper(
     `own` lists the recordings that were made in the bag directory.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
     from ros2_memory.recorder.time_sync import is_synchronised
     from ros2_memory.storage.mcap.writer import McapWriter
@@ -346,7 +346,7 @@ def supposed_own(bag_dir: Path) -> OwnRecordings:
     Raises:
         OSError: the list cannot be read, or the bag directory cannot be listed.
     """
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.storage.mcap.embedded import custom_data
 
     own = OwnRecordings(bag_dir)

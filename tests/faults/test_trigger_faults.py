@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.bag_dir import durable_write, moment_file
+from ros2_memory.bag_dir import durable_write, json_files, moment_file
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.state import trigger_file
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.watched_bags import T0, S, WatchedBags, flag, rule
 
@@ -34,7 +33,7 @@ class Steps:
             (os, "fsync"),
             (moment_file, "write_durably"),
             (moment_file, "make_moment_folder"),
-            (trigger_file, "write_durably"),
+            (json_files, "write_durably"),
             (durable_write, "flush"),
         ):
             monkeypatch.setattr(module, name, self.counting(getattr(module, name)))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from mcap.reader import make_reader
 
-from ros2_memory.bag_dir.state.screened_file import read_gate
+from ros2_memory.bag_dir.state_files import read_gate
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader

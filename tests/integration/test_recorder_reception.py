@@ -18,7 +18,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from ros2_memory.bag_dir.state.lost_file import read_losses
+from ros2_memory.bag_dir.state_files import read_losses
 from tests.support.live_recorder import LiveRecorder, Machine, machine
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder

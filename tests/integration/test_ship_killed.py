@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.bag_dir.state.shipped_file import read_receipts
+from ros2_memory.bag_dir.state_files import read_receipts
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.lease import holder_of
 from ros2_memory.lake.tables import NAMESPACE, TABLES

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import utc_stamp
-from ros2_memory.bag_dir.state.screened_file import read_gate
+from ros2_memory.bag_dir.state_files import read_gate
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.exclusion import ExclusionRule

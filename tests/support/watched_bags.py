@@ -13,8 +13,8 @@ from ros2_memory.bag_dir.handover_file import Handover, Overlap, read_handover, 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import utc_stamp
 from ros2_memory.bag_dir.moment_file import stored_moments_in
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.state.trigger_file import read_trigger_state
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.directories import identity_of
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.moment_file import StoredMoment
-    from ros2_memory.bag_dir.state.trigger_file import RuleRecord
+    from ros2_memory.bag_dir.state_files import RuleRecord
 
 S = 10**9
 T0 = 1_790_000_000 * S
@@ -170,7 +170,7 @@ class WatchedBags:
         self.look()
 
     def record(self, name: str = "bumper") -> RuleRecord:
-        state = read_trigger_state(self.bag_dir)
+        state = TRIGGERS.read(self.bag_dir)
         assert state is not None
         return state.rules[name]
 

@@ -38,7 +38,7 @@ from zlib import crc32
 from pydantic import AfterValidator, ConfigDict, StringConstraints, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
-from ros2_memory.bag_dir.json_fields import Int64, json_object, validated
+from ros2_memory.bag_dir.json_files import Int64, parsed
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -247,16 +247,14 @@ def sure_handover(recording: Path) -> HandoverReading:
     """
     try:
         text = read_small_file(recording / HANDOVER_FILE)
-        handover = validated(_HANDOVER, json_object(text, FORMAT))
-        return HandoverReading(handover, None)
+        return HandoverReading(parsed(_HANDOVER, text, FORMAT), None)
     except (FileNotFoundError, NotADirectoryError):
         return HandoverReading(Handover(), None)
     except OSError as error:
         if error.errno not in _PERMANENT:
             raise
         reason = _unreadable(error)
-    # json raises RecursionError for a file of nothing but brackets.
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         reason = f"{HANDOVER_FILE} is not a valid sidecar: {error}"
     return HandoverReading(Handover(), reason)
 

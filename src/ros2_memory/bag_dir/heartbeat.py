@@ -20,7 +20,7 @@ from typing import Annotated, Final, NamedTuple, TypeAlias
 from pydantic import Field, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import Count, Int64, json_object, validated
+from ros2_memory.bag_dir.json_files import Count, Int64, parsed
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
 
@@ -183,8 +183,7 @@ def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
         return HeartbeatReading(None, f"there is no {HEARTBEAT_FILE}: no recorder has written here")
     except OSError as error:
         return HeartbeatReading(None, f"{HEARTBEAT_FILE} cannot be read: {error.strerror or error}")
-    # json raises RecursionError for a file of nothing but brackets.
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         return HeartbeatReading(None, f"{HEARTBEAT_FILE} is not a valid heartbeat: {error}")
 
 
@@ -234,4 +233,4 @@ _HEARTBEAT: Final = TypeAdapter(Heartbeat)
 # Read for every question about the present, and written every few seconds.
 @lru_cache(4)
 def _parse(text: str) -> Heartbeat:
-    return validated(_HEARTBEAT, json_object(text))
+    return parsed(_HEARTBEAT, text)

@@ -15,21 +15,13 @@
         20261120T043012Z-charging/         one saved moment
           moment.json                      its label and its time
           rec_20261120T043000Z/            hard links, under the names that the bags have above
-      .episodic/recorded.jsonl     recorded time when each recording ended
-      .episodic/lost.jsonl         messages that are missing (see `lost_file`)
-      .episodic/requests/          requests of the query server (see `request_queue`)
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
-      .episodic/triggers.json      what rules found so far (see `trigger_file`)
-      .episodic/erasing.json       messages that are being taken out of bags (see `erasure_file`)
-      .episodic/screened.json      what `recording.exclude_when` holds back (see `screened_file`)
-      .episodic/shipped.jsonl      which bags are in a lake (see `shipped_file`)
-      .episodic/forgotten.jsonl    what a lake has to forget (see `forgotten_file`)
-      .episodic/deleted.jsonl      what retention deleted (see `deleted_file`)
+      .episodic/requests/          requests of the query server (see `request_queue`)
+      .episodic/*.json, *.jsonl    what the two programs know (see `state_files`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before
 `ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
-No name here has the suffix of a bag, so the index ignores these files. What lies below `.episodic/`
-has its modules in `bag_dir.state`.
+No name here has the suffix of a bag, so the index ignores these files.
 """
 
 from __future__ import annotations
@@ -58,7 +50,7 @@ _CARRIED: Final = f"/{CARRY_FOLDER}/{CARRY_FILE}"
 MOMENTS_FOLDER: Final = "moments"
 MOMENT_FILE: Final = "moment.json"
 OWN_FOLDER: Final = ".episodic"
-RECORDED_FILE: Final = "recorded.jsonl"
+RECORDED_FILE: Final = f"{OWN_FOLDER}/recorded.jsonl"
 REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
 LOST_FILE: Final = f"{OWN_FOLDER}/lost.jsonl"
 LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"

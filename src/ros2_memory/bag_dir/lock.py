@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import is_open_file
-from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.json_files import is_integer
 from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.core.errors import RecorderError
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import yaml
 
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import integer
+from ros2_memory.bag_dir.json_files import integer
 from ros2_memory.bag_dir.layout import COMPRESSED, METADATA_FILE, bag_kind
 
 if TYPE_CHECKING:

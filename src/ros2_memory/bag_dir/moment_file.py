@@ -17,10 +17,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
-from pydantic import AfterValidator, ConfigDict, Field, StrictBool, TypeAdapter
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import Count, json_object, validated
+from ros2_memory.bag_dir.json_files import Count, parsed
 from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -108,7 +108,12 @@ class SavedMoment:
     matches: Count = 1
 
 
-_MOMENT: Final = TypeAdapter(SavedMoment)
+def _with_request(fields: dict[object, object]) -> dict[object, object]:
+    return {**fields, "request": fields}  # whose keys lie among those of the moment
+
+
+_Moment: TypeAlias = Annotated[SavedMoment, BeforeValidator(_with_request)]
+_MOMENT: Final[TypeAdapter[SavedMoment]] = TypeAdapter(_Moment)
 
 
 class StoredMoment(NamedTuple):
@@ -173,10 +178,8 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
 
 def read_saved_moment(folder: Path) -> SavedMoment | None:
     """Returns the moment of a folder; None where there is no file, or no valid one."""
-    with suppress(OSError, ValueError, RecursionError):
-        fields = json_object(read_small_file(folder / MOMENT_FILE), FORMAT)
-        # The keys of the request lie among those of the moment.
-        return validated(_MOMENT, {**fields, "request": fields})
+    with suppress(OSError, ValueError):
+        return parsed(_MOMENT, read_small_file(folder / MOMENT_FILE), FORMAT)
     return None
 
 

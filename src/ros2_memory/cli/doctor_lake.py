@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.layout import (
     has_recorded,
     is_carried,
 )
-from ros2_memory.bag_dir.state.shipped_file import is_shipped, read_receipts
+from ros2_memory.bag_dir.state_files import is_shipped, read_receipts
 from ros2_memory.bootstrap_lake import lake_location
 from ros2_memory.catalogue.store import relative
 from ros2_memory.cli.findings import Finding, error, in_order, warning

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
-from ros2_memory.bag_dir.state.own_recordings import folders_with_bags
+from ros2_memory.bag_dir.own_recordings import folders_with_bags
 from ros2_memory.cli.output import with_local_times
 from ros2_memory.config import (
     NullRecorderNode,

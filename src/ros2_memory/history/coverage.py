@@ -13,7 +13,7 @@ The first few of each kind are named, and the others counted:
 - bags that a crash left open, up to the last time that their files were written to;
 - closed bags of which parts could not be read, or that contradict themselves;
 - gaps, and times before the memory begins, of which retention deleted what was recorded;
-- messages that the recorder found to be missing (`bag_dir.state.lost_file`);
+- messages that the recorder found to be missing (`bag_dir.state_files`);
 - stretches that `recording.exclude_when` excluded;
 - bags that a wrong clock dated, except where the answer is that there is nothing.
 """
@@ -24,9 +24,12 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
-from ros2_memory.bag_dir.state.deleted_file import deleted_spans
-from ros2_memory.bag_dir.state.lost_file import INTERRUPTIONS, read_losses
-from ros2_memory.bag_dir.state.screened_file import excluded_between
+from ros2_memory.bag_dir.state_files import (
+    INTERRUPTIONS,
+    deleted_spans,
+    excluded_between,
+    read_losses,
+)
 from ros2_memory.core.bag_summary import (
     DOUBTS,
     MESSAGES_MISSING,

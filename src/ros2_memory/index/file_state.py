@@ -22,7 +22,7 @@ grew within the last three splits is active unless the `metadata.yaml` beside it
 writes last, lists it, or a live heartbeat names other recordings only. A `.zstd` is written after
 the bag in it was closed; it is open until its last frame is complete.
 
-What the recorder holds back until it was screened (`bag_dir.state.screened_file`) counts as active,
+What the recorder holds back until it was screened (`bag_dir.state_files`) counts as active,
 whatever it is, and never answers.
 
 Where a scan includes active files an active `.mcap` is a bag as well as set aside: its complete
@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
-from ros2_memory.bag_dir.state.screened_file import read_gate
+from ros2_memory.bag_dir.state_files import read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -47,7 +47,7 @@ from ros2_memory.index.scan import YOUNG_NS, settled
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
-    from ros2_memory.bag_dir.state.screened_file import Gate
+    from ros2_memory.bag_dir.state_files import Gate
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader

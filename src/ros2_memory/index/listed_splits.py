@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
 from ros2_memory.bag_dir.metadata_yaml import bare_name, read_listing
-from ros2_memory.bag_dir.state.deleted_file import read_deleted
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state_files import read_deleted
 from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed

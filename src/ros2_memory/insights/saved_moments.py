@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.bag_dir.moment_file import stored_moments_in
-from ros2_memory.bag_dir.state.request_queue import PendingRequest
-from ros2_memory.bag_dir.state.trigger_file import read_trigger_state
+from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
@@ -20,7 +20,7 @@ from ros2_memory.results import FiredRule, MomentList, RememberedMoment, ShownMo
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state.request_queue import Outcome
+    from ros2_memory.bag_dir.request_queue import Outcome
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
 
@@ -132,7 +132,7 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
         OSError: it is there and cannot be read.
     """
     try:
-        state = read_trigger_state(bag_dir)
+        state = TRIGGERS.read(bag_dir)
     except ValueError:
         return ()  # the recorder reports that, and starts again
     return tuple(

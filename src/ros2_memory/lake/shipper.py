@@ -20,11 +20,11 @@ from ros2_memory.bag_dir.layout import (
     has_recorded,
     is_carried,
 )
-from ros2_memory.bag_dir.state.forgotten_file import read_forgettings
-from ros2_memory.bag_dir.state.shipped_file import (
+from ros2_memory.bag_dir.state_files import (
     Receipt,
     append_receipts,
     is_shipped,
+    read_forgettings,
     read_receipts,
 )
 from ros2_memory.catalogue.store import relative

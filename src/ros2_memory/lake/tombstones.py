@@ -11,7 +11,7 @@ from dataclasses import asdict, astuple, dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import append_durably
-from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.json_files import is_integer
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.lake.rows import id_of_file
@@ -19,7 +19,7 @@ from ros2_memory.lake.rows import id_of_file
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state.forgotten_file import Forgetting
+    from ros2_memory.bag_dir.state_files import Forgetting
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader

@@ -19,7 +19,7 @@ import structlog
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader, build_recorder, claim
 from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
 from ros2_memory.core.errors import ConfigError, EpisodicError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
-    from ros2_memory.bag_dir.state.lost_file import Interruption
+    from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
 
 

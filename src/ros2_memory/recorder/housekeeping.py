@@ -19,8 +19,8 @@ import structlog
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
-from ros2_memory.bag_dir.state.lost_file import EVERY_TOPIC, Loss, append_losses
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Loss, append_losses
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state.lost_file import Interruption
+    from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.policy import RetentionLimits

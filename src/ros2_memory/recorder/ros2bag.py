@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.layout import (
     STORAGE_FILE,
     node_name,
 )
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.base import Housekeeper, Recorder

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state.lost_file import Interruption
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading

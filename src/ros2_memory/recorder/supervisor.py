@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back

@@ -31,7 +31,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal
 
 if TYPE_CHECKING:
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
 

@@ -17,8 +17,7 @@ import structlog
 
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.metadata_yaml import bare_name
-from ros2_memory.bag_dir.state.deleted_file import append_deleted, deleted_of
-from ros2_memory.bag_dir.state.shipped_file import ReceiptBook
+from ros2_memory.bag_dir.state_files import append_deleted, deleted_of, unshipped
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import free_bytes
@@ -29,8 +28,8 @@ from ros2_memory.retention.recorded_time import relative_recording
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
-    from ros2_memory.bag_dir.state.deleted_file import Deleted
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.state_files import Deleted
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
@@ -147,7 +146,6 @@ class GarbageCollector:
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
         self._needed = needed
-        self._receipts = ReceiptBook(bag_dir) if limits.require_shipped else None
         self._measure_free = measure_free
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
@@ -207,13 +205,11 @@ class GarbageCollector:
 
     def _unshipped(self, stock: RetentionStock) -> frozenset[str]:
         """Returns the bags that are in no lake, where they must be."""
-        if self._receipts is None:
+        if not self._limits.require_shipped:
             return frozenset()
         root = f"{self._bag_dir}{os.sep}"
-        lacking = self._receipts.lacking(
-            (bag.path.removeprefix(root), bag.size) for bag in stock.bags
-        )
-        return frozenset(root + each for each in lacking)
+        bags = ((bag.path.removeprefix(root), bag.size) for bag in stock.bags)
+        return frozenset(root + path for path in unshipped(self._bag_dir, bags))
 
     def _with_clocks(
         self, stock: RetentionStock, limits: RetentionLimits, run: _Pass

@@ -1,6 +1,6 @@
 """Deletes messages by rewriting their bags, and all files that name or repeat them.
 
-What goes is written down first (`bag_dir.state.erasure_file`), so that an interrupted erasure can
+What goes is written down first (`bag_dir.state_files`), so that an interrupted erasure can
 be finished. Then for each bag: its messages leave the sidecar; the bag is rewritten beside
 itself, read back, compared and flushed; and the new file takes the name of the old one, wherever a
 hard link in a moment has it. It is done when no name of the old one is left.
@@ -36,8 +36,14 @@ from ros2_memory.bag_dir.layout import (
     is_kept_apart,
 )
 from ros2_memory.bag_dir.metadata_yaml import correct
-from ros2_memory.bag_dir.state.erasure_file import Erased, Erasure, remove_erasure, write_erasure
-from ros2_memory.bag_dir.state.lost_file import Loss, append_losses, read_losses
+from ros2_memory.bag_dir.state_files import (
+    ERASING,
+    Erased,
+    Erasure,
+    Loss,
+    append_losses,
+    read_losses,
+)
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
@@ -52,7 +58,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from ros2_memory.bag_dir.handover_file import MessageList
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader, BagWriter
@@ -195,7 +201,7 @@ class Eraser:
         """
         if not erasure.files:
             erasure = self._with_files(erasure, survey)
-        write_erasure(self._bag_dir, erasure)
+        ERASING.write(self._bag_dir, erasure)
         kept: list[str] = []
         left = self._left_by_recording(survey)
         for holder in survey.holders:
@@ -211,7 +217,7 @@ class Eraser:
             forgotten(erasure)
             self._record_deletion(erasure)
             if not kept:
-                remove_erasure(self._bag_dir)
+                ERASING.remove(self._bag_dir)
         except (EpisodicError, OSError) as error:
             kept.append(_reason_of(error))
         return Kept(tuple(kept), tuple(notes))

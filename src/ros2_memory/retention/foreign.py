@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.bag_dir.layout import is_kept_apart
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import known_identity
 from ros2_memory.retention.delete import size_of
 

@@ -36,7 +36,7 @@ from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags

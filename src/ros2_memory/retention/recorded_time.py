@@ -8,7 +8,6 @@ without a line counts as recorded when it is first asked about: nothing shows th
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import threading
@@ -16,13 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.bag_dir.durable_write import (
-    append_durably,
-    open_plain,
-    write_durably,
-)
-from ros2_memory.bag_dir.layout import OWN_FOLDER, RECORDED_FILE
-from ros2_memory.core import directories
+from ros2_memory.bag_dir.layout import RECORDED_FILE
+from ros2_memory.bag_dir.state_files import RECORDED, Recorded
 from ros2_memory.core.timebase import Ns, ns_from_unix
 
 if TYPE_CHECKING:
@@ -34,8 +28,6 @@ SAVE_S: Final = 60.0
 LONGEST_SILENCE_S: Final = 60.0
 """A pause in which nothing reached the disk counts as recorded for at most so long."""
 _MOST_LINES: Final = 20_000
-_MOST_BYTES: Final = 1 << 26
-_LONGEST_S: Final = 1e9
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -49,7 +41,7 @@ class RecordedTime:
 
     def __init__(self, bag_dir: Path) -> None:
         self._bag_dir = bag_dir
-        self._path = bag_dir / OWN_FOLDER / RECORDED_FILE
+        self._path = bag_dir / RECORDED_FILE
         self._lock = threading.Lock()
         self._loaded = False
         self._total_s = 0.0
@@ -107,16 +99,16 @@ class RecordedTime:
             return
         self._loaded = True
         try:
-            with open_plain(self._path) as stream:
-                for line in stream.read(_MOST_BYTES).splitlines():
-                    self._take(line)
-        except FileNotFoundError:
-            return
+            rows = RECORDED.rows(self._bag_dir)
         except (OSError, ValueError) as error:
             _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
-        self._total_s = max(self._last_grew_s.values(), default=0.0)
+            rows = []
+        self._last_grew_s = {row.recording: row.recorded_s for row in rows}
+        if not rows:
+            return
+        self._total_s = max(self._last_grew_s.values())
         # The greatest is the total: it stays even if its recording is gone.
-        newest = max(self._last_grew_s, key=self._last_grew_s.__getitem__, default=None)
+        newest = max(self._last_grew_s, key=self._last_grew_s.__getitem__)
         self._last_grew_s = {
             name: recorded_s
             for name, recorded_s in self._last_grew_s.items()
@@ -124,31 +116,14 @@ class RecordedTime:
         }
         self._lines = _MOST_LINES  # so that the next save leaves out what is gone
 
-    def _take(self, line: bytes) -> None:
-        """Reads one line; ignores one that a crash cut short."""
-        try:
-            value: object = json.loads(line)
-        except (ValueError, RecursionError):
-            return
-        if not isinstance(value, dict):
-            return
-        name, recorded_s = value.get("recording"), value.get("recorded_s")
-        if (
-            isinstance(name, str)
-            and isinstance(recorded_s, int | float)
-            and 0 <= recorded_s <= _LONGEST_S
-        ):
-            self._last_grew_s[name] = float(recorded_s)
-
     def _save(self) -> None:
         names = sorted(self._unsaved)
         try:
-            directories.make(self._bag_dir, self._path.parent)
             if self._lines + len(names) > _MOST_LINES:
-                write_durably(self._path, self._text(self._last_grew_s))
+                RECORDED.replace(self._bag_dir, self._rows(self._last_grew_s))
                 self._lines = len(self._last_grew_s)
             elif names:
-                append_durably(self._path, self._text(names))
+                RECORDED.append(self._bag_dir, self._rows(names))
                 self._lines += len(names)
         except OSError as error:
             reason = f"{self._path}: {error.strerror or error}"
@@ -159,13 +134,8 @@ class RecordedTime:
             self._unsaved.clear()
             self._reported = None
 
-    def _text(self, names: Iterable[str]) -> str:
-        # A line break before, too: a line that a full disk cut short must not swallow the next.
-        lines = (
-            json.dumps({"recording": name, "recorded_s": round(self._last_grew_s[name], 3)})
-            for name in names
-        )
-        return "".join(f"\n{line}\n" for line in lines)
+    def _rows(self, names: Iterable[str]) -> list[Recorded]:
+        return [Recorded(name, round(self._last_grew_s[name], 3)) for name in names]
 
 
 def relative_recording(recording: str, bag_dir: Path) -> str:

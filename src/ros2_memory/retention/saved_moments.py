@@ -32,7 +32,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
-from ros2_memory.bag_dir.state.request_queue import Outcome, RequestQueue
+from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, iso_local

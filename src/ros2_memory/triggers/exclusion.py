@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.bag_dir.state.screened_file import ConditionInterval, Excluded
+from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.spans import lies_inside, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS

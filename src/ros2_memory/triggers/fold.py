@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.bag_dir.state.trigger_file import RunRecord
+from ros2_memory.bag_dir.state_files import RunRecord
 from ros2_memory.triggers.rules import RuleKind
 
 if TYPE_CHECKING:

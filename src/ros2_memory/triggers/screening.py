@@ -25,13 +25,12 @@ import structlog
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE, bag_kind, named_start
 from ros2_memory.bag_dir.metadata_yaml import correct
-from ros2_memory.bag_dir.state.screened_file import (
+from ros2_memory.bag_dir.state_files import (
+    SCREENED,
     ConditionInterval,
     FileStep,
     RecordingScreen,
     ScreenState,
-    read_screen_state,
-    write_screen_state,
 )
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import (
@@ -60,7 +59,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state.screened_file import Excluded
+    from ros2_memory.bag_dir.state_files import Excluded
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, BagWriter, Record
@@ -466,7 +465,7 @@ class Screening:
         """
         if self._state is None:
             try:
-                self._state = read_screen_state(self._bag_dir) or ScreenState()
+                self._state = SCREENED.read(self._bag_dir) or ScreenState()
             except ValueError as error:
                 raise RecorderError(
                     f"{self._bag_dir / SCREENED_FILE}: {error}; which splits are still unscreened "
@@ -494,7 +493,7 @@ class Screening:
 
     def _write(self, recordings: dict[str, RecordingScreen], excluded: list[Excluded]) -> None:
         state = ScreenState(recordings, excluded)
-        write_screen_state(self._bag_dir, state)
+        SCREENED.write(self._bag_dir, state)
         self._state = state
 
     def _report(self, path: Path, error: Exception) -> None:

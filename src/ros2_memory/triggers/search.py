@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.conditions import refusal_for
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.bag_dir.state.trigger_file import LatchedMark, RuleRecord
+from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.triggers.fold import RuleFold
@@ -24,7 +24,7 @@ from ros2_memory.triggers.rules import RuleKind
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.bag_dir.state.trigger_file import TriggerState
+    from ros2_memory.bag_dir.state_files import TriggerState
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record

@@ -19,12 +19,11 @@ import structlog
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
-from ros2_memory.bag_dir.state.trigger_file import (
+from ros2_memory.bag_dir.state_files import (
+    TRIGGERS,
     RuleMoment,
     RuleRecord,
     TriggerState,
-    read_trigger_state,
-    write_trigger_state,
 )
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot
@@ -157,7 +156,7 @@ class Triggers:
         self._is_written &= state == self._state
         self._state = state
         if not self._is_written:
-            write_trigger_state(self._bag_dir, state)
+            TRIGGERS.write(self._bag_dir, state)
             self._is_written = True
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
@@ -188,7 +187,7 @@ class Triggers:
         if state is None:
             problem = None
             try:
-                state = read_trigger_state(self._bag_dir)
+                state = TRIGGERS.read(self._bag_dir)
             except ValueError as error:
                 problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
                 _log.error("trigger_state_lost", reason=problem)

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.bag_dir import durable_write
 from ros2_memory.bag_dir.durable_write import (
     flush_bags,
-    read_small_file,
     write_all_durably,
-    write_durably,
 )
 
 
@@ -26,30 +23,6 @@ def flushed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     monkeypatch.setattr(os, "fsync", fsync)
     return names
-
-
-def test_a_small_file_is_on_the_disk_before_it_gets_its_name(
-    tmp_path: Path, flushed: list[str]
-) -> None:
-    write_durably(tmp_path / "state.json", "{}")
-    assert flushed == [".state.json.tmp", tmp_path.name]
-    assert [path.name for path in tmp_path.iterdir()] == ["state.json"]
-
-
-def test_a_file_that_cannot_be_replaced_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target = tmp_path / "state.json"
-    write_durably(target, "before")
-
-    def full(_descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_durably(target, "after")
-    assert target.read_text() == "before"
-    assert [path.name for path in tmp_path.iterdir()] == ["state.json"]
 
 
 def test_closed_splits_are_flushed_and_then_the_directory_that_names_them(
@@ -76,17 +49,6 @@ def test_what_cannot_be_flushed_is_named(tmp_path: Path, monkeypatch: pytest.Mon
     assert len(faults) == 2
     assert faults[0].startswith(str(tmp_path / "a.mcap"))
     assert "power cut" in faults[0]
-
-
-def test_only_a_small_regular_file_is_read(tmp_path: Path) -> None:
-    (tmp_path / "large").write_bytes(b" " * (durable_write.MAX_SMALL_FILE + 1))
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "fine").write_text("text")
-    assert read_small_file(tmp_path / "fine") == "text"
-    with pytest.raises(ValueError, match="larger than"):
-        read_small_file(tmp_path / "large")
-    with pytest.raises(ValueError, match="not a regular file"):
-        read_small_file(tmp_path / "pipe")
 
 
 def test_of_several_files_none_is_replaced_where_one_cannot_be_written(tmp_path: Path) -> None:

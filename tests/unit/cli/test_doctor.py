@@ -17,7 +17,7 @@ from mcap.writer import Writer
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.state.shipped_file import Receipt, append_receipts
+from ros2_memory.bag_dir.state_files import Receipt, append_receipts
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap

@@ -29,8 +29,7 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import Contents, describing
-from ros2_memory.bag_dir.state.erasure_file import read_erasure
-from ros2_memory.bag_dir.state.lost_file import read_losses
+from ros2_memory.bag_dir.state_files import ERASING, read_losses
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey
@@ -537,7 +536,7 @@ class TestInterruption:
                     finished = False
                 else:
                     finished = True
-            begun = read_erasure(bag_dir)
+            begun = ERASING.read(bag_dir)
             if not finished and begun is None:
                 # Nothing was begun, or everything was done.
                 left = traces(bag_dir, SAID)
@@ -551,7 +550,7 @@ class TestInterruption:
                 assert "an earlier forget was interrupted" in capsys.readouterr().out
                 assert traces(bag_dir, SAID) == [], steps
                 assert stored(bag_dir / "rec_a") == others
-                assert read_erasure(bag_dir) is None
+                assert ERASING.read(bag_dir) is None
             if finished:
                 break
         assert steps > 8
@@ -589,7 +588,7 @@ def cut_off_after(patch: pytest.MonkeyPatch, steps: int) -> None:
         (eraser, "flush"),
         (eraser, "correct"),
         (eraser, "append_losses"),
-        (eraser, "remove_erasure"),
+        (ERASING, "remove"),
         (cli_forget, "purge"),
     ):
         patch.setattr(place, name, counting(getattr(place, name)))

@@ -13,7 +13,7 @@ import pytest
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.state.lost_file import Loss, append_losses
+from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.output import format_duration
 from ros2_memory.cli.watch import AS_USUAL, TopicRate
 from ros2_memory.core.timebase import NS_PER_S

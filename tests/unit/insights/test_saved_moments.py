@@ -17,8 +17,8 @@ from ros2_memory.bag_dir.moment_file import (
     make_moment_folder,
     write_saved_moment,
 )
-from ros2_memory.bag_dir.state.request_queue import PendingRequest
-from ros2_memory.bag_dir.state.trigger_file import RuleRecord, TriggerState, write_trigger_state
+from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord, TriggerState
 from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import RefusedError
@@ -225,7 +225,7 @@ class TestTheList:
     def test_rules_are_told_with_how_often_they_fired(self, tmp_path: Path) -> None:
         (tmp_path / ".episodic").mkdir()
         bumper = RuleRecord(fired=3, moments=1, refused=2, last_fired=NOW - 5 * S, problem="full")
-        write_trigger_state(tmp_path, TriggerState({"door": RuleRecord(), "bumper": bumper}))
+        TRIGGERS.write(tmp_path, TriggerState({"door": RuleRecord(), "bumper": bumper}))
         self.keep(tmp_path, 1, pending=False, rule="bumper", matches=3)
         memory = memory_of(tmp_path, clock=SettableClock(NOW))
         told = shown(memory, tmp_path)

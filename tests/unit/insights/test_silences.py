@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.bag_dir.state.lost_file import Loss, append_losses
+from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.timebase import local_text
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock

@@ -10,8 +10,13 @@ from mcap.writer import Writer
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.state.lost_file import Loss, append_losses
-from ros2_memory.bag_dir.state.screened_file import Excluded, ScreenState, write_screen_state
+from ros2_memory.bag_dir.state_files import (
+    SCREENED,
+    Excluded,
+    Loss,
+    ScreenState,
+    append_losses,
+)
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index.listed_splits import absent_splits
@@ -197,7 +202,7 @@ def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -
 def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
     beating(tmp_path, RecorderState.RECORDING, 59, held_back="1 split is not served")
-    write_screen_state(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
+    SCREENED.write(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
     told = shown(memory, tmp_path)
     assert told["trust"] == "1 split is not served"
     [note] = told["notes"]

@@ -14,7 +14,7 @@ from pyiceberg.typedef import Record
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
-from ros2_memory.bag_dir.state.forgotten_file import Forgetting, read_forgettings
+from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.forgetting import Forgotten, forget_in_lake

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 
-from ros2_memory.bag_dir.state.shipped_file import read_receipts
+from ros2_memory.bag_dir.state_files import read_receipts
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.tables import TABLES

@@ -10,8 +10,7 @@ import structlog
 import zstandard
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.state.lost_file import read_losses
-from ros2_memory.bag_dir.state.shipped_file import Receipt, append_receipts
+from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS

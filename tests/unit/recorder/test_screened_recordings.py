@@ -10,12 +10,11 @@ import pytest
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
-from ros2_memory.bag_dir.state.screened_file import read_gate
+from ros2_memory.bag_dir.state_files import SCREENED, read_gate
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.triggers import screening
 from ros2_memory.triggers.screening import Screening
 from tests.support.bags import McapLayout
 from tests.support.housekeepers import keeper_of, recording_now
@@ -83,7 +82,7 @@ class TestSessions:
         world.supervisor.start()
         world.run(15)
         with monkeypatch.context() as patched:
-            patched.setattr(screening, "write_screen_state", full)
+            patched.setattr(SCREENED, "write", full)
             world.run(15)
             assert len(world.recorders) == 1
             assert "screened.json: No space left" in world.heartbeat()["last_error"]

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
 
+from ros2_memory.bag_dir import state_files
 from ros2_memory.bag_dir.layout import DELETED_FILE
-from ros2_memory.bag_dir.state import deleted_file
-from ros2_memory.bag_dir.state.deleted_file import (
+from ros2_memory.bag_dir.state_files import (
+    DELETED,
+    EVERY_TOPIC,
+    Loss,
     append_deleted,
+    append_losses,
     deleted_of,
     deleted_spans,
     read_deleted,
 )
-from ros2_memory.bag_dir.state.lost_file import EVERY_TOPIC, Loss, append_losses
 from ros2_memory.index.listed_splits import absent_splits
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept, recording, size_of
@@ -136,7 +138,7 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
-        patched.setattr(deleted_file, "append_durably", full)
+        patched.setattr(DELETED, "append", full)
         house.apply()
     assert "deletions_not_written" in {each["event"] for each in captured}
     assert not any(path.exists() for path in old)
@@ -149,7 +151,7 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
 def test_the_list_stays_short_however_long_the_robot_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(deleted_file, "_MOST_BYTES", 20_000)
+    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 20_000)
     (tmp_path / "here").mkdir()
     append_deleted(tmp_path, [deleted_of("here", [("here_0.mcap", T0 - 50 * S, T0 - 40 * S)])])
     for n in range(1000):
@@ -166,13 +168,3 @@ def test_a_split_in_which_the_clock_was_set_shows_no_time(tmp_path: Path) -> Non
     append_deleted(tmp_path, [deleted_of("a", splits)])
     assert deleted_spans(tmp_path) == ((T0, T0 + 9 * S + 1),)
     assert len(read_deleted(tmp_path)["a"].files) == 3
-
-
-@pytest.mark.parametrize("line", ["", "{", "[" * 5000, '{"recording": 1}', '{"recording": "a"'])
-def test_lines_that_mean_nothing_are_ignored(tmp_path: Path, line: str) -> None:
-    append_deleted(tmp_path, [deleted_of("a", [("a_0.mcap", T0, T0 + S)])])
-    with (tmp_path / DELETED_FILE).open("a") as stream:
-        stream.write(line)
-    append_deleted(tmp_path, [deleted_of("b", [("b_0.mcap", T0, T0 + S)])])
-    assert [*read_deleted(tmp_path)] == ["a", "b"]
-    assert json.loads((tmp_path / DELETED_FILE).read_text().splitlines()[0])["recording"] == "a"

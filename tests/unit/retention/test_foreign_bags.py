@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import claim
 from ros2_memory.history.context import Call
 from ros2_memory.insights.status import memory_status

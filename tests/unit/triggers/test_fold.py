@@ -17,7 +17,7 @@ from tests.support.watched_bags import S, rule
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.bag_dir.state.trigger_file import RunRecord
+    from ros2_memory.bag_dir.state_files import RunRecord
 
 Stream = list[tuple[int, bool | None]]
 

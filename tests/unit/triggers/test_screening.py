@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
-from ros2_memory.bag_dir.state.screened_file import excluded_between, read_gate, read_screen_state
+from ros2_memory.bag_dir.state_files import SCREENED, excluded_between, read_gate
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import rewriting
 from ros2_memory.storage.mcap.writer import McapWriter
-from ros2_memory.triggers import screening
 from tests.support.bags import McapLayout, odom
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.screened_bags import (
@@ -256,7 +255,7 @@ class TestFaults:
             raise OSError(errno.ENOSPC, "No space left on device")
 
         with monkeypatch.context() as patched:
-            patched.setattr(screening, "write_screen_state", full)
+            patched.setattr(SCREENED, "write", full)
             with pytest.raises(OSError, match="No space"):
                 bags.end()
             with pytest.raises(RecorderError, match=r"screened\.json: No space"):
@@ -295,7 +294,7 @@ class TestFaults:
         bags.split(name, words(10, 20))
         bags.step()
         assert len(bags.served()) == 1
-        state = read_screen_state(bags.bag_dir)
+        state = SCREENED.read(bags.bag_dir)
         assert state is not None
         assert [*state.recordings] == [name]
 
@@ -322,7 +321,7 @@ def interrupted_at(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
         return call
 
-    for module, name in ((screening, "write_screen_state"), (rewriting, "replace_file")):
+    for module, name in ((SCREENED, "write"), (rewriting, "replace_file")):
         real = getattr(module, name)
         monkeypatch.setattr(module, name, dying(dying(real, after=True), after=False))
     monkeypatch.setattr(McapWriter, "cut", dying(McapWriter.cut, after=True))

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
-from ros2_memory.bag_dir.state import trigger_file
+from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.retention import saved_moments
 from ros2_memory.triggers.rules import RuleKind
 from tests.support.bags import McapLayout, Msg, boolean, text
@@ -301,7 +302,7 @@ class TestFaults:
 
         with monkeypatch.context() as broken:
             broken.setattr(saved_moments, "make_moment_folder", full)
-            broken.setattr(trigger_file, "write_durably", full)
+            broken.setattr(json_files, "write_durably", full)
             robot.close_all()
             robot.look()
         assert not robot.moments()
@@ -359,7 +360,7 @@ class TestFaults:
 
         robot.beat(state=RecorderState.STOPPED)
         with monkeypatch.context() as broken:
-            broken.setattr("ros2_memory.triggers.watch.write_trigger_state", killed)
+            broken.setattr(TRIGGERS, "write", killed)
             with pytest.raises(KilledError):
                 robot.look()
         assert len(robot.moments()) == 2

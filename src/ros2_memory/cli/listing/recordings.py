@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import supposed_own
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,

@@ -11,7 +11,7 @@ import typer
 
 from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings, folders_with_bags, is_regular
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,

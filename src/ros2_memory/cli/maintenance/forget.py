@@ -30,13 +30,8 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
-from ros2_memory.bag_dir.state.erasure_file import Erasure, read_erasure
-from ros2_memory.bag_dir.state.forgotten_file import (
-    Forgetting,
-    ForgottenBag,
-    append_forgettings,
-)
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state_files import ERASING, FORGOTTEN, Erasure, Forgetting, ForgottenBag
 from ros2_memory.bootstrap import build_reader, catalogue_paths, supposed_own
 from ros2_memory.catalogue.purge import purge
 from ros2_memory.catalogue.store import BagKey
@@ -200,7 +195,7 @@ class _Taking:
     def finish(self) -> bool:
         """Finishes an erasure that was interrupted; returns whether something of it stays."""
         try:
-            begun = read_erasure(self._bag_dir)
+            begun = ERASING.read(self._bag_dir)
         except ValueError as error:
             raise RecorderError(
                 f"{self._bag_dir / ERASING_FILE}: {error}; an earlier forget was interrupted: "
@@ -523,7 +518,7 @@ def _request_of_lake(bag_dir: Path, forgettings: Sequence[Forgetting]) -> list[s
     if not forgettings:
         return []
     try:
-        append_forgettings(bag_dir, forgettings)
+        FORGOTTEN.append(bag_dir, forgettings)
     except OSError as error:
         first = min(each.start for each in forgettings) // NS_PER_S
         last = -(-max(each.stop for each in forgettings) // NS_PER_S)

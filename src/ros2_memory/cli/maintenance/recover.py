@@ -20,7 +20,7 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE, is_kept_apart
 from ros2_memory.bag_dir.metadata_yaml import is_named_by_rosbag2
-from ros2_memory.bag_dir.state.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import EXIT_NEGATIVE, AsJson, print_line
 from ros2_memory.cli.output import progress_bar

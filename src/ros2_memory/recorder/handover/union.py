@@ -29,7 +29,7 @@ from ros2_memory.bag_dir.handover_file import (
     message_id,
     write_handovers,
 )
-from ros2_memory.bag_dir.state.screened_file import OPEN_GATE, read_gate
+from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns

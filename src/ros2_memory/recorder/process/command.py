@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import yaml
 
-from ros2_memory.bag_dir.state.own_recordings import BAG_DIR_ID, PROGRAM, RECORDED_BY
+from ros2_memory.bag_dir.own_recordings import BAG_DIR_ID, PROGRAM, RECORDED_BY
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.topics import TopicSelection
 

@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.state.lost_file import Loss
+from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.recorder.reception.continuity import Hole, Kind, Position, holes
 

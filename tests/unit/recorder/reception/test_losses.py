@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable
-from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.state import lost_file
-from ros2_memory.bag_dir.state.lost_file import Loss, append_losses, read_losses
+from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.recorder.reception.continuity import Position, holes, reader_of
 from ros2_memory.recorder.reception.losses import HOUR_NS, LossCounter, Progress
 from ros2_memory.storage.base import Schema
@@ -230,18 +228,3 @@ def test_counters_and_stamps_are_found_by_the_definition(
 def test_other_types_show_nothing(text: str) -> None:
     assert reader_of(Schema("a/msg/B", "ros2msg", text.encode())) is None
     assert reader_of(Schema("a/msg/B", "ros2idl", b"uint32 seq\n")) is None
-
-
-def test_losses_are_read_back_for_a_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    losses = [Loss("/odom", T0 + n * NS, T0 + n * NS + 5, 1, "stamps") for n in range(100)]
-    assert read_losses(tmp_path, T0, T0 + NS) == ()
-    append_losses(tmp_path, losses[:50])
-    with (tmp_path / ".episodic" / "lost.jsonl").open("a") as stream:
-        stream.write("[1]\nno json\n{}\n")
-    append_losses(tmp_path, losses[50:])
-    assert read_losses(tmp_path, T0, T0 + 200 * NS) == losses
-    assert read_losses(tmp_path, T0 + 3 * NS + 1, T0 + 5 * NS) == losses[3:5]
-    monkeypatch.setattr(lost_file, "MOST_BYTES", 8000)
-    append_losses(tmp_path, losses[:1])
-    assert read_losses(tmp_path, T0 + 90 * NS, T0 + 200 * NS) == losses[90:]
-    assert len(read_losses(tmp_path, 0, T0 + 200 * NS)) < 60

@@ -24,7 +24,7 @@ import structlog
 from pydantic import StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.json_fields import Count, json_object, validated
+from ros2_memory.bag_dir.json_files import READABLE, Count, parsed
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import FORMAT, REQUEST, SaveRequest
 from ros2_memory.core import directories
@@ -42,7 +42,6 @@ MAX_REQUEST_BYTES: Final = 4096
 STALE_NS: Final[Ns] = 60 * NS_PER_S
 """An older request was not withdrawn because its server died."""
 _KEEP_ANSWER_NS: Final[Ns] = 600 * NS_PER_S
-_READABLE: Final = 0o644  # the two programs may run as different users
 _REQUEST_NAME: Final = re.compile(r"[0-9a-f]{32}\.(json|taken)")
 _OWN_NAME: Final = re.compile(r"\.?[0-9a-f]{32}\.(json|taken|answer)(\.tmp)?")
 
@@ -80,12 +79,12 @@ class PendingRequest:
             OSError: it cannot be written.
         """
         directories.make(self._bag_dir, self._folder)
-        write_durably(self._path("json"), json.dumps(self.request.to_json()), mode=_READABLE)
+        write_durably(self._path("json"), json.dumps(self.request.to_json()), mode=READABLE)
 
     def outcome(self) -> Outcome | None:
         """Returns the outcome; None while there is none."""
-        with suppress(OSError, ValueError, RecursionError):
-            return validated(_OUTCOME, json_object(read_small_file(self._path("answer")), FORMAT))
+        with suppress(OSError, ValueError):
+            return parsed(_OUTCOME, read_small_file(self._path("answer")), FORMAT)
         return None
 
     def withdraw(self) -> bool:
@@ -151,7 +150,7 @@ class RequestQueue:
             OSError: it cannot be written.
         """
         text = json.dumps({"format": FORMAT, **asdict(outcome)})
-        write_durably(self._folder / f"{request.number}.answer", text, mode=_READABLE)
+        write_durably(self._folder / f"{request.number}.answer", text, mode=READABLE)
         self._delete(request.number)
 
     def _take(self, name: str, now: Ns) -> SaveRequest | None:
@@ -163,7 +162,7 @@ class RequestQueue:
             return _read_request(path, number, now)
         except FileNotFoundError:
             return None  # withdrawn
-        except (OSError, ValueError, RecursionError) as error:
+        except (OSError, ValueError) as error:
             self._ignored.add(path.name)
             _log.warning("request_ignored", path=str(path), reason=str(error))
             self._delete(number)
@@ -202,7 +201,7 @@ def _read_request(path: Path, number: str, now: Ns) -> SaveRequest:
     """
     if path.lstat().st_size > MAX_REQUEST_BYTES:
         raise ValueError(f"it is larger than {MAX_REQUEST_BYTES} bytes")
-    request = validated(REQUEST, json_object(read_small_file(path), FORMAT))
+    request = parsed(REQUEST, read_small_file(path), FORMAT)
     if request.number != number:
         raise ValueError("it has the number of another")
     if abs(now - request.asked) > STALE_NS:

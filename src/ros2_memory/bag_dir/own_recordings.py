@@ -19,9 +19,7 @@ that have gone, the list is written again without them.
 from __future__ import annotations
 
 import fcntl
-import json
 import os
-import re
 import stat
 import threading
 import time
@@ -29,26 +27,26 @@ import uuid
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final
 
 import structlog
+from pydantic import AfterValidator, Field, StrictBool
 
 from ros2_memory.bag_dir.durable_write import (
     append_lines,
     flush,
     is_open_file,
-    open_plain,
     write_durably,
 )
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_fields import integer
+from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.bag_dir.layout import LIST_FILE, bag_kind, has_own_name
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from typing import TypeAlias
 
     CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
@@ -61,7 +59,6 @@ RECORDED_BY: Final = "recorded_by"
 BAG_DIR_ID: Final = "bag_dir_id"
 PROGRAM: Final = "ros2-memory"
 
-_MAX_BYTES: Final = 64 << 20
 _SPARE_LINES: Final = 1000
 _MAX_NAMED: Final = 5
 _LOCK_WAIT_S: Final = 2.0
@@ -71,73 +68,41 @@ _APPEND: Final = os.O_RDWR | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_N
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-class _Entry(NamedTuple):
-    """What the list holds of one recording; `identity` is None until its child has made it."""
+def _checked_name(name: str) -> str:
+    if "\0" in name or {"", ".", ".."}.intersection(name.split("/")):
+        raise ValueError("it must be the path of a directory below the bag directory")
+    return name
 
-    identity: Identity | None = None
-    adopted: bool = False
+
+@dataclass(frozen=True, slots=True)
+class ListRow:
+    """One line of the list: the id of the bag directory, or a recording."""
+
+    bag_dir_id: Annotated[str, Field(pattern=r"^[0-9a-f]{8,64}$")] = ""
+    recording: Annotated[str, AfterValidator(_checked_name)] = ""
+    inode: Int64 | None = None
+    generation: Int64 | None = None
+    adopted: StrictBool = False
+
+    @property
+    def identity(self) -> Identity | None:
+        """The directory of the recording; None until its child has made it."""
+        return None if self.inode is None else Identity(self.inode, self.generation)
+
+
+LIST: Final = JsonLog(LIST_FILE, ListRow, is_brief=True)
 
 
 @dataclass(slots=True)
-class _List:
-    """The content of a list. `damaged` counts lines that mean nothing."""
+class _Content:
+    """The content of a list; `lines` counts all of the file."""
 
-    bag_dir_id: str | None = None
-    entries: dict[str, _Entry] = field(default_factory=dict)
+    bag_dir_id: str = ""
+    entries: dict[str, ListRow] = field(default_factory=dict)
     lines: int = 0
-    damaged: int = 0
 
-    @classmethod
-    def parse(cls, data: bytes) -> _List:
-        """Returns the content of a file, whatever it holds."""
-        content = cls()
-        for line in filter(None, data.split(b"\n")):
-            content.lines += 1
-            try:
-                fields: object = json.loads(line)
-                content._take_line(fields if isinstance(fields, dict) else {})
-            # json raises RecursionError for a line of nothing but brackets.
-            except (ValueError, RecursionError):
-                content.damaged += 1
-        return content
-
-    def to_text(self) -> str:
-        """Returns the content as lines, each recording once."""
-        return json.dumps({BAG_DIR_ID: self.bag_dir_id}) + "\n" + _lines(self.entries)
-
-    def _take_line(self, fields: Mapping[object, object]) -> None:
-        bag_dir_id, name = fields.get(BAG_DIR_ID), fields.get("recording")
-        if isinstance(bag_dir_id, str) and re.fullmatch(r"[0-9a-f]{8,64}", bag_dir_id):
-            self.bag_dir_id = bag_dir_id
-            return
-        # The name must be of a directory below the bag directory.
-        if (
-            not isinstance(name, str)
-            or "\0" in name
-            or {"", ".", ".."}.intersection(name.split("/"))
-        ):
-            raise ValueError("it names no recording")
-        inode, generation = _number(fields, "inode"), _number(fields, "generation")
-        identity = None if inode is None else Identity(inode, generation)
-        self.entries[name] = _Entry(identity, adopted=fields.get("adopted") is True)
-
-
-def _number(fields: Mapping[object, object], key: str) -> int | None:
-    return None if fields.get(key) is None else integer(fields, key)
-
-
-def _lines(entries: Mapping[str, _Entry]) -> str:
-    lines = []
-    for name, (identity, adopted) in entries.items():
-        fields: dict[str, str | int] = {"recording": name}
-        if identity is not None:
-            fields["inode"] = identity.inode
-            if identity.generation is not None:
-                fields["generation"] = identity.generation
-        if adopted:
-            fields["adopted"] = True
-        lines.append(json.dumps(fields) + "\n")
-    return "".join(lines)
+    def add(self, rows: Iterable[ListRow]) -> None:
+        self.entries.update({row.recording: row for row in rows})
 
 
 class OwnRecordings:
@@ -151,7 +116,7 @@ class OwnRecordings:
         self._bag_dir = bag_dir
         self._path = bag_dir / LIST_FILE
         self._lock = threading.RLock()
-        self._list = _List()
+        self._list = _Content()
         self._stamp: tuple[int, ...] | None = None
         self._max_lines = _SPARE_LINES
         self._reported_damaged = 0
@@ -188,13 +153,9 @@ class OwnRecordings:
         with self._lock:
             self._read()
             name = self.name_of(directory)
-            if name not in self._list.entries:
-                return False
-            try:
-                identity = identity_of(directory)
-            except OSError:
-                return False
-            return self.lists(name, identity)
+            with suppress(OSError):
+                return name in self._list.entries and self.lists(name, identity_of(directory))
+            return False
 
     def began(self, directory: Path) -> bool:
         """Returns whether a recording was to begin there, and no directory was listed for it.
@@ -210,9 +171,8 @@ class OwnRecordings:
     def lists(self, name: str, identity: Identity | None) -> bool:
         """Returns whether the list, as last read, has a directory of this name and identity."""
         entry = self._list.entries.get(name)
-        if entry is None or entry.identity is None or identity is None:
-            return False
-        return identity.matches(entry.identity)
+        listed = None if entry is None else entry.identity
+        return identity is not None and listed is not None and identity.matches(listed)
 
     def name_of(self, directory: Path | str) -> str:
         """Returns the name of a directory in the list; empty where it lies elsewhere."""
@@ -227,7 +187,7 @@ class OwnRecordings:
     @property
     def bag_dir_id(self) -> str | None:
         """The random id of this bag directory, which recordings carry; None before there is one."""
-        return self._list.bag_dir_id
+        return self._list.bag_dir_id or None
 
     def suppose(self, custom_data: CustomDataOf) -> None:
         """Assumes, where there is no list yet, the recordings that `claim` would adopt.
@@ -237,7 +197,7 @@ class OwnRecordings:
         """
         with self._lock:
             if not self._read():
-                self._list.entries.update(_adopted(_find_former(self._bag_dir, custom_data)[0]))
+                self._list.add(_adopted(_find_former(self._bag_dir, custom_data)[0]))
 
     # What follows is for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
@@ -261,11 +221,10 @@ class OwnRecordings:
             except OSError as error:
                 raise self._failure(error, "read") from error
             completed = self._find_completed(custom_data)
-            self._list.entries.update(_adopted(former))
-            self._list.entries.update(completed)
+            self._list.add([*_adopted(former), *completed])
             self._report_claim(former, left)
-            entries = self._list.entries
-            if exists and not completed and not self._gone(entries) and self.bag_dir_id:
+            gone = self._gone(self._list.entries)
+            if exists and self.bag_dir_id and not (completed or gone):
                 return
             try:
                 self._rewrite()
@@ -278,7 +237,7 @@ class OwnRecordings:
         Raises:
             RecorderError: it cannot be listed: then it must not begin.
         """
-        self._add({name: _Entry()})
+        self._add([ListRow(recording=name)])
 
     def complete(self, name: str) -> bool:
         """Lists the directory that the child made for a recording; False while there is none.
@@ -292,7 +251,7 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._add({name: _Entry(identity)})
+        self._add([_row_of(name, identity)])
         return True
 
     def adopt(self, identities: Mapping[str, Identity]) -> None:
@@ -316,20 +275,21 @@ class OwnRecordings:
             if entry.identity is None and (self._bag_dir / name).is_dir():
                 _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
 
-    def _find_completed(self, custom_data: CustomDataOf) -> dict[str, _Entry]:
+    def _find_completed(self, custom_data: CustomDataOf) -> list[ListRow]:
         """Returns the entries without a directory whose directory our child made after all."""
         ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
-        found: dict[str, _Entry] = {}
+        found: list[ListRow] = []
         for name, entry in self._list.entries.items():
+            if entry.identity is not None:
+                continue
             with suppress(OSError):
-                identity = None if entry.identity else identity_of(self._bag_dir / name)
+                identity = identity_of(self._bag_dir / name)
                 if identity is None:
                     continue
-                embedded = [
-                    custom_data(path) or {} for path in _files_with_data(self._bag_dir / name)
-                ]
-                if embedded and all(ours.items() <= each.items() for each in embedded):
-                    found[name] = _Entry(identity)
+                files = _files_with_data(self._bag_dir / name)
+                embedded = [custom_data(path) or {} for path in files]
+                if embedded and all(ours.items() <= data.items() for data in embedded):
+                    found.append(_row_of(name, identity))
         return found
 
     def _gone(self, names: Iterable[str]) -> list[str]:
@@ -353,38 +313,40 @@ class OwnRecordings:
             stamp = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
             if stamp == self._stamp:
                 return True
-            with open_plain(self._path) as stream:
-                data = stream.read(_MAX_BYTES)
+            lines = [*LIST.lines(self._bag_dir)]
         except (FileNotFoundError, NotADirectoryError):
             self._stamp = None
             return False
         except ValueError as error:
             raise OSError(f"{self._path}: {error}") from error
-        self._list, self._stamp = _List.parse(data), stamp
-        if self._list.damaged > self._reported_damaged:
-            self._reported_damaged = self._list.damaged
-            _log.warning(
-                "recordings_list_damaged", path=str(self._path), lines=self._reported_damaged
-            )
+        rows = [line.row or ListRow() for line in lines]
+        content = _Content(lines=len(lines))
+        content.add(row for row in rows if row.recording and not row.bag_dir_id)
+        content.bag_dir_id = next((each.bag_dir_id for each in rows[::-1] if each.bag_dir_id), "")
+        self._list, self._stamp = content, stamp
+        damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
+        if damaged > self._reported_damaged:
+            self._reported_damaged = damaged
+            _log.warning("recordings_list_damaged", path=str(self._path), lines=damaged)
         return True
 
-    def _add(self, entries: Mapping[str, _Entry]) -> None:
+    def _add(self, rows: Sequence[ListRow]) -> None:
         """Appends entries, or writes the whole list where there is none or most of it is gone."""
         try:
             with self._lock:
                 exists = self._read()
                 if not exists or self._list.lines > self._max_lines or self.bag_dir_id is None:
-                    self._rewrite(entries)
+                    self._rewrite(rows)
                     return
                 with self._locked() as descriptor:
                     if descriptor is None:
                         raise FileNotFoundError("the list of recordings is missing")
-                    append_lines(descriptor, _lines(entries))
-                self._list.entries.update(entries)
+                    append_lines(descriptor, LIST.text(rows))
+                self._list.add(rows)
         except OSError as error:
             raise self._failure(error) from error
 
-    def _rewrite(self, entries: Mapping[str, _Entry] | None = None) -> None:
+    def _rewrite(self, rows: Iterable[ListRow] = ()) -> None:
         """Writes the list again with these entries, and without recordings that have gone."""
         known = self._list
         try:
@@ -393,19 +355,20 @@ class OwnRecordings:
                     # Another program may have appended meanwhile.
                     self._stamp = None
                     self._read()
-                content = _List(self.bag_dir_id or known.bag_dir_id or uuid.uuid4().hex)
+                content = _Content(self.bag_dir_id or known.bag_dir_id or uuid.uuid4().hex)
                 for name, entry in (*known.entries.items(), *self._list.entries.items()):
                     if entry.identity or name not in content.entries:
                         content.entries[name] = entry
                 for name in self._gone(content.entries):
                     del content.entries[name]
-                content.entries.update(entries or {})
+                content.add(rows)
                 folder = self._path.parent
                 if not folder.is_dir():
                     folder.mkdir(exist_ok=True)
                     _give_to_owner(folder, self._bag_dir)
                     flush(folder.parent)
-                write_durably(self._path, content.to_text())
+                header = ListRow(bag_dir_id=content.bag_dir_id)
+                write_durably(self._path, LIST.text([header, *content.entries.values()]))
                 _give_to_owner(self._path, self._bag_dir)
         except OSError:
             self._list = known
@@ -559,8 +522,12 @@ def _files_with_data(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def _adopted(identities: Mapping[str, Identity]) -> dict[str, _Entry]:
-    return {name: _Entry(identity, adopted=True) for name, identity in identities.items()}
+def _row_of(name: str, identity: Identity, *, adopted: bool = False) -> ListRow:
+    return ListRow("", name, identity.inode, identity.generation, adopted)
+
+
+def _adopted(identities: Mapping[str, Identity]) -> list[ListRow]:
+    return [_row_of(name, identity, adopted=True) for name, identity in identities.items()]
 
 
 def _give_to_owner(path: Path, bag_dir: Path) -> None:

@@ -1,0 +1,259 @@
+"""JSON files that the two programs share, and that another version, or a person, may have written.
+
+A log is one object a line. Rows are appended and flushed, all of them or none, so a power cut
+leaves at most a part of the last line, which the next append ends. A line that is damaged, or of
+another version, spoils no other. A document is one object, which is replaced by rename.
+
+They stay files, not a database: a person reads them, and so does a server that may not write here,
+while the recorder is killed; SQLite needs to write before it can read what a kill left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import lru_cache, wraps
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Final,
+    Generic,
+    NamedTuple,
+    TypeAlias,
+    TypeGuard,
+    TypeVar,
+)
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from ros2_memory.bag_dir.durable_write import (
+    append_durably,
+    flush,
+    open_plain,
+    read_small_file,
+    write_durably,
+)
+from ros2_memory.core import directories
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from pathlib import Path
+
+_T = TypeVar("_T")
+
+Int64: TypeAlias = Annotated[int, Field(strict=True, ge=MIN_NS, le=MAX_NS)]
+"""An integer of 64 bits, and no boolean."""
+Count: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=MAX_NS)]
+READABLE: Final = 0o644
+"""The permissions of what the other program reads: the two may run as different users."""
+
+_MOST_BYTES: Final = 64 << 20
+_FORMAT: Final = 1  # of each document
+
+
+class Line(NamedTuple, Generic[_T]):
+    """One line of a log: its row, or None and what is wrong with it.
+
+    `number` counts from 1; 0 stands for all lines that are left out, for they are too many.
+    """
+
+    number: int
+    text: bytes
+    row: _T | None
+    error: ValueError | None
+
+
+class JsonLog(Generic[_T]):
+    """A log in the bag directory, whose rows are of one dataclass.
+
+    Args:
+        name: the path of the file in the bag directory.
+        row: the dataclass.
+        most_bytes: of a longer file only the end is read.
+        is_brief: whether fields that have their default are not written.
+    """
+
+    def __init__(
+        self, name: str, row: type[_T], *, most_bytes: int = _MOST_BYTES, is_brief: bool = False
+    ) -> None:
+        self.name = name
+        self._adapter = TypeAdapter(row)
+        self._most_bytes = most_bytes
+        self._is_brief = is_brief
+
+    def lines(self, bag_dir: Path) -> Iterator[Line[_T]]:
+        """Yields the lines that are not empty.
+
+        Raises:
+            OSError: the file cannot be read, or there is none.
+            ValueError: it is not a regular file.
+        """
+        with open_plain(bag_dir / self.name) as stream:
+            if stream.seek(0, os.SEEK_END) > self._most_bytes:
+                yield Line(0, b"", None, ValueError(f"it is larger than {self._most_bytes} bytes"))
+                stream.seek(-self._most_bytes, os.SEEK_END)
+                stream.readline()
+            else:
+                stream.seek(0)
+            for number, line in enumerate(stream, 1):
+                text = line.strip()
+                if text:
+                    try:
+                        yield Line(number, text, parsed(self._adapter, text), None)
+                    except ValueError as error:
+                        yield Line(number, text, None, error)
+
+    def rows(self, bag_dir: Path) -> list[_T]:
+        """Returns the rows, the oldest first, whatever other lines hold; none without a file.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is not a regular file.
+        """
+        try:
+            return [line.row for line in self.lines(bag_dir) if line.row is not None]
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+
+    def text(self, rows: Iterable[_T]) -> str:
+        """Returns rows as lines."""
+        dumped = (self._adapter.dump_python(row, exclude_defaults=self._is_brief) for row in rows)
+        return "".join(f"{json.dumps(fields)}\n" for fields in dumped)
+
+    def append(self, bag_dir: Path, rows: Iterable[_T]) -> int:
+        """Appends rows durably; returns how many bytes the file has then.
+
+        Raises:
+            OSError: they cannot be written, and none is appended.
+        """
+        target = bag_dir / self.name
+        directories.make(bag_dir, target.parent)
+        append_durably(target, self.text(rows))
+        return target.stat().st_size
+
+    def replace(self, bag_dir: Path, rows: Iterable[_T]) -> None:
+        """Replaces the file by one with these rows.
+
+        Raises:
+            OSError: it cannot be written; the old one remains.
+        """
+        target = bag_dir / self.name
+        directories.make(bag_dir, target.parent)
+        write_durably(target, self.text(rows))
+
+
+class JsonDocument(Generic[_T]):
+    """A document in the bag directory, which holds one value of a dataclass.
+
+    Args:
+        name: the path of the file in the bag directory.
+        content: the dataclass.
+        is_ascii: whether other characters are escaped, as paths need that are not UTF-8.
+    """
+
+    def __init__(self, name: str, content: type[_T], *, is_ascii: bool = True) -> None:
+        self.name = name
+        self._adapter = TypeAdapter(content)
+        self._is_ascii = is_ascii
+
+    def read(self, bag_dir: Path) -> _T | None:
+        """Returns the value; None where there is no file.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: it is damaged, or of another format.
+        """
+        try:
+            text = read_small_file(bag_dir / self.name)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        return parsed(self._adapter, text, _FORMAT)
+
+    def write(self, bag_dir: Path, value: _T) -> None:
+        """Replaces the file durably.
+
+        Raises:
+            OSError: it cannot be written; the old one remains.
+        """
+        target = bag_dir / self.name
+        directories.make(bag_dir, target.parent)
+        content = {"format": _FORMAT, **self._adapter.dump_python(value)}
+        text = json.dumps(content, ensure_ascii=self._is_ascii, separators=(",", ":"))
+        write_durably(target, text, mode=READABLE)
+
+    def remove(self, bag_dir: Path) -> None:
+        """Removes the file durably.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
+        target = bag_dir / self.name
+        target.unlink(missing_ok=True)
+        flush(target.parent)
+
+
+def until_changed(name: str) -> Callable[[Callable[[Path], _T]], Callable[[Path], _T]]:
+    """Has a function of a bag directory called again only once a file there has changed.
+
+    For files that every answer needs. Where there is none, the function is called each time.
+    """
+
+    def decorate(read: Callable[[Path], _T]) -> Callable[[Path], _T]:
+        @lru_cache(2)
+        def known(bag_dir: Path, _stamp: tuple[int, int, int]) -> _T:
+            return read(bag_dir)
+
+        @wraps(read)
+        def current(bag_dir: Path) -> _T:
+            try:
+                status = (bag_dir / name).lstat()
+            except (FileNotFoundError, NotADirectoryError):
+                return read(bag_dir)
+            return known(bag_dir, (status.st_ino, status.st_mtime_ns, status.st_size))
+
+        return current
+
+    return decorate
+
+
+def parsed(adapter: TypeAdapter[_T], text: str | bytes, version: int | None = None) -> _T:
+    """Returns the value that a JSON object describes; keys of other versions are ignored.
+
+    Its `format` must be the version, where one is given.
+
+    Raises:
+        ValueError: it is none, or of another format, or a key is missing or wrong; the sentence
+            names the first one.
+    """
+    try:
+        value: object = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nothing but brackets") from error
+    if not isinstance(value, dict):
+        raise ValueError("it is not a JSON object")  # noqa: TRY004 - a value in a text
+    if version is not None and value.get("format") != version:
+        raise ValueError(f"its format is {value.get('format')!r}, and only {version} is known")
+    try:
+        return adapter.validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{key}: {first['msg']}") from error
+
+
+def is_integer(value: object) -> TypeGuard[int]:
+    """Returns whether a value is an integer of 64 bits; a boolean is not one."""
+    return isinstance(value, int) and not isinstance(value, bool) and MIN_NS <= value <= MAX_NS
+
+
+def integer(fields: Mapping[object, object], key: str) -> int:
+    """Returns the integer under a key.
+
+    Raises:
+        ValueError: the value is not an integer of 64 bits.
+    """
+    value = fields.get(key)
+    if not is_integer(value):
+        raise ValueError(f"{key} must be an integer of 64 bits")
+    return value

@@ -1,1 +1,0 @@
-"""The files below `.episodic/`: the recorder's state, and requests to it."""

@@ -1,0 +1,631 @@
+"""The files below `.episodic/`: what each row, or document, holds, and who may read it.
+
+    recorded.jsonl     the recorder: how long it has recorded (see `retention.recorded_time`)
+    lost.jsonl         the recorder, `forget`: messages that are in no bag, for the notes of answers
+    deleted.jsonl      the recorder: what retention deletes, so that nobody calls it lost
+    shipped.jsonl      `ship`: which bags are in a lake, for retention
+    forgotten.jsonl    `forget`: what is deleted here, for the lake that may have it
+    erasing.json       `forget`: messages that are being taken out of bags
+    screened.json      the recorder: what `recording.exclude_when` holds back, and has excluded
+    triggers.json      the recorder: how far the rules of `recording.keep_when` know the recordings
+
+What is about to be deleted is written before it is, so a kill hides nothing. Elsewhere are
+`recordings.jsonl` (`own_recordings`), and the folder of requests (`request_queue`).
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
+
+from pydantic import Field, StrictBool
+
+from ros2_memory.bag_dir.json_files import Count, Int64, JsonDocument, JsonLog, until_changed
+from ros2_memory.bag_dir.layout import (
+    DELETED_FILE,
+    ERASING_FILE,
+    FORGOTTEN_FILE,
+    LOST_FILE,
+    RECORDED_FILE,
+    SCREENED_FILE,
+    SHIPPED_FILE,
+    TRIGGERS_FILE,
+    has_own_name,
+)
+from ros2_memory.core.spans import united
+from ros2_memory.core.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.model import TimeWindow
+
+# recorded.jsonl
+
+_Seconds: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=1e9)]
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The total recorded time when a recording (its path in the bag directory) last grew."""
+
+    recording: str
+    recorded_s: _Seconds
+
+
+RECORDED: Final = JsonLog(RECORDED_FILE, Recorded)
+
+# lost.jsonl
+
+MOST_LOST_BYTES: Final = 1 << 20
+"""A longer file loses its older half."""
+EVERY_TOPIC: Final = "*"
+"""Stands for the topics of a recording that ended unexpectedly."""
+INTERRUPTIONS: Final = MappingProxyType(
+    {
+        "died": "ros2 bag record died",
+        "hung": "ros2 bag record hung",
+        "unclean": "the recorder ended without a shutdown",
+    }
+)
+"""How a recording may end unexpectedly, and the words for it."""
+Interruption: TypeAlias = Literal["died", "hung", "unclean"]
+"""A key of `INTERRUPTIONS`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Messages of a topic that are missing between two log times.
+
+    `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
+    may never have been published either), or rosbag2's own count; or they were deleted by request.
+    The unexpected end of a recording is of `EVERY_TOPIC`, from when it last grew to when that was
+    noticed, with a key of `INTERRUPTIONS`. How many messages it cost is not known, and `lost` 0.
+    """
+
+    topic: str
+    start: Int64
+    stop: Int64
+    lost: Count
+    by: Literal["counter", "stamps", "rosbag2", "forgotten", "died", "hung", "unclean"]
+
+    @property
+    def interrupts(self) -> bool:
+        """Whether this is the unexpected end of a recording."""
+        return self.by in INTERRUPTIONS
+
+
+LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)
+
+
+def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
+    """Appends losses, and drops the oldest where the file is too long.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if LOST.append(bag_dir, losses) > MOST_LOST_BYTES:
+        rows = LOST.rows(bag_dir)
+        LOST.replace(bag_dir, rows[len(rows) // 2 :])
+
+
+@until_changed(LOST_FILE)
+def _losses(bag_dir: Path) -> Sequence[Loss]:
+    return LOST.rows(bag_dir)
+
+
+def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
+    """Returns the losses that fall between two log times; none where the file cannot be read."""
+    try:
+        return [each for each in _losses(bag_dir) if each.start < stop and start < each.stop]
+    except (OSError, ValueError):
+        return []
+
+
+# deleted.jsonl
+
+_MOST_DELETED_BYTES: Final = 1 << 18
+_MOST_SPANS: Final = 1000
+_APART_NS: Final[Ns] = 20 * NS_PER_S
+"""From one split of a recording to the next no message may come for so long."""
+_TOUCHING_NS: Final[Ns] = NS_PER_S
+"""From one recording to the next."""
+_LONGEST_NS: Final[Ns] = 86_400 * NS_PER_S
+"""The clock was set within a split that lasts for longer: it shows nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deleted:
+    """What was deleted of a recording (its path below the bag directory); "" for some.
+
+    `files` are the names of its splits, without the suffix of compression; `spans` the log times
+    (half-open) of their first and last messages, joined.
+    """
+
+    recording: str
+    files: tuple[str, ...] = ()
+    spans: tuple[tuple[Int64, Int64], ...] = ()
+
+
+DELETED: Final = JsonLog(DELETED_FILE, Deleted, most_bytes=4 * _MOST_DELETED_BYTES)
+
+
+def deleted_of(recording: str, splits: Iterable[tuple[str, Ns, Ns]]) -> Deleted:
+    """Returns the entry for splits of a recording: each its name, first and last log time."""
+    named = [*splits]
+    spans = [(first, last + 1) for _, first, last in named if 0 <= last - first <= _LONGEST_NS]
+    return Deleted(recording, tuple(name for name, _, _ in named), _joined(spans, _APART_NS))
+
+
+def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
+    """Appends what is about to be deleted; nobody asks about a split that is still there.
+
+    A file that is too long is written again: a row for each recording that is still there, and one
+    for all that have gone, whose files nothing lists any more.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
+        return
+    known = _deleted(bag_dir)
+    there = {name for name in known if name and (bag_dir / name).is_dir()}
+    gone = (span for name, row in known.items() if name not in there for span in row.spans)
+    rows, size = [Deleted("", (), _joined(gone, _TOUCHING_NS)[-_MOST_SPANS:])], 0
+    # The newest recordings come last, so they are the first to stay.
+    for name in reversed([name for name in known if name in there]):
+        size += len(DELETED.text([known[name]]))
+        if size > _MOST_DELETED_BYTES // 2:
+            break
+        rows.append(known[name])
+    DELETED.replace(bag_dir, rows)
+
+
+@until_changed(DELETED_FILE)
+def _deleted(bag_dir: Path) -> Mapping[str, Deleted]:
+    files: dict[str, dict[str, None]] = {}
+    spans: dict[str, list[tuple[Ns, Ns]]] = {}
+    for row in DELETED.rows(bag_dir):
+        files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
+        spans.setdefault(row.recording, []).extend(row.spans)
+    return {
+        name: Deleted(name, tuple(known), _joined(spans[name], _APART_NS if name else _TOUCHING_NS))
+        for name, known in files.items()
+    }
+
+
+def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
+    """Returns what was deleted, by recording; nothing where the file cannot be read."""
+    try:
+        return _deleted(bag_dir)
+    except (OSError, ValueError):
+        return {}
+
+
+def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
+    """Returns the log times (half-open) of all that was deleted, sorted and apart."""
+    every = (span for row in read_deleted(bag_dir).values() for span in row.spans)
+    return _joined(every, _TOUCHING_NS)
+
+
+def _joined(spans: Iterable[tuple[Ns, Ns]], apart: Ns) -> tuple[tuple[Ns, Ns], ...]:
+    """Returns spans, sorted; those that are no further apart than this are joined."""
+    wider = united((start, stop + apart) for start, stop in spans)
+    return tuple((start, stop - apart) for start, stop in wider)
+
+
+# shipped.jsonl
+
+_SPARE_RECEIPTS: Final = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    """One bag that is in a lake.
+
+    Attributes:
+        bag: its path below the bag directory.
+        bag_id: its id in the lake.
+        size: of its file when it was shipped (bytes).
+        sha256: of its file, in hexadecimal.
+        lake: the id of the lake.
+        at: when it was committed (ns).
+    """
+
+    bag: str
+    bag_id: str
+    size: Count
+    sha256: str
+    lake: str
+    at: Int64
+
+
+SHIPPED: Final = JsonLog(SHIPPED_FILE, Receipt)
+
+
+def read_receipts(bag_dir: Path) -> dict[str, Receipt]:
+    """Returns the newest receipt of each bag, by its path; none where there is no file.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    try:
+        return {receipt.bag: receipt for receipt in SHIPPED.rows(bag_dir)}
+    except ValueError:
+        return {}
+
+
+def append_receipts(bag_dir: Path, receipts: Iterable[Receipt]) -> None:
+    """Appends receipts. Those of bags that are gone are dropped where most lines are.
+
+    Raises:
+        OSError: the file cannot be written, as where the bag directory is mounted read-only.
+    """
+    SHIPPED.append(bag_dir, receipts)
+    rows = SHIPPED.rows(bag_dir)
+    if len(rows) > _SPARE_RECEIPTS:
+        newest = {receipt.bag: receipt for receipt in rows}
+        present = [each for path, each in newest.items() if (bag_dir / path).exists()]
+        if len(rows) > _SPARE_RECEIPTS + 2 * len(present):
+            SHIPPED.replace(bag_dir, present)
+
+
+# Sizes alone: a week has 60,000 bags.
+@until_changed(SHIPPED_FILE)
+def _shipped_sizes(bag_dir: Path) -> Mapping[str, int]:
+    return {path: receipt.size for path, receipt in read_receipts(bag_dir).items()}
+
+
+def unshipped(bag_dir: Path, bags: Iterable[tuple[str, int]]) -> frozenset[str]:
+    """Returns those of some bags, given by path and size (bytes), that are in no lake.
+
+    That is all of them where the receipts cannot be read.
+    """
+    try:
+        sizes = _shipped_sizes(bag_dir)
+    except OSError:
+        sizes = {}
+    return frozenset(path for path, size in bags if sizes.get(path) != size)
+
+
+def is_shipped(receipts: Mapping[str, Receipt], bag: str, size: int) -> bool:
+    """Returns whether a bag of this path and size is in a lake."""
+    receipt = receipts.get(bag)
+    return receipt is not None and receipt.size == size
+
+
+# forgotten.jsonl
+
+
+@dataclass(frozen=True, slots=True)
+class ForgottenBag:
+    """A bag that was deleted as a whole: its recording, its file, and its first log time."""
+
+    recording: str
+    file: str
+    first: Int64
+
+
+@dataclass(frozen=True, slots=True)
+class Forgetting:
+    """What was deleted between two log times (half-open): messages of topics, or whole bags."""
+
+    start: Int64
+    stop: Int64
+    topics: tuple[str, ...] = ()
+    bags: tuple[ForgottenBag, ...] = ()
+
+
+FORGOTTEN: Final = JsonLog(FORGOTTEN_FILE, Forgetting)
+
+
+def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
+    """Returns what was deleted, the oldest first and each once; no line is ever removed.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: a line is damaged, or the file too large: what was deleted is unknown.
+    """
+    found: dict[Forgetting, None] = {}
+    try:
+        lines = [*FORGOTTEN.lines(bag_dir)]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    for line in lines:
+        if isinstance(line.error, json.JSONDecodeError):
+            # A whole line ends with the list of bags; of one that was cut, nothing was deleted.
+            if line.text.startswith(b"{") and not line.text.endswith(b"]}"):
+                continue
+            raise ValueError(f"line {line.number}: it is damaged: {line.error}")
+        if line.row is None:
+            raise ValueError(f"line {line.number}: {line.error}")
+        if not (line.row.topics or line.row.bags):
+            raise ValueError(f"line {line.number}: it names no topics and no bags")
+        found[line.row] = None
+    return [*found]
+
+
+# erasing.json
+
+
+@dataclass(frozen=True, slots=True)
+class Erased:
+    """How many messages of a topic go, between two log times (half-open)."""
+
+    topic: str
+    start: Int64
+    stop: Int64
+    count: Count
+
+
+@dataclass(frozen=True, slots=True)
+class Erasure:
+    """Which messages are taken out of bags.
+
+    The file is written before the first bag is changed, and removed after the last trace has gone:
+    an erasure that was interrupted can be finished.
+
+    Attributes:
+        topics: by name.
+        windows: of log time, half-open, in order and apart.
+        latched: those of the topics whose messages go also where they were published in a window
+            and received again later, as each recording receives them.
+        files: the bags that hold some, by their paths in the bag directory, with all hard links.
+        counts: what they hold.
+    """
+
+    topics: tuple[str, ...]
+    windows: tuple[tuple[Int64, Int64], ...]
+    latched: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+    counts: tuple[Erased, ...] = ()
+
+    @classmethod
+    def of(
+        cls, topics: Iterable[str], windows: Iterable[TimeWindow], latched: Iterable[str]
+    ) -> Erasure:
+        """Returns what is to go, of windows in any order that may overlap."""
+        spans = united((window.start, window.stop) for window in windows if not window.empty)
+        return cls(tuple(sorted(topics)), tuple(spans), tuple(sorted(latched)))
+
+    def window_of(self, topic: str, log_time: Ns, publish_time: Ns) -> tuple[Ns, Ns] | None:
+        """Returns the window by which a message goes; None where it stays."""
+        if topic not in self.topics:
+            return None
+        times = (log_time, publish_time) if topic in self.latched else (log_time,)
+        for time in times:
+            nth = bisect_right(self.windows, time, key=lambda window: window[0])
+            if nth and time < self.windows[nth - 1][1]:
+                return self.windows[nth - 1]
+        return None
+
+    def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
+        """Returns whether a message is deleted."""
+        return self.window_of(topic, log_time, publish_time) is not None
+
+
+ERASING: Final = JsonDocument(ERASING_FILE, Erasure)
+
+# screened.json
+
+
+@dataclass(slots=True)
+class ConditionInterval:
+    """An interval in which a topic's condition kept its value, in one recording.
+
+    Attributes:
+        first: log time of the first message of it.
+        last: log time of the last message of it.
+        holds: whether the condition held; None: a message could not be read.
+        lasts: the topic is latched: it says nothing while nothing changes.
+    """
+
+    first: Int64
+    last: Int64
+    holds: StrictBool | None
+    lasts: StrictBool = False
+
+
+class FileStep(StrEnum):
+    """How far a closed file has come."""
+
+    READ = "read"  # by the rules, and not served yet
+    RELEASED = "released"
+    UNREADABLE = "unreadable"  # it stays as it is, and is not served
+
+
+@dataclass(slots=True)
+class RecordingScreen:
+    """The state of one recording.
+
+    Attributes:
+        done: nothing of it is held back any more.
+        start: log time of its first message; None before one was read.
+        end: log time of its last message that was read; None likewise.
+        files: its closed files, by name.
+        heard: for each rule the values of its topic, in the order in which they were written.
+        unclear: spans of log time in which the clock was set back, so that no order is known.
+    """
+
+    done: StrictBool = False
+    start: Int64 | None = None
+    end: Int64 | None = None
+    files: dict[str, FileStep] = field(default_factory=dict)
+    heard: dict[str, list[ConditionInterval]] = field(default_factory=dict)
+    unclear: list[tuple[Int64, Int64]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Excluded:
+    """A stretch of log time (half-open) of which nothing stays.
+
+    `held`: the condition held; else it was not known.
+    """
+
+    start: Int64
+    stop: Int64
+    held: StrictBool = True
+
+
+@dataclass(slots=True)
+class ScreenState:
+    """All that is known: recordings in the order in which they began, and what was excluded.
+
+    The recorder lists a recording before anything of it exists. From then on none of its files is
+    served, nor read by what the recorder does with closed bags, until it is listed as released: by
+    then what is to be excluded has been cut out of it. What the rules know is written before a file
+    is cut: what the cut takes cannot be read again.
+    """
+
+    recordings: dict[str, RecordingScreen] = field(default_factory=dict)
+    excluded: list[Excluded] = field(default_factory=list)
+
+
+class Gate(NamedTuple):
+    """Which files are not served yet.
+
+    `state` is None where the file cannot be read: then no file of a recording is.
+    """
+
+    state: ScreenState | None
+
+    def holds(self, recording: str, file: str) -> bool:
+        """Returns whether a file of a recording is held back; both by their names."""
+        if not self.holds_some(recording):
+            return False
+        files = {} if self.state is None else self.state.recordings[recording].files
+        return files.get(file) is not FileStep.RELEASED
+
+    def holds_some(self, recording: str) -> bool:
+        """Returns whether files of a recording are held back, or may come to be."""
+        if self.state is None:
+            return has_own_name(recording)
+        screen = self.state.recordings.get(recording)
+        return screen is not None and not screen.done
+
+
+OPEN_GATE: Final = Gate(ScreenState())
+"""Holds nothing back."""
+SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState)
+
+
+@until_changed(SCREENED_FILE)
+def _screen_state(bag_dir: Path) -> ScreenState | None:
+    return SCREENED.read(bag_dir)
+
+
+def read_gate(bag_dir: Path) -> Gate:
+    """Returns what is held back at this moment. Raises nothing."""
+    try:
+        return Gate(_screen_state(bag_dir) or OPEN_GATE.state)
+    except (OSError, ValueError):
+        return Gate(None)
+
+
+def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
+    """Returns the stretches that were excluded between two log times."""
+    state = read_gate(bag_dir).state
+    known = () if state is None else state.excluded
+    return [each for each in known if each.start < stop and start < each.stop]
+
+
+# triggers.json
+
+_Number: TypeAlias = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+
+
+@dataclass(slots=True)
+class RunRecord:
+    """A match that goes on: the log times of its first and its newest message.
+
+    `fired`: the rule has fired for it. `lasts`: a silence of the topic does not end it.
+    """
+
+    first: Int64
+    last: Int64
+    fired: StrictBool = False
+    lasts: StrictBool = False
+
+
+@dataclass(slots=True)
+class RuleMoment:
+    """A moment of a rule, which its next match may extend; log times, inclusive.
+
+    `matches` is how often the rule fired in it. `known`: it was stored before, perhaps shorter;
+    `stored`: it is stored as it is here.
+    """
+
+    number: _Number
+    start: Int64
+    end: Int64
+    matches: Count = 1
+    known: StrictBool = False
+    stored: StrictBool = False
+
+
+@dataclass(slots=True)
+class RuleRecord:
+    """The state of one rule.
+
+    Attributes:
+        fired: how often it fired.
+        moments: how many moments that made.
+        refused: how often nothing was kept of it.
+        last_fired: log time at which it fired last.
+        problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
+        always_since: since when it has matched without an end, where that is long; else None.
+        begun: log times at which its moments of the last hour began.
+        newest: its moments that are not stored yet, and the newest one, in order.
+        runs: its matches that go on, by topic.
+    """
+
+    fired: Count = 0
+    moments: Count = 0
+    refused: Count = 0
+    last_fired: Int64 | None = None
+    problem: str | None = None
+    always_since: Int64 | None = None
+    begun: list[Int64] = field(default_factory=list)
+    newest: list[RuleMoment] = field(default_factory=list)
+    runs: dict[str, RunRecord] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class LatchedMark:
+    """How far a latched topic is known: each recording receives its messages again.
+
+    By recording, `published` is the latest publish time and `begun` the first log time; `payload`
+    is a hash of the last message.
+    """
+
+    published: dict[str, Int64] = field(default_factory=dict)
+    begun: dict[str, Int64] = field(default_factory=dict)
+    payload: str = ""
+
+
+@dataclass(slots=True)
+class TriggerState:
+    """All that the rules know, as it is written after each look at closed splits.
+
+    A recorder that was killed goes on from here, so what it had found since is found again.
+
+    Attributes:
+        rules: by name; those that are not configured any more are dropped.
+        searched: until which log time (excluded) the newest recordings were searched.
+        before: a recording; it and all that were listed before it were searched, or lie before the
+            rules. None if there is none.
+        latched: by topic.
+    """
+
+    rules: dict[str, RuleRecord] = field(default_factory=dict)
+    searched: dict[str, Int64] = field(default_factory=dict)
+    before: str | None = None
+    latched: dict[str, LatchedMark] = field(default_factory=dict)
+
+
+TRIGGERS: Final = JsonDocument(TRIGGERS_FILE, TriggerState, is_ascii=False)

@@ -1,0 +1,368 @@
+"""The files below `.episodic/`: what stands in them, and what no damage, kill or link does.
+
+They are given as an installed robot has them on its disk, so their formats are tested, too.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir import state_files
+from ros2_memory.bag_dir.json_files import JsonDocument, JsonLog
+from ros2_memory.bag_dir.own_recordings import LIST
+from ros2_memory.bag_dir.state_files import (
+    DELETED,
+    ERASING,
+    FORGOTTEN,
+    LOST,
+    RECORDED,
+    SCREENED,
+    SHIPPED,
+    TRIGGERS,
+    Forgetting,
+    Loss,
+    Receipt,
+    append_losses,
+    append_receipts,
+    read_deleted,
+    read_forgettings,
+    read_gate,
+    read_losses,
+    read_receipts,
+    unshipped,
+)
+from tests.support.examples import examples
+
+Log: TypeAlias = JsonLog[Any]
+Document: TypeAlias = JsonDocument[Any]
+
+FORGOTTEN_ROWS = [
+    '{"start": 2, "stop": 3, "topics": ["/camera", "/odd]}"], "bags": []}',
+    '{"start": 1, "stop": 9, "topics": [], "bags": [{"recording": "}", "file": "]}", "first": 4}]}',
+]
+LOGS: list[tuple[Log, str]] = [
+    (RECORDED, '{"recording": "rec_A", "recorded_s": 3600.5}\n'),
+    (LOST, '{"topic": "/odom", "start": -1, "stop": 9, "lost": 4, "by": "stamps"}\n'),
+    (
+        DELETED,
+        r"""{"recording": "", "files": [], "spans": [[1, 5]]}
+{"recording": "rec_\udcff", "files": ["a_0.mcap"], "spans": [[1, 5], [8, 9]]}
+""",
+    ),
+    (
+        SHIPPED,
+        r"""{"bag": "\u00fc", "bag_id": "b", "size": 5, "sha256": "0", "lake": "l", "at": 7}
+""",
+    ),
+    (FORGOTTEN, "".join(f"{row}\n" for row in FORGOTTEN_ROWS)),
+    (
+        LIST,
+        r"""{"bag_dir_id": "5f0c5f0c"}
+{"recording": "rec_A"}
+{"recording": "rec_A", "inode": 7, "generation": 9}
+{"recording": "old/run\udcff", "inode": 8, "adopted": true}
+""",
+    ),
+]
+# In one line each.
+ERASURE = r"""{"format":1,"topics":["/a"],"windows":[[1,2]],"latched":["/\u00e4"],
+"files":["f\udcff"],"counts":[{"topic":"/a","start":1,"stop":2,"count":3}]}"""
+SCREEN = """{"format":1,"recordings":{"rec_A":{"done":false,"start":1,"end":null,
+"files":{"a.mcap":"read"},"heard":{"home":[{"first":1,"last":2,"holds":null,"lasts":false}]},
+"unclear":[[1,2]]}},"excluded":[{"start":1,"stop":2,"held":true}]}"""
+RULES = """{"format":1,"rules":{"tür":{"fired":1,"moments":2,"refused":3,"last_fired":null,
+"problem":"ß","always_since":null,"begun":[1],"newest":[{"number":"00000000000000000000000000000000",
+"start":1,"end":2,"matches":1,"known":false,"stored":false}],
+"runs":{"/a":{"first":1,"last":2,"fired":false,"lasts":false}}}},"searched":{"a":1},"before":"x",
+"latched":{"/m":{"published":{"a":1},"begun":{"a":2},"payload":"ff"}}}"""
+DOCUMENTS: list[tuple[Document, str]] = [
+    (ERASING, ERASURE.replace("\n", "")),
+    (SCREENED, SCREEN.replace("\n", "")),
+    (TRIGGERS, RULES.replace("\n", "")),
+]
+
+
+def name_of(value: object) -> str:
+    return Path(value.name).name if isinstance(value, JsonLog | JsonDocument) else ""
+
+
+def laid(bag_dir: Path, file: Log | Document, content: str | bytes) -> Path:
+    """Puts a file there, as it was written before."""
+    path = bag_dir / file.name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def read(file: Log | Document, bag_dir: Path) -> Any:
+    return file.rows(bag_dir) if isinstance(file, JsonLog) else file.read(bag_dir)
+
+
+def replace(file: Log | Document, bag_dir: Path, value: Any) -> None:
+    (file.replace if isinstance(file, JsonLog) else file.write)(bag_dir, value)
+
+
+@pytest.mark.parametrize(("file", "text"), [*LOGS, *DOCUMENTS], ids=name_of)
+class TestEveryFile:
+    def test_it_is_written_as_it_stands_on_robots(
+        self, tmp_path: Path, file: Log | Document, text: str
+    ) -> None:
+        assert not read(file, tmp_path)
+        path = laid(tmp_path, file, text)
+        value = read(file, tmp_path)
+        path.unlink()
+        replace(file, tmp_path, value)
+        assert path.read_text() == text
+
+    def test_it_is_on_the_disk_before_it_gets_its_name_and_stands_where_the_disk_is_full(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: Log | Document, text: str
+    ) -> None:
+        path = laid(tmp_path, file, text)
+        value, flushed = read(file, tmp_path), list[str]()
+
+        def fsync(descriptor: int) -> None:
+            flushed.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+            if len(flushed) > 2:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        replace(file, tmp_path, value)
+        assert flushed == [f".{path.name}.tmp", ".episodic"]
+        with pytest.raises(OSError, match="No space left"):
+            replace(file, tmp_path, value)
+        if isinstance(file, JsonLog):
+            with pytest.raises(OSError, match="No space left"):
+                file.append(tmp_path, value * 9)
+        assert path.read_text() == text
+        assert [*path.parent.iterdir()] == [path]
+
+    def test_nothing_is_read_or_written_behind_a_link(
+        self, tmp_path: Path, file: Log | Document, text: str
+    ) -> None:
+        elsewhere = laid(tmp_path, file, text)
+        value = read(file, tmp_path)
+        linked, within = tmp_path / "linked", tmp_path / "within"
+        linked.mkdir()
+        (linked / ".episodic").symlink_to(elsewhere.parent)
+        (within / ".episodic").mkdir(parents=True)
+        (within / file.name).symlink_to(elsewhere)
+        with pytest.raises(OSError, match="symbolic link"):
+            read(file, within)
+        with pytest.raises(OSError, match="symbolic link"):
+            replace(file, linked, value)
+        for bag_dir in (linked, within):
+            if isinstance(file, JsonLog):
+                with pytest.raises(OSError, match="symbolic link"):
+                    file.append(bag_dir, value)
+        assert elsewhere.read_text() == text
+
+    def test_what_is_no_file_is_told_at_once(
+        self, tmp_path: Path, file: Log | Document, text: str
+    ) -> None:
+        laid(tmp_path, file, text).unlink()
+        os.mkfifo(tmp_path / file.name)
+        with pytest.raises(ValueError, match="not a regular file"):
+            read(file, tmp_path)
+
+
+@pytest.mark.parametrize(("log", "text"), LOGS, ids=name_of)
+class TestLogs:
+    def test_rows_are_appended_and_newer_ones_read_as_far_as_they_are_known(
+        self, tmp_path: Path, log: Log, text: str
+    ) -> None:
+        path = laid(tmp_path, log, text.replace("}\n", ', "mood": ["fine"]}\n'))
+        rows = log.rows(tmp_path)
+        path.unlink()
+        sizes = [log.append(tmp_path, [row]) for row in rows]
+        assert path.read_text() == text
+        assert sizes[-1] == path.stat().st_size
+
+    def test_a_line_that_a_crash_cut_anywhere_costs_itself_alone(
+        self, tmp_path: Path, log: Log, text: str
+    ) -> None:
+        first, last = text.splitlines()[0], text.splitlines()[-1]
+        for length in range(1, len(last), 5):
+            laid(tmp_path, log, f"{first}\n{last[:length]}")
+            rows = log.rows(tmp_path)
+            assert len(rows) == 1
+            log.append(tmp_path, rows)
+            assert log.rows(tmp_path) == rows * 2
+
+    @settings(max_examples=examples(20), deadline=None)
+    @given(junk=st.binary(max_size=99) | st.sampled_from([b"{", b"[" * 5000, b"[1]", b'{"by": 7}']))
+    def test_lines_that_mean_nothing_are_named_and_spoil_no_other(
+        self, tmp_path_factory: pytest.TempPathFactory, log: Log, text: str, junk: bytes
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        laid(bag_dir, log, b"%b\n%b\n" % (junk, text.splitlines()[-1].encode()))
+        *before, last = log.lines(bag_dir)
+        assert last.number == junk.count(b"\n") + 2
+        assert last.row is not None
+        assert log.rows(bag_dir)[-1] == last.row
+        for line in before:
+            assert (line.row is None) == (line.error is not None)
+            assert line.text in junk
+
+    def test_of_too_long_a_file_the_newest_rows_are_read(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log, text: str
+    ) -> None:
+        laid(tmp_path, log, text * 50)
+        rows = log.rows(tmp_path)
+        monkeypatch.setattr(log, "_most_bytes", 600)
+        left_out, *found = log.lines(tmp_path)
+        assert (left_out.number, left_out.row, len(found) > 1) == (0, None, True)
+        assert "larger than 600 bytes" in str(left_out.error)
+        assert [line.row for line in found] == rows[-len(found) :]
+
+
+@pytest.mark.parametrize(("document", "text"), DOCUMENTS, ids=name_of)
+class TestDocuments:
+    @pytest.mark.parametrize(
+        ("content", "told"),
+        [
+            ("", "Expecting value"),
+            ('{"format":1,', "Expecting property name"),
+            ("[" * 5000, "nothing but brackets"),
+            ("[]", "not a JSON object"),
+            ("{}", "its format is None, and only 1 is known"),
+            ('{"format": 2}', "its format is 2, and only 1 is known"),
+            ('{"format": []}', "only 1 is known"),
+            ('{"format": 1, "topics": 7, "rules": 7, "recordings": 7}', r"^\w+: "),
+            (b"\xff", "utf-8"),
+            (" " * (2 << 20), "larger than"),
+        ],
+    )
+    def test_a_damaged_or_newer_one_is_told(
+        self, tmp_path: Path, document: Document, text: str, content: str | bytes, told: str
+    ) -> None:
+        laid(tmp_path, document, text)
+        laid(tmp_path, document, content)
+        with pytest.raises(ValueError, match=told):
+            document.read(tmp_path)
+
+    def test_the_other_program_may_read_it_whatever_the_umask(
+        self, tmp_path: Path, document: Document, text: str
+    ) -> None:
+        path = laid(tmp_path, document, text)
+        before = os.umask(0o077)
+        try:
+            document.write(tmp_path, document.read(tmp_path))
+        finally:
+            os.umask(before)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+def test_a_file_is_read_again_once_it_has_changed_and_not_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads: list[Path] = []
+    rows = LOST.rows
+
+    def counting(bag_dir: Path) -> list[Loss]:
+        reads.append(bag_dir)
+        return rows(bag_dir)
+
+    monkeypatch.setattr(LOST, "rows", counting)
+    loss = Loss("/odom", 1, 5, 2, "stamps")
+    assert read_losses(tmp_path, 0, 9) == []
+    for number in (1, 2):
+        append_losses(tmp_path, [loss])
+        reads.clear()
+        assert [read_losses(tmp_path, 0, 9) for _ in range(3)] == [[loss] * number] * 3
+        assert len(reads) == 1
+    (tmp_path / LOST.name).unlink()
+    assert read_losses(tmp_path, 0, 9) == []
+
+
+def test_losses_are_those_of_a_window_and_the_oldest_are_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losses = [Loss("/odom", n * 10, n * 10 + 5, 1, "stamps") for n in range(100)]
+    append_losses(tmp_path, losses)
+    assert read_losses(tmp_path, 31, 50) == losses[3:5]
+    monkeypatch.setattr(state_files, "MOST_LOST_BYTES", 6000)
+    append_losses(tmp_path, losses[:1])
+    assert read_losses(tmp_path, 900, 2000) == losses[90:]
+    assert len(read_losses(tmp_path, 0, 2000)) < 60
+
+
+def test_receipts_of_bags_that_are_gone_are_dropped_where_they_are_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_files, "_SPARE_RECEIPTS", 10)
+    (tmp_path / "here").touch()
+    for number in range(8):
+        given = [Receipt(name, "id", number, "00", "hub", 0) for name in (f"gone{number}", "here")]
+        append_receipts(tmp_path, given)
+    receipts = read_receipts(tmp_path)
+    assert receipts["here"].size == 7
+    assert "gone7" in receipts
+    assert "gone0" not in receipts
+    bags = [("here", 7), ("here", 6), ("new", 1)]
+    assert unshipped(tmp_path, bags) == {"here", "new"}
+    assert unshipped(tmp_path, bags[:1]) == frozenset()
+
+
+def test_where_a_file_cannot_be_read_nothing_is_lost_or_shipped_and_all_is_held_back(
+    tmp_path: Path,
+) -> None:
+    name = "rec_20261120T043000Z"
+    assert not read_gate(tmp_path).holds_some(name)
+    for file in (LOST, DELETED, SHIPPED, SCREENED):
+        (tmp_path / file.name).mkdir(parents=True)
+    assert read_losses(tmp_path, 0, 9) == []
+    assert read_deleted(tmp_path) == {}
+    assert unshipped(tmp_path, [("a", 1)]) == {"a"}
+    assert read_gate(tmp_path).holds(name, "a.mcap")
+    assert not read_gate(tmp_path).holds("copied", "a.mcap")
+
+
+class TestForgotten:
+    """The lake deletes by this file: no line of it may be passed over in silence."""
+
+    def test_a_line_is_cut_or_an_error(self, tmp_path: Path) -> None:
+        whole, last = (f"{line}\n" for line in FORGOTTEN_ROWS)
+        laid(tmp_path, FORGOTTEN, whole + last + last)
+        topics, _ = read_forgettings(tmp_path)
+        for length in range(len(last) - 1):
+            laid(tmp_path, FORGOTTEN, whole + last[:length])
+            if last[:length].endswith("]}"):  # within a name that looks like the end of a line
+                with pytest.raises(ValueError, match="line 2: it is damaged"):
+                    read_forgettings(tmp_path)
+                continue
+            assert read_forgettings(tmp_path) == [topics]
+
+    @pytest.mark.parametrize("at", [0, 1])
+    @pytest.mark.parametrize(
+        ("line", "told"),
+        [
+            ('{"start" 1, "stop": 2, "topics": [], "bags": []}', "it is damaged: "),
+            ("[]", "it is not a JSON object"),
+            ('{"start": "1", "stop": 2}', "start: "),
+            ('{"start": 1, "stop": 2}', "it names no topics and no bags"),
+        ],
+    )
+    def test_a_damaged_line_is_an_error_wherever_it_is(
+        self, tmp_path: Path, at: int, line: str, told: str
+    ) -> None:
+        lines = [*FORGOTTEN_ROWS]
+        lines[at] = line
+        laid(tmp_path, FORGOTTEN, "".join(f"{each}\n" for each in lines))
+        with pytest.raises(ValueError, match=f"line {at + 1}: {told}"):
+            read_forgettings(tmp_path)
+
+    def test_a_file_that_is_too_long_is_an_error(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        FORGOTTEN.append(tmp_path, [Forgetting(1, 2, ("/a",))] * 3)
+        monkeypatch.setattr(FORGOTTEN, "_most_bytes", 100)
+        with pytest.raises(ValueError, match="larger than 100 bytes"):
+            read_forgettings(tmp_path)
