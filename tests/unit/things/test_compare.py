@@ -23,7 +23,7 @@ from ros2_memory.results import (
     StandstillPlace,
     ThingStay,
 )
-from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_json import as_json
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import log_entry
 from tests.support.examples import examples
@@ -322,7 +322,7 @@ def test_a_comparison_is_cut_to_6_kb_however_much_differs() -> None:
         farthest=(point, point),
         notes=("a note " * 50,) * 3,
     )
-    reply = render(answer)
+    reply = as_json(answer, Path())
     assert isinstance(reply, dict)
     assert 3_000 < len(to_json_text(reply)) <= 6_000
     cut: Any = reply
