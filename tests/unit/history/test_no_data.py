@@ -99,7 +99,7 @@ def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reporte
     tmp_path: Path, sign: float
 ) -> None:
     turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
-    reply = as_json(TransformAt("odom", "base_link", T0, turned, "stamp"), Path())
+    reply = as_json(TransformAt("odom", "base_link", T0, turned, "stamp"), tmp_path)
     assert isinstance(reply, dict)
     assert reply["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
 
