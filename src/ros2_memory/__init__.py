@@ -10,13 +10,13 @@ Modules at the top::
     bootstrap       composition root; bootstrap_fleet: of many robots; bootstrap_lake: of a lake
     config          the configuration: models, loading, errors, sources
     queries         one function for each tool of the specification
-    results         what queries and insights return
     extract         the fields, poses and transforms that the schema map names
     typestore       message definitions
 
 Rooms, from the bottom up. A room imports only from rooms below it::
 
-    core            errors, time, the domain model, geometry, text, logging, telemetry port
+    core            errors, time, the domain model, geometry, text, logging, telemetry port,
+                    units and keys of replies
     storage         bag readers and writers; storage.mcap: the MCAP format
     messages        a decoded message as JSON: its fields, conversions, detections
     bag_dir         the contract between the two programs: file names, heartbeat, handover, lock,
@@ -28,6 +28,7 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     recorder        the recorder; recorder.process: the child; recorder.handover: rotation
     columns         closed bags decoded once, as columns in SQLite; scanned by questions
     catalogue       SQLite digests of closed bags; derived, disposable
+    results         what queries and insights return: each class declares the keys of its reply
     history         one call's view across many bags
     things          what detectors saw, as instances with places and a history
     places          where the robot was: in the map, in regions, in named places

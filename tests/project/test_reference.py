@@ -7,10 +7,11 @@ import os
 import re
 import time
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from ros2_memory import results
 from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import (
@@ -29,6 +30,8 @@ from tests.support.memories import ROOT
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
+
+    from ros2_memory.core.reply import Declared
 
 FOLDER = ROOT / "docs" / "reference"
 TOOLS = build_tools(QuerySettings(), writing=True)
@@ -70,6 +73,51 @@ def test_every_tool_stands_there_with_its_arguments_a_call_and_its_reply(
 ) -> None:
     assert list(CALLS) == [tool.name for tool in TOOLS]
     compare("tools", "tools", reference.tool_sections(TOOLS, answers))
+
+
+REPLIES: dict[str, type[object]] = {
+    "compare": results.Comparison,
+    "data_time_range": results.DataTimeRange,
+    "find_last_match": results.Match,
+    "find_matches": results.Sightings,
+    "get_topic_at_time": results.TopicValue,
+    "get_transform_at": results.TransformAt,
+    "get_value_when": results.ValueWhen,
+    "get_velocity_at": results.Velocity,
+    "list_frames": results.Frames,
+    "list_recorded_topics": results.TopicRow,
+    "recap": results.Recap,
+    "remember_moment": results.RememberedMoment,
+    "trajectory_summary": results.TrajectorySummary,
+    "visits": results.Visits,
+}
+"""The class that declares the reply of a tool."""
+
+
+SPREAD = {"x", "y", "z", "yaw_deg", "at_least", "notes"}
+"""Keys that a unit shows in the place of its own, and the one that every reply may have."""
+
+
+def outer_keys(text: str) -> list[str]:
+    """The keys of the object that a text begins with, without those of its rows."""
+    outer, depth = "", 0
+    for char in re.sub(r"\([^()]*\)|: the [a-z ]+|: a number|: \w+ or null", "", text).lstrip("`["):
+        depth += (char in "{[") - (char in "}]")
+        if depth == 0:
+            break
+        outer += char if depth == 1 else ""
+    return re.findall(r"[a-z_]+", outer)
+
+
+@pytest.mark.parametrize("name", sorted(REPLIES))
+def test_the_keys_that_a_reply_is_said_to_have_are_declared(name: str) -> None:
+    declared = SPREAD | {key.name for key in cast("type[Declared]", REPLIES[name]).reply.all}
+    rows = re.findall(rf"^\| `{name}` \| [^|]*\| (`.*) \|$", page("tools"), re.MULTILINE)
+    [description] = [tool.description for tool in TOOLS if tool.name == name]
+    texts = (*rows, description.partition("Reply: ")[2])
+    said = [key for text in texts for key in outer_keys(text)]
+    assert said
+    assert [key for key in said if key not in declared] == []
 
 
 @pytest.mark.parametrize("name", sorted(set(CALLS)))

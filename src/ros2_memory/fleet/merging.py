@@ -13,10 +13,22 @@ from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 from heapq import merge
-from typing import TYPE_CHECKING, Final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import iso_local
+from ros2_memory.results import (
+    AnswerWithNotes,
+    Before,
+    Comparison,
+    DataTimeRange,
+    Recap,
+    Sightings,
+    Status,
+    Things,
+    Visits,
+)
 from ros2_memory.tools.reply_json import ROBOT_NAME
 from ros2_memory.tools.reply_size import to_json_text
 
@@ -24,9 +36,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject, Merging
     from ros2_memory.core.timebase import Ns
     from ros2_memory.fleet.robots import FromLake
-    from ros2_memory.tools.reply_size import JsonObject
 
 _MOST_NAMED: Final = 8
 """Robots that a note names."""
@@ -53,29 +65,27 @@ class RobotReply:
     lake: FromLake | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class MergedRows:
-    """How the rows of a tool's replies become one list.
+class MergedRows(NamedTuple):
+    """How the rows of a tool's replies become one list, as the class of the replies declares it.
 
     Attributes:
         rows: by the key of the rows, that of their time; a row whose time is null goes on.
-        added: keys of numbers that are added up, also listed by robot.
-        counted: keys of objects whose numbers are added up.
-        earliest: keys of which the smallest counts.
-        newest: keys of which the largest counts.
-        inherited: keys that each row takes over from its reply, since they differ between robots.
-        who: keys that are true of some robots, whose names are listed.
+        merging: of the other keys. Those that are added up are also listed by robot.
         marks_more: whether `more` says that rows are left out.
     """
 
     rows: Mapping[str, str]
-    added: tuple[str, ...] = ()
-    counted: tuple[str, ...] = ()
-    earliest: tuple[str, ...] = ()
-    newest: tuple[str, ...] = ()
-    inherited: tuple[str, ...] = ()
-    who: tuple[str, ...] = ()
+    merging: Mapping[str, Merging] = MappingProxyType({})
     marks_more: bool = False
+
+    @classmethod
+    def declared(cls, answer: type[AnswerWithNotes]) -> MergedRows:
+        """Returns what the keys of an answer say."""
+        return cls(
+            {key.name: key.row_time for key in answer.reply.all if key.row_time},
+            {key.name: key.merging for key in answer.reply.all if key.merging},
+            any(key.name == "more" for key in answer.reply.all),
+        )
 
 
 _TOTAL: Final = "total"
@@ -86,34 +96,20 @@ TOPICS: Final = "topics"
 MERGED_ROWS: Final[Mapping[str, MergedRows]] = {
     "find_last_match": MergedRows({MATCHES: "timestamp"}),
     "list_recorded_topics": MergedRows({TOPICS: "last_ts"}),
-    "find_matches": MergedRows(
-        {"sightings": "last_seen"},
-        added=("total",),
-        earliest=("searched_from",),
-        newest=("searched_to",),
-        marks_more=True,
-    ),
-    "find_things": MergedRows(
-        {"things": "last_seen"},
-        added=("total",),
-        counted=("labels",),
-        inherited=("frame_id",),
-    ),
-    "visits": MergedRows(
-        {"visits": "departed", "places": "last_exit"},
-        added=("total", "entries", "exits", "minutes"),
-        inherited=("frame_id",),
-        who=("there_now",),
-        marks_more=True,
-    ),
+    "find_matches": MergedRows.declared(Sightings),
+    "find_things": MergedRows.declared(Things),
+    "visits": MergedRows.declared(Visits),
 }
 """The tools whose rows are merged."""
 
 SHORT_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
-    "compare": ("recorded_s", "things_unchanged", "way", "errors"),
-    "recap": ("around", "duration_s", "distance_m", "stood_s", "counts", "before"),
-    "memory_status": ("trust", "recorder", "latest", "newest_age_s", "damaged"),
-    "data_time_range": ("earliest", "latest", "bags"),
+    tool: tuple(key.name for answer in answers for key in answer.reply.short.keys)
+    for tool, answers in (
+        ("compare", (Comparison,)),
+        ("recap", (Before, Recap)),
+        ("memory_status", (Status,)),
+        ("data_time_range", (DataTimeRange,)),
+    )
 }
 """The tools with a row for each robot, and what is left of it where the whole is too long."""
 
@@ -179,7 +175,8 @@ def _rows(
         if never := [each.name for each in replies if each.value is None]:
             reply["never"] = [*never]
         return reply
-    reply |= _rest(rule, replies, [_without(value, {key, *rule.inherited}) for value in values])
+    inherited = {name for name, how in rule.merging.items() if how == "inherited"}
+    reply |= _rest(rule, replies, [_without(value, {key, *inherited}) for value in values])
     is_cut = len(found) > len(found[:limit])
     if rule.marks_more and (is_cut or any(value.get("more") for value in values)):
         reply["more"] = True
@@ -197,7 +194,11 @@ def _as_rows(reply: RobotReply) -> JsonObject:
 
 
 def _named_row(rule: MergedRows, name: str, reply: JsonObject, row: JsonObject) -> JsonObject:
-    taken = {key: reply[key] for key in rule.inherited if key in reply and key not in row}
+    taken = {
+        key: reply[key]
+        for key, how in rule.merging.items()
+        if how == "inherited" and key in reply and key not in row
+    }
     return {ROBOT_NAME: name, **row, **taken}
 
 
@@ -213,17 +214,18 @@ def _rest(
         each = {
             one.name: value[key] for one, value in zip(replies, values, strict=True) if key in value
         }
-        if key in rule.who:
+        how = rule.merging.get(key)
+        if how == "who":
             reply[key] = [name for name, is_so in each.items() if is_so]
-        elif key in rule.counted:
+        elif how == "counted":
             reply[key] = _added(each.values())
-        elif key in rule.earliest or key in rule.newest:
+        elif how in {"earliest", "newest"}:
             numbers = [
                 _number(each[one.name]) for one in _dated(replies) if each.get(one.name) is not None
             ]
-            best = min if key in rule.earliest else max
+            best = min if how == "earliest" else max
             reply[key] = best(numbers, default=None)
-        elif key in rule.added or key == AT_LEAST:
+        elif how == "added" or key == AT_LEAST:
             reply |= _summed(key, each.values(), values)
             _add(by_robot, key, each)
         elif len(each) == len(replies) and len({to_json_text(one) for one in each.values()}) == 1:

@@ -34,17 +34,16 @@ from ros2_memory.fleet.merging import (
 from ros2_memory.fleet.page import Page
 from ros2_memory.fleet.robots import Robot, StoppedClock
 from ros2_memory.results import Match, OfFleet, OfRobot, Sightings
-from ros2_memory.tools.replies import as_json
-from ros2_memory.tools.reply_json import ROBOT_NAME
+from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.fleet.robots import Fleet, FromLake
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Answer, OneAnswer
     from ros2_memory.tools.declaration import Question, Tool
-    from ros2_memory.tools.reply_size import JsonObject
 
 ROBOT: Final = "robot"
 """The argument that names a robot."""

@@ -39,11 +39,11 @@ from ros2_memory.tools.reply_size import to_json_text
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Mapping, Sequence
 
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.history.context import Memory
     from ros2_memory.tools.declaration import Question, Tool, ToolDeclaration
     from ros2_memory.tools.replies import Replies
-    from ros2_memory.tools.reply_size import JsonObject
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2

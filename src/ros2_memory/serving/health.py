@@ -15,20 +15,20 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.reply import moment, seconds
 from ros2_memory.history.context import short_name
 from ros2_memory.insights.status import clock_faults, left_open, problems_of
 from ros2_memory.serving.fair_queue import FairQueue
-from ros2_memory.tools.reply_json import moment, seconds
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
-    from ros2_memory.tools.reply_size import JsonObject
 
 TIMEOUT_S: Final = 2.0
 """How long the index may take; the first scan of a large directory takes longer."""

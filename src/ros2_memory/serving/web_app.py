@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from starlette.requests import Request
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.telemetry import Exposition
-    from ros2_memory.tools.reply_size import JsonObject
 
 Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 

@@ -14,10 +14,10 @@ from ros2_memory.tools.schema import Signature
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Answer
     from ros2_memory.tools.arguments import Arguments, TimeArgument
-    from ros2_memory.tools.reply_size import JsonObject
 
 Question: TypeAlias = "Callable[[Memory, Call], Answer]"
 """A query with its arguments bound."""

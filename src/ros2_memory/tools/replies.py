@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import accumulate
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.core.errors import (
@@ -14,22 +15,19 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
+from ros2_memory.core.reply import Scope, file_name, shown, with_notes
 from ros2_memory.core.timebase import unix_rounded_up
-from ros2_memory.tools import (  # noqa: F401 - register replies
-    reply_json_bins,
-    reply_json_motion,
-    reply_json_things,
-)
-from ros2_memory.tools.reply_json import ROBOT_NAME, render, with_notes
-from ros2_memory.tools.reply_json_memory import file_name, time_range
-from ros2_memory.tools.reply_json_topics import fit_topics, topic_row
+from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 from ros2_memory.tools.reply_size import fit_reply, to_json_text
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.tools.reply_size import JsonObject
+    from ros2_memory.core.reply import JsonObject
+
+_LONGEST_LAST_ROW_CHARS: Final = 200
+"""Characters of the row that sums up those left out, whatever its numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +36,6 @@ class Reply:
 
     text: str
     is_error: bool = False
-
-
-def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
-    """Returns an answer as a JSON value of any size; files are named relative to `bag_dir`."""
-    if isinstance(answer, tuple):
-        return [topic_row(row) for row in answer]
-    if isinstance(answer, results.DataTimeRange):
-        return time_range(answer, bag_dir)
-    return render(answer)
 
 
 def named(robot_name: str, value: JsonValue) -> JsonObject:
@@ -79,7 +68,7 @@ class Replies:
         else:
             bag_dir = self.bag_dir
         if isinstance(answer, tuple):
-            return Reply(fit_topics(answer, self.max_chars, name))
+            return Reply(self._topics(answer, {} if name is None else {ROBOT_NAME: name}))
         value = answer.value if isinstance(answer, results.OfFleet) else as_json(answer, bag_dir)
         if name is not None:
             value = named(name, value)
@@ -91,6 +80,33 @@ class Replies:
         if from_active:
             value = {**value, "from_active": True}
         return Reply(fit_reply(value, self.max_chars))
+
+    def _topics(self, rows: tuple[results.TopicRow, ...], name: JsonObject) -> str:
+        """Returns the list of topics, each row with the name of the robot, if there is one.
+
+        It is always a list of rows. Where it would be too long, the busiest topics come first, and
+        the last row sums up those left out: their first and last time and all their messages.
+        """
+
+        def named_row(row: results.TopicRow) -> JsonObject:
+            return name | shown(row, Scope())
+
+        text = to_json_text([named_row(row) for row in rows])
+        if len(text) <= self.max_chars:
+            return text
+        busiest = sorted(rows, key=lambda row: -row.count)
+        fitting = self.max_chars - _LONGEST_LAST_ROW_CHARS - len(to_json_text(name))
+        sizes = accumulate(len(to_json_text(named_row(row))) + 1 for row in busiest)
+        kept = sum(size <= fitting for size in sizes)
+        rest = busiest[kept:]
+        others = results.TopicRow(
+            f"({len(rest)} more: use pattern)",
+            "",
+            min(row.first for row in rest),
+            max(row.last for row in rest),
+            sum(row.count for row in rest),
+        )
+        return to_json_text([named_row(row) for row in (*busiest[:kept], others)])
 
     def error(self, error: EpisodicError) -> Reply:
         """Returns an error of the tree. Having no data is an answer; the others are errors."""

@@ -1,146 +1,102 @@
-"""Answers as JSON values: units, rounding, and the parts that several replies share.
+"""An answer as a JSON value: by the keys that its class declares, and what several rows share.
 
-Timestamps are Unix seconds, rounded up to whole microseconds so that one that is passed back finds
-its own message; metres and metres per second to 1e-4, degrees to 1e-2, durations to 1e-3 s. A
-number that is not finite is null. `notes` is there only if there are any, and `local` only in
-replies that span more than half a day (`LocalTimes`). The replies themselves
-are in `reply_json_memory`, `reply_json_motion` and `reply_json_topics`, each registered with
-`render` for its result.
+Nearly every answer is rendered by its declaration alone (`core/reply.py`, `results/`). Here is what
+looks at the reply as a whole: rows that repeat each other, lists that are shortened until it fits.
 """
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from dataclasses import dataclass
-from functools import singledispatch
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
-from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.geometry import normalised, yaw
-from ros2_memory.core.timebase import NS_PER_S, Ns, local_text, unix_from_ns, unix_rounded_up
+from ros2_memory.core.reply import Scope, render, shown, with_notes
+from ros2_memory.core.text import listed as named
+from ros2_memory.history.driven_path import length_notes
+from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
+from ros2_memory.tools.reply_size import largest, to_json_text, without_constant_zeros
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator
+    from pathlib import Path
 
-    from ros2_memory.core.model import JsonValue, Pose, Vector3
-    from ros2_memory.tools.reply_size import JsonObject
+    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject, Keys
 
-LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
-"""Shorter spans have no local times."""
 ROBOT_NAME: Final = "robot_name"
 """The key of the robot that an answer or a row is of, in a fleet; `robot` is where one was."""
+ZEROS_SHOWN_BELOW_CHARS: Final = 4000
+"""A range shorter than this keeps its constant zeros: there is room, and whole values read best."""
+FINE_PATH_M: Final = 0.05 + 1e-9
+"""The deviation that a simplified path is expected to have; a larger one is noted."""
+_MAX_ZEROS_NAMED: Final = 20
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
+_COMPARISONS: Final = tuple(compared(most) for most in range(5, 0, -1))
+_THINGS: Final = tuple(listed_things(thing(most_stays)) for most_stays in (8, 5, 3, 2))
+_SHORT_THINGS: Final = listed_things(SHORT_THING)
+_HOW: Final = "in short form; ask with label or where for their scores, states and moves"
+_LONGEST: Final = 6_000
+"""Characters of a reply about things; its lists are cut until it is no longer."""
 
 
-@singledispatch
-def render(answer: object) -> JsonValue:
-    """Returns the JSON value of an answer.
-
-    Raises:
-        TypeError: it is no answer of a query.
-    """
-    raise TypeError(f"{type(answer).__name__} is not an answer")
-
-
-def moment(at: Ns | None) -> float | None:
-    """Returns a time in Unix seconds, if there is one."""
-    return None if at is None else unix_rounded_up(at)
-
-
-def seconds(duration: Ns) -> float:
-    """Returns a duration in seconds."""
-    return round(unix_from_ns(duration), 3)
-
-
-@dataclass(frozen=True, slots=True)
-class LocalTimes:
-    """Local times beside Unix seconds, for a reply that spans more than half a day.
-
-    Its oldest time is `first`. `last` is now where it counts ages, else its newest time.
-    """
-
-    first: Ns | None
-    last: Ns | None
-
-    def of(self, start: Ns | None, end: Ns | None = None) -> JsonObject:
-        """Returns `local` for a time, or for a stretch whose ends may be unknown; else nothing."""
-        first, last = self.first, self.last
-        if first is None or last is None or last - first <= LOCAL_BEYOND_NS:
-            return {}
-        begins, ends = (None if at is None else local_text(at) for at in (start, end))
-        if begins is None or ends is None or begins == ends:
-            text = begins or (f"- {ends}" if ends else None)
-        else:
-            day = begins[: -len("00:00:00")]
-            text = f"{begins} - {ends.removeprefix(day)}"
-        return {} if text is None else {"local": text}
+def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
+    """Returns an answer as a JSON value of any size; files are named relative to `bag_dir`."""
+    reply: JsonValue = None
+    match answer:
+        case tuple():
+            reply = [shown(row, Scope()) for row in answer]
+        case results.Match(found=None, notes=()) | results.ValueWhen(matched=None, notes=()):
+            pass
+        case results.ValueWhen(matched=None):
+            reply = render(results.Match(None, notes=answer.notes), bag_dir)
+        case results.AtEach():
+            reply = _at_each(answer, bag_dir)
+        case results.Comparison():
+            reply = _shortest(answer, bag_dir, _COMPARISONS)
+        case results.Things():
+            reply = _things(answer, bag_dir)
+        case results.TopicRange(fields=()):
+            reply = _samples(answer, bag_dir)
+        case _:
+            reply = render(_with_all_notes(answer), bag_dir)
+    return reply
 
 
-def total(number: int | None, at_least: int) -> JsonObject:
-    """Returns how many there are; under another name where not all of them were counted."""
-    return {"at_least": at_least} if number is None else {"total": number}
+def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
+    """Returns an answer with the notes of what it consists of, each once."""
+    match answer:
+        case results.Match(found=found) if found is not None:
+            return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
+        case results.ValueWhen(matched=matched, value=value) if matched is not None:
+            held = () if value is None else value.notes
+            return replace(
+                answer, notes=tuple(dict.fromkeys((*matched.notes, *held, *answer.notes)))
+            )
+        case results.TrajectorySummary():
+            return replace(answer, notes=(*answer.notes, *_path_notes(answer.trajectory)))
+        case _:
+            return answer
 
 
-def metres(vector: Vector3) -> JsonObject:
-    """Returns a point or vector by its axes."""
-    return {name: rounded(part, 4) for name, part in zip("xyz", vector, strict=True)}
-
-
-def degrees(angle: float | None) -> float | None:
-    """Returns an angle, given in radians, in degrees, if there is one."""
-    return None if angle is None else rounded(math.degrees(angle), 2)
-
-
-def rounded(number: float, places: int) -> float | None:
-    """Returns a rounded number; None if it is not finite."""
-    return round(number, places) if math.isfinite(number) else None
-
-
-def planar_pose(pose: Pose) -> JsonObject:
-    """Returns a position, its yaw, and the named places that it is in."""
-    unit = None if pose.orientation is None else normalised(pose.orientation)
-    heading = degrees(None if unit is None else yaw(unit))
-    return {**metres(pose.position), "yaw_deg": heading, **inside(pose.places)}
-
-
-def inside(places: Sequence[str]) -> JsonObject:
-    """Returns the smallest of the named places that a point is in, and those around it."""
-    reply: JsonObject = {"in": places[0]} if places else {}
-    return {**reply, "also_in": [*places[1:]]} if places[1:] else reply
-
-
-def with_notes(
-    reply: JsonObject, notes: Sequence[str], age: Ns | None = None, **marks: bool
-) -> JsonObject:
-    """Returns a reply with the marks that are true, its age and its notes, where there are any."""
-    whole = reply | {name: True for name, is_so in marks.items() if is_so}
-    if age is not None:
-        whole["age_s"] = seconds(age)
-    if notes:
-        whole["notes"] = [*notes]
-    return whole
-
-
-@render.register(results.AtEach)
-def _at_each(answer: results.AtEach) -> JsonObject:
+def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
     """Returns one row for each moment; what all rows share is above them, and is not repeated."""
-    rows = [row for row in map(render, answer.answers) if isinstance(row, dict)]
+    rows = [render(found, bag_dir) for found in answer.answers]
     found = [row for row in rows if "error" not in row]
     shared: JsonObject = {
         key: found[0][key]
         for key in _OF_ALL
         if found and key in found[0] and all(row.get(key) == found[0][key] for row in found)
     }
-    often = Counter(note for each in answer.answers for note in dict.fromkeys(each.notes))
+    often = Counter(note for one in answer.answers for note in dict.fromkeys(one.notes))
     common = [note for note, times in often.items() if times > 1]
     explained: set[JsonValue] = set()
-    for row, each in zip(rows, answer.answers, strict=True):
+    for row, one in zip(rows, answer.answers, strict=True):
         for key in shared.keys() & row.keys():
             del row[key]
-        own = [note for note in each.notes if note not in common]
+        own = [note for note in one.notes if note not in common]
         row.pop("notes", None)
         if own:
             row["notes"] = [*own]
@@ -151,12 +107,71 @@ def _at_each(answer: results.AtEach) -> JsonObject:
     return with_notes({**shared, "results": [*rows]}, common)
 
 
-@render.register(results.NothingAt)
-def _nothing_at(answer: results.NothingAt) -> JsonObject:
-    reply: JsonObject = {
-        "at": unix_rounded_up(answer.at),
-        "error": NoDataError.code,
-        "reason": answer.reason.value,
-        "detail": answer.detail,
-    }
-    return with_notes(reply, answer.notes)
+def _shortest(
+    answer: results.Comparison | results.Things, bag_dir: Path, forms: tuple[Keys, ...]
+) -> JsonObject:
+    """Returns an answer by the first keys that leave it short, else by the last."""
+    reply: JsonObject = {}
+    for form in forms:
+        reply = render(answer, bag_dir, form)
+        if _is_short(reply):
+            break
+    return reply
+
+
+def _is_short(reply: JsonObject) -> bool:
+    return len(to_json_text(reply)) <= _LONGEST
+
+
+def _things(answer: results.Things, bag_dir: Path) -> JsonObject:
+    """Returns the things, each with as many of its newest places as leave the reply short.
+
+    Where that is not enough, what each is and where it was last, and only the things seen last.
+    """
+    reply = _shortest(answer, bag_dir, _THINGS)
+    if not answer.things or _is_short(reply):
+        return reply
+
+    def first(count: int) -> JsonObject:
+        note = f"{count} of {answer.total} things are listed, {_HOW}"
+        few = replace(answer, things=answer.things[:count], notes=(note, *answer.notes))
+        return render(few, bag_dir, _SHORT_THINGS)
+
+    return first(largest(1, len(answer.things), lambda count: _is_short(first(count))) or 1)
+
+
+def _samples(answer: results.TopicRange, bag_dir: Path) -> JsonObject:
+    """Returns the samples of a window, without the numbers that are 0 throughout a long reply."""
+    reply = render(answer, bag_dir)
+    if len(to_json_text(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
+        return reply
+    values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
+    if not zeros:
+        return reply
+    note = f"0 in every sample and left out: {named(zeros, at_most=_MAX_ZEROS_NAMED)}"
+    samples = tuple(
+        replace(sample, value=value) for sample, value in zip(answer.samples, values, strict=True)
+    )
+    return render(replace(answer, samples=samples, notes=(*answer.notes, note)), bag_dir)
+
+
+def _path_notes(path: Trajectory) -> Iterator[str]:
+    yield from length_notes(path)
+    if path.totals.jumps:
+        drawn = sum(point.jump for point in path.waypoints)
+        if drawn:
+            longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
+            yield (
+                f"of the jumps {longest} to a waypoint with jump: true; "
+                "that distance was not driven"
+            )
+    if path.poses and path.max_speed_from == "positions":
+        yield "max_speed is measured from positions: the messages have no speed"
+    # By more than the rounding of both.
+    if path.avg_speed > path.max_speed + 0.01:
+        yield (
+            "avg_speed, by the positions, is above max_speed of the messages: "
+            "one of the two is wrong"
+        )
+    if path.waypoint_error_m > FINE_PATH_M:
+        yield f"the path is within {path.waypoint_error_m:.2f} m of the waypoints' line"

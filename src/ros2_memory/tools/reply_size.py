@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
-JsonObject: TypeAlias = "dict[str, JsonValue]"
 _Path: TypeAlias = tuple[str, ...]
 
 EVENLY_THINNED: Final = frozenset({"samples", "rows", "waypoints", "value"})
@@ -202,7 +202,7 @@ def _rows_that_fit(key: str, sizes: Sequence[int], spare: int) -> list[int]:
     def fits(count: int) -> bool:
         return sum(sizes[index] for index in chosen(count)) <= spare
 
-    return chosen(_largest(_FEWEST_ROWS, len(sizes), fits) or _FEWEST_ROWS)
+    return chosen(largest(_FEWEST_ROWS, len(sizes), fits) or _FEWEST_ROWS)
 
 
 def _rows_note(key: str, kept: int, total: int, max_chars: int) -> str:
@@ -241,13 +241,11 @@ def _weakest_shortener(reply: JsonObject, max_chars: int) -> _Shortener:
         return len(to_json_text(_Shortener(keys, arrays, text).shorten(reply))) <= room
 
     unlimited = len(to_json_text(reply))
-    longest = _largest(
-        _ARRAY_STEPS[0], max_chars, lambda arrays: fits(unlimited, arrays, unlimited)
-    )
+    longest = largest(_ARRAY_STEPS[0], max_chars, lambda arrays: fits(unlimited, arrays, unlimited))
     if longest is not None:
         return _Shortener(unlimited, longest, unlimited)
     for arrays in _ARRAY_STEPS:
-        text = _largest(_SHORTEST_TEXT, max_chars, partial(fits, unlimited, arrays))
+        text = largest(_SHORTEST_TEXT, max_chars, partial(fits, unlimited, arrays))
         if text is not None:
             return _Shortener(unlimited, arrays, text)
     fewest, shortest = _ARRAY_STEPS[-1], _SHORTEST_TEXT // 4
@@ -317,7 +315,7 @@ class _Shortener:
             self.shortened[path, how] = (kept, total)
 
 
-def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int | None:
+def largest(low: int, high: int, fits: Callable[[int], bool]) -> int | None:
     """Returns the largest number from `low` to `high` that fits, by bisection; None if none does.
 
     A number fits if a larger one does.

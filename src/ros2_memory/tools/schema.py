@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.tools.arguments import Arguments, TimeArgument
-    from ros2_memory.tools.reply_size import JsonObject
 
 _MAX_UNKNOWN_NAMED: Final = 5
 _MAX_NAME_CHARS: Final = 64

@@ -16,7 +16,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.results import TransformAt
-from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of, recalling
@@ -99,7 +99,7 @@ def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reporte
     tmp_path: Path, sign: float
 ) -> None:
     turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
-    reply = render(TransformAt("odom", "base_link", T0, turned, "stamp"))
+    reply = as_json(TransformAt("odom", "base_link", T0, turned, "stamp"), tmp_path)
     assert isinstance(reply, dict)
     assert reply["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
 

@@ -23,7 +23,7 @@ from ros2_memory.results import (
     StandstillPlace,
     ThingStay,
 )
-from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_json import as_json
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import log_entry
 from tests.support.examples import examples
@@ -294,7 +294,7 @@ def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
     assert away["things"] == {}
 
 
-def test_a_comparison_is_cut_to_6_kb_however_much_differs() -> None:
+def test_a_comparison_is_cut_to_6_kb_however_much_differs(tmp_path: Path) -> None:
     at, name, pair = (
         BEGIN * S + 565_926_123,
         ("upstairs living room", "upstairs"),
@@ -322,7 +322,7 @@ def test_a_comparison_is_cut_to_6_kb_however_much_differs() -> None:
         farthest=(point, point),
         notes=("a note " * 50,) * 3,
     )
-    reply = render(answer)
+    reply = as_json(answer, tmp_path)
     assert isinstance(reply, dict)
     assert 3_000 < len(to_json_text(reply)) <= 6_000
     cut: Any = reply

@@ -27,10 +27,10 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import Pose, Sample, SetAside, Transform, Twist
+from ros2_memory.core.reply import LocalTimes
 from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
 from ros2_memory.results import Answer
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.reply_json import LocalTimes, render
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -320,12 +320,13 @@ def test_what_spans_more_than_half_a_day_has_local_times() -> None:
 @pytest.mark.usefixtures("utc")
 def test_a_local_time_names_the_day_where_it_is_another() -> None:
     local = LocalTimes(T0, T0 + 24 * HOUR)
-    assert local.of(T0) == {"local": "Tue 2026-07-14 10:00:00"}
-    assert local.of(T0, T0) == local.of(T0, T0 + 1) == local.of(T0)
-    over_night = {"local": "Tue 2026-07-14 10:00:00 - Wed 2026-07-15 01:00:00"}
-    assert local.of(T0, T0 + 15 * HOUR) == over_night
-    assert local.of(None, T0) == {"local": "- Tue 2026-07-14 10:00:00"}
-    assert local.of(None) == LocalTimes(None, T0).of(T0) == LocalTimes(T0, None).of(T0) == {}
+    assert local.text(T0) == "Tue 2026-07-14 10:00:00"
+    assert local.text(T0, T0) == local.text(T0, T0 + 1) == local.text(T0)
+    over_night = "Tue 2026-07-14 10:00:00 - Wed 2026-07-15 01:00:00"
+    assert local.text(T0, T0 + 15 * HOUR) == over_night
+    assert local.text(None, T0) == "- Tue 2026-07-14 10:00:00"
+    unknown = (LocalTimes(None, T0), LocalTimes(T0, None))
+    assert [local.text(None), *(span.text(T0) for span in unknown)] == [None] * 3
 
 
 @pytest.mark.usefixtures("utc")
@@ -554,11 +555,6 @@ def test_no_data_tells_what_could_not_be_read() -> None:
     error = NoDataError(NoDataReason.GAP, "nothing", ("1 bag file could not be read",))
     shown = json.loads(REPLIES.error(error).text)
     assert shown["notes"] == ["1 bag file could not be read"]
-
-
-def test_what_is_no_answer_is_refused() -> None:
-    with pytest.raises(TypeError, match="str is not an answer"):
-        render("text")
 
 
 def test_having_no_data_is_an_answer_with_its_reason() -> None:

@@ -6,19 +6,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.reply import POSE_KEYS, Scope, render, rounded
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import before
 from ros2_memory.insights.recap import found_events, recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.serving.page.span import event_shown
-from ros2_memory.tools.reply_json import planar_pose, render, rounded
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Recap
-    from ros2_memory.tools.reply_size import JsonObject
 
 AROUND_S: Final = 1.0
 """How long before and after a moment counts as seen at it: a detector reports once a second."""
@@ -71,7 +71,7 @@ def _moment(memory: Memory, call: Call, at_s: float) -> JsonObject:
     changes = [*found.changes, *found.after]
     return {
         "t": at_s,
-        "robot": None if found.robot is None else planar_pose(found.robot),
+        "robot": None if found.robot is None else POSE_KEYS.render(found.robot, Scope()),
         "frame": None if found.robot is None else found.robot.frame_id,
         "speed": None if found.speed_mps is None else rounded(found.speed_mps, 2),
         "state": dict(found.state),
@@ -131,9 +131,9 @@ def _sightings(memory: Memory, call: Call, label: str, start_s: float, end_s: fl
             end_s=end_s,
             limit=MOST_SIGHTINGS,
         )
-        reply = render(found)
-        if isinstance(reply, dict) and isinstance(reply["sightings"], list):
-            rows += [each for each in reply["sightings"] if isinstance(each, dict)]
+        sightings = render(found, memory.index.bag_dir)["sightings"]
+        if isinstance(sightings, list):
+            rows += [each for each in sightings if isinstance(each, dict)]
         total = None if total is None or found.total is None else total + found.total
         notes += found.notes
     rows.sort(key=_last_seen, reverse=True)

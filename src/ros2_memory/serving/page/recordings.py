@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.retention.foreign import Foreign
-    from ros2_memory.tools.reply_size import JsonObject
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""

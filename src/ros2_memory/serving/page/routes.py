@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.dispatch import Dispatcher
-    from ros2_memory.tools.reply_size import JsonObject
 
 log = get_logger(__name__)
 

@@ -9,19 +9,19 @@ import numpy as np
 
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.reply import rounded
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
-from ros2_memory.tools.reply_json import rounded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.field_numbers import FieldNumbers
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.tools.reply_size import JsonObject
 
 MOST_SIGNALS: Final = 4
 MOST_BINS: Final = 400

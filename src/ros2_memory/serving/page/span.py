@@ -22,6 +22,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Polygon, Rectangle
+from ros2_memory.core.reply import degrees, moment, render, rounded
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_MS,
@@ -41,8 +42,6 @@ from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.queries import data_time_range
 from ros2_memory.serving.page.signals import Signal, signal_in
 from ros2_memory.things.find import find_things
-from ros2_memory.tools.reply_json import degrees, moment, render, rounded
-from ros2_memory.tools.reply_json_memory import time_range
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,12 +50,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place
+    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import DataTimeRange, Event, Thing
     from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.question_log import KeptQuestion, QuestionLog
-    from ros2_memory.tools.reply_size import JsonObject
 
 MOST_POINTS: Final = 2_000
 MOST_EVENTS: Final = 300
@@ -159,8 +158,8 @@ def span_shown(
         shown["questions"] = [_question(each) for each in questions.newest(MOST_QUESTIONS)]
     if request.status:
         ranged = data_time_range(memory, call)
-        shown["range"] = {**time_range(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
-        shown["status"] = render(memory_status(memory, call))
+        shown["range"] = {**render(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
+        shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
         return shown
     window = request.window(earliest, latest)

@@ -1,0 +1,493 @@
+"""A result's class declares its JSON, once: the keys of its reply, their units, and their order.
+
+    @result("topic", TIME("first_seen", "first"), AGO("ago_s", "last"), digits(3)("score").if_known)
+    class Sighting:
+
+A key is the name of an attribute, which is shown as it is, or a unit called with the name of the
+key and with what it is made of: an attribute, a dot-path, or a function of the result; by default
+the attribute that has the key's name without its unit. Timestamps are Unix seconds, rounded up to
+whole microseconds so that one that is passed back finds its own message; metres and metres per
+second to 1e-4, degrees to 1e-2, durations to 1e-3 s, unless `digits` says otherwise. A number that
+is not finite is null, and so is what is not known; `local` is there only in replies that span more
+than half a day (`LocalTimes`), and `notes` (`render`) only if there are any.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
+from operator import attrgetter
+from pathlib import Path
+from typing import (
+    TYPE_CHECKING,
+    ClassVar,
+    Final,
+    Literal,
+    Never,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    cast,
+    dataclass_transform,
+)
+
+from ros2_memory.core.geometry import normalised, yaw
+from ros2_memory.core.text import shortened
+from ros2_memory.core.timebase import (
+    NS_PER_S,
+    Ns,
+    iso_local,
+    local_text,
+    unix_from_ns,
+    unix_rounded_up,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from ros2_memory.core.model import JsonValue, Pose
+
+T = TypeVar("T")
+
+JsonObject: TypeAlias = "dict[str, JsonValue]"
+Source: TypeAlias = "str | Callable[[Never], object]"
+"""What a key is made of: the attribute of a dot-path, None where a part of it is; or a function."""
+Merging: TypeAlias = Literal["", "added", "counted", "earliest", "newest", "inherited", "who"]
+"""How a key of several robots' replies becomes one: numbers are added up, or those of an object;
+the smallest or the largest counts; each row takes it over; the robots of which it is true are
+named. Else it is kept once where all agree."""
+
+LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
+"""Shorter spans have no local times."""
+
+
+def moment(at: Ns | None) -> float | None:
+    """Returns a time in Unix seconds, if there is one."""
+    return None if at is None else unix_rounded_up(at)
+
+
+def seconds(duration: Ns) -> float:
+    """Returns a duration in seconds."""
+    return round(unix_from_ns(duration), 3)
+
+
+def rounded(number: float, places: int) -> float | None:
+    """Returns a rounded number; None if it is not finite."""
+    return round(number, places) if math.isfinite(number) else None
+
+
+def degrees(angle: float | None) -> float | None:
+    """Returns an angle, given in radians, in degrees, if there is one."""
+    return None if angle is None else rounded(math.degrees(angle), 2)
+
+
+def file_name(path: Path | str, bag_dir: Path) -> str:
+    """Returns a bag's path below the bag directory; never an absolute path of the machine."""
+    bag = Path(path)
+    return str(bag.relative_to(bag_dir)) if bag.is_relative_to(bag_dir) else bag.name
+
+
+@dataclass(frozen=True, slots=True)
+class LocalTimes:
+    """Local times beside Unix seconds, for a reply that spans more than half a day.
+
+    Its oldest time is `first`. `last` is now where it counts ages, else its newest time.
+    """
+
+    first: Ns | None
+    last: Ns | None
+
+    def text(self, start: Ns | None, end: Ns | None = None) -> str | None:
+        """Returns a time, or a stretch whose ends may be unknown; None where that is not shown."""
+        first, last = self.first, self.last
+        if first is None or last is None or last - first <= LOCAL_BEYOND_NS:
+            return None
+        begins, ends = (None if at is None else local_text(at) for at in (start, end))
+        if begins is None or ends is None or begins == ends:
+            return begins or (f"- {ends}" if ends else None)
+        day = begins[: -len("00:00:00")]
+        return f"{begins} - {ends.removeprefix(day)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """What rows depend on besides themselves.
+
+    Attributes:
+        answer: the whole, whose rows they are.
+        now: what ages count from.
+        bag_dir: files are named relative to it.
+        local: of the span of the reply.
+        notes: on what was left out.
+    """
+
+    answer: object = None
+    now: Ns = 0
+    bag_dir: Path = Path()
+    local: LocalTimes = LocalTimes(None, None)
+    notes: list[str] = field(default_factory=list)
+
+
+class Absent(Enum):
+    """What a unit returns where its key is left out."""
+
+    ABSENT = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """How the values of a kind are shown.
+
+    Attributes:
+        convert: a value to JSON.
+        suffix: of the names of keys in this unit.
+        is_spread: the value is an object whose keys are shown in the place of its own.
+        takes_none: None is converted, too; else it is null.
+    """
+
+    convert: Callable[[Never, Scope], JsonValue | Absent]
+    suffix: str = ""
+    is_spread: bool = False
+    takes_none: bool = False
+
+    def __call__(self, name: str, *sources: Source) -> Key:
+        """Returns a key in this unit; of several sources the values are a tuple."""
+        getters = [_getter(source) for source in sources or (name.removesuffix(self.suffix),)]
+        if len(getters) == 1:
+            return Key(name, self, getters[0])
+        return Key(name, self, lambda owner: tuple(get(owner) for get in getters))
+
+    @property
+    def spread(self) -> Unit:
+        """The same unit, of objects that are shown without a key of their own."""
+        return replace(self, is_spread=True)
+
+
+def _getter(source: Source) -> Callable[[object], object]:
+    if not isinstance(source, str):
+        return cast("Callable[[object], object]", source)
+    if "." not in source:
+        return attrgetter(source)
+    parts = source.split(".")
+
+    def get(owner: object) -> object:
+        for part in parts:
+            owner = None if owner is None else getattr(owner, part)
+        return owner
+
+    return get
+
+
+def _always(_value: object, _owner: object) -> bool:
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """One key of a reply.
+
+    Attributes:
+        name: in JSON.
+        unit: of its values.
+        get: the value, from the result.
+        is_shown: whether there is such a key, of its value and the result.
+        most: of a list so many are shown: the first, or the last of them if that is negative. Of
+            more, a key tells the number (`<name>_<counted>`), and of the last a note.
+        merging: how the key of several robots becomes one.
+        row_time: of a list of rows, which several robots' replies share: the key of their time.
+        is_short: it stays where a reply has to be short.
+    """
+
+    name: str
+    unit: Unit
+    get: Callable[[object], object]
+    is_shown: Callable[[object, object], bool] = _always
+    most: int = 0
+    counted: str = "count"
+    merging: Merging = ""
+    row_time: str = ""
+    is_short: bool = False
+
+    @property
+    def if_known(self) -> Key:
+        """The key, left out where its value is None."""
+        return replace(self, is_shown=lambda value, _: value is not None)
+
+    @property
+    def if_any(self) -> Key:
+        """The key, left out where its value is None, empty, zero or false."""
+        return replace(self, is_shown=lambda value, _: bool(value))
+
+    def when(self, attribute: str) -> Key:
+        """Returns the key, left out where an attribute is None, empty, zero or false."""
+        get = _getter(attribute)
+        return replace(self, is_shown=lambda _, owner: bool(get(owner)))
+
+    @property
+    def in_short(self) -> Key:
+        """The key, also of a short reply."""
+        return replace(self, is_short=True)
+
+    def first(self, most: int, counted: str = "count") -> Key:
+        """Returns the key with the first `most` of its list, and how many there are of more.
+
+        That is in another key, if `counted` is not empty.
+        """
+        return replace(self, most=most, counted=counted)
+
+    def last(self, most: int, counted: str = "count") -> Key:
+        """Returns the key with the last `most` of its list; likewise, and with a note."""
+        return replace(self, most=-most, counted=counted)
+
+    def merged(self, how: Merging) -> Key:
+        """Returns the key that becomes one of several robots' in this way."""
+        return replace(self, merging=how)
+
+    def along(self, row_time: str) -> Key:
+        """Returns the key whose rows become one list of several robots', in order of a time."""
+        return replace(self, row_time=row_time)
+
+    def add_to(self, reply: JsonObject, owner: object, scope: Scope) -> None:
+        """Adds the key to a reply, if it is shown."""
+        value = self.get(owner)
+        if not self.is_shown(value, owner):
+            return
+        total = 0
+        if self.most and isinstance(value, tuple):
+            total = len(value)
+            value = value[: self.most] if self.most > 0 else value[self.most :]
+        converted: JsonValue | Absent = None
+        if value is not None or self.unit.takes_none:
+            converted = cast("Callable[[object, Scope], JsonValue]", self.unit.convert)(
+                value, scope
+            )
+        if isinstance(converted, Absent):
+            return
+        if not self.unit.is_spread:
+            reply[self.name] = converted
+        elif isinstance(converted, dict):
+            reply |= converted
+        if total > abs(self.most) and self.counted:
+            reply[f"{self.name}_{self.counted}"] = total
+            if self.most < 0:
+                last = f"the last {-self.most} of {total} are listed"
+                scope.notes.append(f"{self.name}: {last}")
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of an object, in order.
+
+    Attributes:
+        keys: all of them.
+        span: the oldest time and the newest, which decide whether it has local times.
+        other: an attribute, and the keys that take the place of these where it is true.
+    """
+
+    keys: tuple[Key, ...]
+    span: Callable[[object], object] | None = None
+    other: tuple[Callable[[object], object], Keys] | None = None
+
+    @property
+    def all(self) -> tuple[Key, ...]:
+        """These keys, and those that may take their place."""
+        return self.keys if self.other is None else (*self.keys, *self.other[1].keys)
+
+    @property
+    def short(self) -> Keys:
+        """Those that stay where a reply has to be short."""
+        return replace(self, keys=tuple(key for key in self.keys if key.is_short))
+
+    def render(self, owner: object, scope: Scope) -> JsonObject:
+        """Returns an object with these keys."""
+        if self.other is not None and self.other[0](owner):
+            return self.other[1].render(owner, scope)
+        if self.span is not None:
+            first, last = cast("tuple[Ns | None, Ns | None]", self.span(owner))
+            now = getattr(owner, "now", scope.now)
+            scope = replace(scope, now=now, local=LocalTimes(first, last))
+        reply: JsonObject = {}
+        for key in self.keys:
+            key.add_to(reply, owner, scope)
+        return reply
+
+
+class Declared(Protocol):
+    """A result that declares its JSON."""
+
+    reply: ClassVar[Keys]
+
+
+def keys(*declared: str | Key, span: tuple[Source, Source] | None = None) -> Keys:
+    """Returns the keys of an object; a text is the name of an attribute that is shown as it is.
+
+    `span` is made of the oldest and the newest time of the reply.
+    """
+    whole = tuple(PLAIN(key) if isinstance(key, str) else key for key in declared)
+    return Keys(whole, None if span is None else PLAIN("span", *span).get)
+
+
+@dataclass_transform(frozen_default=True)
+def result(
+    *declared: str | Key,
+    span: tuple[Source, Source] | None = None,
+    where: tuple[Source, Keys] | None = None,
+) -> Callable[[type[T]], type[T]]:
+    """Returns what makes a class an immutable dataclass with these keys.
+
+    `where` is an attribute, and the keys that take the place of these where it is true.
+    """
+    form = keys(*declared, span=span)
+    if where is not None:
+        form = replace(form, other=(_getter(where[0]), where[1]))
+
+    def made(cls: type[T]) -> type[T]:
+        whole = dataclass(frozen=True, slots=True)(cls)
+        cast("type[Declared]", whole).reply = form
+        return whole
+
+    return made
+
+
+def render(answer: object, bag_dir: Path, form: Keys | None = None) -> JsonObject:
+    """Returns the JSON of an answer, by the keys it declares or others, with its notes last."""
+    scope = Scope(answer, getattr(answer, "now", 0), bag_dir)
+    reply = shown(answer, scope, form)
+    return with_notes(reply, [*getattr(answer, "notes", ()), *scope.notes])
+
+
+def shown(owner: object, scope: Scope, form: Keys | None = None) -> JsonObject:
+    """Returns the JSON of a result, by the keys it declares or others."""
+    return (form or cast("Declared", owner).reply).render(owner, scope)
+
+
+def with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:
+    """Returns a reply with its notes, where there are any."""
+    return {**reply, "notes": [*notes]} if notes else reply
+
+
+def itself_if(attribute: str) -> Source:
+    """Returns the source of keys that stand in an object of their own, where one is known."""
+    get = _getter(attribute)
+    return lambda owner: None if get(owner) is None else owner
+
+
+def unit(convert: Callable[[Never], JsonValue], suffix: str = "") -> Unit:
+    """Returns a unit whose values depend on nothing else."""
+    known = cast("Callable[[object], JsonValue]", convert)
+    return Unit(lambda value, _: known(value), suffix)
+
+
+def digits(places: int) -> Unit:
+    """Returns the unit of numbers that are rounded to so many places."""
+    return unit(lambda number: rounded(number, places))
+
+
+def objects(form: Keys | None = None) -> Unit:
+    """Returns the unit of lists of objects that have these keys, or declare their own."""
+
+    def convert(rows: Iterable[object], scope: Scope) -> JsonValue:
+        return [shown(row, scope, form) for row in rows]
+
+    return Unit(convert)
+
+
+def an_object(form: Keys | None = None) -> Unit:
+    """Returns the unit of an object that has these keys, or declares its own."""
+    return Unit(lambda owner, scope: shown(owner, scope, form))
+
+
+def by_name(value_unit: Unit, longest: int = 1000) -> Unit:
+    """Returns the unit of pairs of a name, which is cut, and a value, as an object by name."""
+    convert = cast("Callable[[object, Scope], JsonValue]", value_unit.convert)
+
+    def convert_all(pairs: Iterable[tuple[str, object]], scope: Scope) -> JsonValue:
+        return {shortened(name, longest): convert(value, scope) for name, value in pairs}
+
+    return Unit(convert_all)
+
+
+def vector(axes: str, places: int) -> Unit:
+    """Returns the unit of points or vectors by their axes; of those not named nothing is shown."""
+
+    def convert(parts: Sequence[float]) -> JsonValue:
+        return {axis: rounded(part, places) for axis, part in zip(axes, parts, strict=False)}
+
+    return unit(convert)
+
+
+def texts(longest: int) -> Unit:
+    """Returns the unit of lists of texts that are cut."""
+
+    def convert(lines: Iterable[str]) -> JsonValue:
+        return [shortened(line, longest) for line in lines]
+
+    return unit(convert)
+
+
+def _heading(pose: Pose) -> float | None:
+    unit_quaternion = None if pose.orientation is None else normalised(pose.orientation)
+    return None if unit_quaternion is None else yaw(unit_quaternion)
+
+
+def _plain(value: JsonValue | tuple[JsonValue, ...]) -> JsonValue:
+    return [*value] if isinstance(value, tuple) else value
+
+
+def _name(name: str) -> str | None:
+    return name or None
+
+
+def _inside(places: Sequence[str]) -> JsonValue:
+    """Returns the smallest of the named places that a point is in, and those around it."""
+    reply: JsonObject = {"in": places[0]} if places else {}
+    return {**reply, "also_in": [*places[1:]]} if places[1:] else reply
+
+
+def _counted(known: tuple[int, bool]) -> JsonValue:
+    number, is_all = known
+    return {"total" if is_all else "at_least": number}
+
+
+def _ago(at: Ns | None, scope: Scope) -> float:
+    """Returns how long ago a time was (s); 0 of what still goes on."""
+    return 0.0 if at is None else seconds(scope.now - at)
+
+
+def _lasted(times: Sequence[Ns]) -> float | None:
+    start, end, *skipped = times
+    return seconds(end - start - sum(skipped))
+
+
+def _local(times: Sequence[Ns | None], scope: Scope) -> JsonValue | Absent:
+    return scope.local.text(*times) or Absent.ABSENT
+
+
+PLAIN: Final = unit(_plain)
+NAME: Final = unit(_name)
+PAIRS: Final = unit(dict)
+TIME: Final = unit(unix_rounded_up)
+ISO_LOCAL: Final = unit(iso_local, "_local")
+LOCAL: Final = Unit(_local)
+"""Of two times, which are the ends of a stretch."""
+SECONDS: Final = unit(seconds, "_s")
+TENTHS_OF_S: Final = unit(lambda duration: round(seconds(duration), 1), "_s")
+MINUTES: Final = unit(lambda duration: round(duration / 60e9, 2))
+AGO: Final = Unit(_ago, takes_none=True)
+TENTHS_OF_S_AGO: Final = Unit(lambda at, scope: round(seconds(scope.now - at), 1))
+YAW: Final = Unit(lambda angle, _: {"yaw_deg": degrees(angle)}, is_spread=True, takes_none=True)
+"""An angle (rad) under its own key."""
+XYZ: Final = vector("xyz", 4)
+INSIDE: Final = unit(_inside).spread
+"""The named places that something is in, the smallest first."""
+TOTAL: Final = unit(_counted).spread
+"""How many there are, and whether that is all; under another name where not all were counted."""
+FILE: Final = Unit(lambda path, scope: file_name(path, scope.bag_dir))
+LASTED: Final = unit(_lasted)
+"""The time between two, or three: the third is how much of it does not count."""
+OBJECT: Final = an_object()
+OBJECTS: Final = objects()
+POSE_KEYS: Final = keys(XYZ.spread("position"), YAW("yaw", _heading), INSIDE("places"))
+"""A position, its yaw, and the named places that it is in."""
+POSE: Final = an_object(POSE_KEYS).spread

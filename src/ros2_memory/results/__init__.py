@@ -1,0 +1,181 @@
+"""Results: what queries and insights return. The class of a result declares its JSON, too.
+
+Times are `Ns` of log time, lengths metres, angles radians, velocities m/s and rad/s. `age` is how
+long before "now" the answer's own moment lies, in nanoseconds; it is set for relative questions
+only. `now` is what ages count from. The keys of its reply, with their units (`core/reply.py`), are
+`reply`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeAlias
+
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.reply import PLAIN, TIME, result
+from ros2_memory.results.base import AnswerWithNotes
+from ros2_memory.results.memory import (
+    ANOTHER,
+    Budget,
+    DataTimeRange,
+    FiredRule,
+    Gap,
+    MomentList,
+    RememberedMoment,
+    ShownMoment,
+    SilentTopic,
+    Status,
+    Undecodable,
+)
+from ros2_memory.results.motion import (
+    DrivenInside,
+    Frames,
+    PlaceVisits,
+    Position,
+    TrajectorySummary,
+    TransformAt,
+    Velocity,
+    Visit,
+    Visits,
+)
+from ros2_memory.results.recap import Before, Event, PastChange, Recap
+from ros2_memory.results.things import (
+    ComparedMover,
+    ComparedThing,
+    ComparedThings,
+    Comparison,
+    FarFromOther,
+    MoverSeen,
+    Pair,
+    StandstillPlace,
+    StillThere,
+    Thing,
+    Things,
+    ThingStay,
+)
+from ros2_memory.results.topics import (
+    BinColumn,
+    Bins,
+    Extremes,
+    LabelledPlace,
+    Match,
+    Sighting,
+    Sightings,
+    TopicRange,
+    TopicRow,
+    TopicValue,
+    TypeFields,
+    Usual,
+    ValueWhen,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.core.errors import NoDataReason
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.timebase import Ns
+
+__all__ = [
+    "ANOTHER",
+    "AnswerWithNotes",
+    "Before",
+    "BinColumn",
+    "Bins",
+    "Budget",
+    "ComparedMover",
+    "ComparedThing",
+    "ComparedThings",
+    "Comparison",
+    "DataTimeRange",
+    "DrivenInside",
+    "Event",
+    "Extremes",
+    "FarFromOther",
+    "FiredRule",
+    "Frames",
+    "Gap",
+    "LabelledPlace",
+    "Match",
+    "MomentList",
+    "MoverSeen",
+    "Pair",
+    "PastChange",
+    "PlaceVisits",
+    "Position",
+    "Recap",
+    "RememberedMoment",
+    "ShownMoment",
+    "Sighting",
+    "Sightings",
+    "SilentTopic",
+    "StandstillPlace",
+    "Status",
+    "StillThere",
+    "Thing",
+    "ThingStay",
+    "Things",
+    "TopicRange",
+    "TopicRow",
+    "TopicValue",
+    "TrajectorySummary",
+    "TransformAt",
+    "TypeFields",
+    "Undecodable",
+    "Usual",
+    "ValueWhen",
+    "Velocity",
+    "Visit",
+    "Visits",
+]
+
+MomentAnswer: TypeAlias = TopicValue | Position | Velocity | TransformAt
+"""An answer about one moment."""
+
+
+@result(TIME("at"), PLAIN("error", "code"), PLAIN("reason", "reason.value"), "detail")
+class NothingAt(AnswerWithNotes):
+    """The answer for one of several times without data: the reason."""
+
+    at: Ns
+    reason: NoDataReason
+    detail: str
+
+    @property
+    def code(self) -> str:
+        """The code of the error that it would be alone."""
+        return NoDataError.code
+
+
+@result()
+class AtEach(AnswerWithNotes):
+    """The answers for several times, in the order given."""
+
+    answers: tuple[MomentAnswer | NothingAt, ...]
+
+
+OneAnswer: TypeAlias = (
+    AnswerWithNotes | tuple[TopicRow, ...] | RememberedMoment | MomentList | ShownMoment
+)
+
+
+@result()
+class OfRobot:
+    """What one robot of a fleet answers; its files are named relative to `bag_dir`.
+
+    `notes` are on where the answer was found.
+    """
+
+    name: str
+    bag_dir: Path
+    answer: OneAnswer
+    notes: tuple[str, ...] = ()
+
+
+@result()
+class OfFleet:
+    """What several robots answer, as one JSON value."""
+
+    value: dict[str, JsonValue]
+
+
+Answer: TypeAlias = OneAnswer | OfRobot | OfFleet

@@ -1,0 +1,419 @@
+"""Results about the memory itself: its time range, its status, saved moments."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.reply import (
+    AGO,
+    FILE,
+    ISO_LOCAL,
+    LASTED,
+    LOCAL,
+    OBJECT,
+    OBJECTS,
+    PAIRS,
+    PLAIN,
+    SECONDS,
+    TIME,
+    Absent,
+    Unit,
+    an_object,
+    digits,
+    keys,
+    objects,
+    result,
+    seconds,
+    unit,
+)
+from ros2_memory.core.text import counted
+from ros2_memory.results.base import AnswerWithNotes
+from ros2_memory.retention.policy import GB
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from ros2_memory.analysis.clock_steps import ClockStep
+    from ros2_memory.analysis.silences import Silence
+    from ros2_memory.bag_dir.moment_file import StoredMoment
+    from ros2_memory.core.model import SetAside
+    from ros2_memory.core.timebase import Ns
+
+ANOTHER: Final = "another program"
+"""The recorder of a status where this program has none, and files are being written."""
+_MAX_LISTED: Final = 20
+_MAX_TOPICS: Final = 10
+_S_PER_DAY: Final = 86_400
+_LARGE_PARTS: Final = 10
+_SMALL_BYTES: Final = GB // 10
+"""Smaller sizes are given to the kilobyte."""
+
+_GIGABYTES: Final = unit(lambda size: round(size / GB, 3 if size >= _SMALL_BYTES else 6))
+
+
+def _known_end(silence: Silence) -> Ns | None:
+    return None if silence.goes_on else silence.end
+
+
+_SILENCES: Final = objects(
+    keys(
+        "topic",
+        TIME("start"),
+        TIME("end", _known_end),
+        SECONDS("silent_s", "length"),
+        LOCAL("local", "start", _known_end),
+    )
+)
+"""`silent_s` is how long the robot was on in it."""
+_CLOCK_STEPS: Final = objects(keys(TIME("at"), SECONDS("step_s", "by"), LOCAL("local", "at", "at")))
+"""`step_s` is negative where the clock was set back."""
+_FILES: Final = objects(keys(FILE("file", "path"), "reason"))
+
+
+@result("topic", "type", "reason")
+class Undecodable:
+    """A topic with messages under a type that cannot be decoded, and why."""
+
+    topic: str
+    type: str
+    reason: str
+
+
+@result(
+    TIME("start"),
+    TIME("end"),
+    LASTED("duration_s", "start", "end"),
+    SECONDS("deleted_s").if_any,
+    LOCAL("local", "start", "end"),
+)
+class Gap:
+    """A time without a bag; `end` is where data begins again.
+
+    `deleted` is how much of it was recorded, and deleted by retention since.
+    """
+
+    start: Ns
+    end: Ns
+    deleted: Ns = 0
+
+
+@result(
+    TIME("earliest").in_short,
+    TIME("latest").in_short,
+    ISO_LOCAL("earliest_local"),
+    ISO_LOCAL("latest_local"),
+    TIME("now"),
+    ISO_LOCAL("now_local"),
+    PLAIN("bags").in_short,
+    OBJECTS("gaps").last(_MAX_LISTED),
+    _SILENCES("silences").last(_MAX_LISTED),
+    _CLOCK_STEPS("clock_steps").last(_MAX_LISTED),
+    _FILES("active").last(_MAX_LISTED),
+    _FILES("damaged").last(_MAX_LISTED),
+    _FILES("incomplete").last(_MAX_LISTED),
+    _FILES("unread").last(_MAX_LISTED),
+    _FILES("clock_faults").last(_MAX_LISTED),
+    OBJECTS("undecodable").last(_MAX_LISTED),
+    "silent_topics",
+    span=("earliest", "now"),
+)
+class DataTimeRange(AnswerWithNotes):
+    """The recorded time range, and unreadable files; no times if nothing is recorded."""
+
+    earliest: Ns | None
+    latest: Ns | None
+    now: Ns
+    bags: int
+    gaps: tuple[Gap, ...]
+    incomplete: tuple[SetAside, ...]
+    active: tuple[SetAside, ...]
+    damaged: tuple[SetAside, ...]
+    unread: tuple[SetAside, ...]
+    silent_topics: int
+    undecodable: tuple[Undecodable, ...] = ()
+    clock_faults: tuple[SetAside, ...] = ()
+    silences: tuple[Silence, ...] = ()
+    clock_steps: tuple[ClockStep, ...] = ()
+
+
+@result("topic", TIME("last_ts", "last"), AGO("ago_s", "last"), LOCAL("local", "last", "last"))
+class SilentTopic:
+    """A topic without recent messages: its last one, and the usual time between two."""
+
+    topic: str
+    last: Ns
+    usual: Ns
+
+
+@result(
+    _GIGABYTES("used_gb", "used"),
+    _GIGABYTES("max_gb", "most"),
+    _GIGABYTES("state_gb", "large_state").if_known,
+    _GIGABYTES("foreign_gb", "foreign"),
+    _GIGABYTES("growth_gb_per_day", "per_day"),
+    digits(2)("full_in_days").if_known,
+    digits(2)("keeps_days").if_known,
+)
+class Budget:
+    """The bytes of all bags, the limit, and the growth per day; None where not known.
+
+    `used` is what a live recorder counts, its own files (`state`) and sidecars too. `foreign`: the
+    bytes of bags that the recorder did not make; they are in none of the others.
+    """
+
+    used: int
+    most: int | None
+    per_day: int | None
+    max_age: Ns | None
+    foreign: int | None = None
+    state: int = 0
+
+    @property
+    def large_state(self) -> int | None:
+        """The bytes of all but recordings, if that is a large part of the limit."""
+        is_large = self.most is not None and _LARGE_PARTS * self.state > self.most
+        return self.state if is_large else None
+
+    @property
+    def full_in_days(self) -> float | None:
+        """For how many days there is still room."""
+        if self.most is None or not self.per_day:
+            return None
+        return max(self.most - self.used, 0) / self.per_day
+
+    @property
+    def keeps_days(self) -> float | None:
+        """For how many days the limit lasts; older bags are deleted then."""
+        if self.most is None or not self.per_day:
+            return None
+        lasting = self.most / self.per_day
+        return lasting if self.max_age is None else min(lasting, seconds(self.max_age) / _S_PER_DAY)
+
+
+@result("moment", "label", TIME("start"), TIME("end"), "bags", "pending")
+class RememberedMoment:
+    """A moment that the recorder saves: its name, and how many bags it has so far.
+
+    `start` and `end` (inclusive) are as asked. `pending`: the rest is still being written.
+    """
+
+    moment: str
+    label: str
+    start: Ns
+    end: Ns
+    bags: int
+    pending: bool
+
+
+@result(
+    PLAIN("rule", "name"),
+    "fired",
+    "moments",
+    TIME("last_ts", "last").if_known,
+    AGO("last_ago_s", "last").if_known,
+    PLAIN("refused").if_any,
+    TIME("matches_since", "always_since").if_known,
+    PLAIN("problem").if_known,
+)
+class FiredRule:
+    """How often a rule of `recording.keep_when` fired, and how many moments that made.
+
+    Attributes:
+        name: of the rule.
+        fired: how often it fired.
+        moments: how many moments it made; a moment may hold several matches.
+        refused: how often nothing was saved.
+        last: log time at which it fired last; None where it never did.
+        always_since: since when it matches without an end, where that is long; else None.
+        problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
+    """
+
+    name: str
+    fired: int
+    moments: int
+    refused: int
+    last: Ns | None
+    always_since: Ns | None
+    problem: str | None
+
+
+def _size_gb(stored: StoredMoment) -> float:
+    return sum(stored.files.values()) / GB
+
+
+def _is_complete(stored: StoredMoment) -> bool:
+    return not (stored.moment.pending or stored.moment.missing)
+
+
+_STORED: Final = keys(
+    PLAIN("moment", "folder.name"),
+    PLAIN("label", "moment.request.label"),
+    TIME("start", "moment.request.start"),
+    TIME("end", "moment.request.end"),
+    LOCAL("local", "moment.request.start", "moment.request.end"),
+    AGO("ago_s", "moment.request.end"),
+    unit(len)("bags", "files"),
+    digits(6)("size_gb", _size_gb),
+    PLAIN("complete", _is_complete),
+    PLAIN("rule", "moment.rule").if_known,
+    PLAIN("matches", "moment.matches").when("moment.rule"),
+    PLAIN("pending", "moment.pending").if_any,
+    PLAIN("notes", "moment.missing").if_any,
+)
+_MOMENTS: Final = objects(_STORED)("moments")
+_RULES: Final = OBJECTS("rules").first(_MAX_LISTED).if_any
+
+
+@result(_MOMENTS, PLAIN("more").if_any, _RULES, span=("oldest", "now"))
+class MomentList:
+    """The saved moments, newest first; `more` is how many there are besides; the rules by name."""
+
+    moments: tuple[StoredMoment, ...]
+    more: int
+    now: Ns
+    rules: tuple[FiredRule, ...] = ()
+
+    @property
+    def oldest(self) -> Ns | None:
+        """When the first of the moments began."""
+        return min((stored.moment.request.start for stored in self.moments), default=None)
+
+    @property
+    def total(self) -> int | None:
+        """How many there are, where not all are listed."""
+        return len(self.moments) + self.more if self.more else None
+
+
+@result(an_object(_STORED).spread("stored"), span=("stored.moment.request.start", "now"))
+class ShownMoment:
+    """One saved moment; `now` is what "ago" counts from."""
+
+    stored: StoredMoment
+    now: Ns
+
+
+_NEWEST_MOMENTS: Final = keys(
+    _MOMENTS, PLAIN("moments_count", "total").if_known, _RULES, span=("oldest", "now")
+)
+_BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS else Absent.ABSENT)
+
+
+@result(
+    PLAIN("trust").in_short,
+    PLAIN("recorder").in_short,
+    "recorder_alive",
+    "restarts",
+    PAIRS("lost_last_hour", "lost").if_any,
+    TIME("now"),
+    TIME("earliest"),
+    TIME("latest").in_short,
+    LOCAL("local", "earliest", "latest"),
+    SECONDS("newest_age_s").in_short,
+    OBJECTS("fell_silent").first(_MAX_TOPICS, ""),
+    _SILENCES("silences", "newest_silences").first(_MAX_TOPICS, ""),
+    _CLOCK_STEPS("clock_steps", "newest_clock_steps").first(_MAX_TOPICS, ""),
+    PLAIN("never_heard").first(_MAX_TOPICS, ""),
+    PLAIN("missing").first(_MAX_TOPICS, ""),
+    PLAIN("damaged").in_short,
+    "incomplete",
+    "unread",
+    OBJECT("budget"),
+    an_object(_NEWEST_MOMENTS).spread("moments"),
+    _BEYOND("fell_silent_count", "fell_silent"),
+    _BEYOND("silences_count", "silences"),
+    _BEYOND("clock_steps_count", "clock_steps"),
+    _BEYOND("never_heard_count", "never_heard"),
+    _BEYOND("missing_count", "missing"),
+    span=("earliest", "now"),
+)
+class Status(AnswerWithNotes):
+    """How complete and how recent the recorded data is.
+
+    Attributes:
+        now: what ages count from.
+        earliest: the oldest recorded time; None if nothing is recorded.
+        latest: the newest one.
+        heard: while a recorder runs, the newest time of a topic that it does not publish itself;
+            else `latest`.
+        recorder: its state; None where no recorder has written here.
+        live: whether it is running.
+        restarts: how often it restarted `ros2 bag record`; 0 without a recorder.
+        missing: topics that it should record by name, and that no publisher offers.
+        never_heard: topics it subscribed to that sent no message.
+        lost: how many messages of each topic are known to be missing of the recorder's last hour.
+        fell_silent: topics that had messages, but not lately.
+        silences: when topics with a usual rate were silent although the robot was on.
+        clock_steps: when the clock was set by 2 s or more.
+        damaged: files that cannot be read.
+        incomplete: bags that a crash left open.
+        unread: files of a kind that is not read here.
+        budget: the use of the disk budget.
+        moments: the newest saved moments; None where they cannot be listed.
+        problems: why answers may be incomplete.
+    """
+
+    now: Ns
+    earliest: Ns | None
+    latest: Ns | None
+    heard: Ns | None
+    recorder: str | None
+    live: bool
+    restarts: int
+    missing: tuple[str, ...]
+    never_heard: tuple[str, ...]
+    fell_silent: tuple[SilentTopic, ...]
+    damaged: int
+    incomplete: int
+    unread: int
+    budget: Budget
+    moments: MomentList | None
+    problems: tuple[str, ...]
+    silences: tuple[Silence, ...] = ()
+    clock_steps: tuple[ClockStep, ...] = ()
+    lost: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def trust(self) -> str:
+        """Why answers may be missing something, or be wrong, in short."""
+        return "; ".join(self._doubts()) or "nothing is known to be missing"
+
+    @property
+    def recorder_alive(self) -> bool | None:
+        """Whether this program's recorder is running; None where it has none."""
+        is_ours = self.recorder != ANOTHER and bool(self.recorder or self.budget.most)
+        return self.live if is_ours else None
+
+    @property
+    def newest_age(self) -> Ns | None:
+        """How old the newest data is."""
+        return None if self.heard is None else max(self.now - self.heard, 0)
+
+    @property
+    def newest_silences(self) -> tuple[Silence, ...]:
+        """The silences, newest first."""
+        return self.silences[::-1]
+
+    @property
+    def newest_clock_steps(self) -> tuple[ClockStep, ...]:
+        """The steps of the clock, newest first."""
+        return self.clock_steps[::-1]
+
+    def _doubts(self) -> Iterator[str]:
+        yield from self.problems
+        topics = {silence.topic for silence in self.silences}
+        if len(self.silences) == 1:
+            one = self.silences[0]
+            still = ", and still is" if one.goes_on else ""
+            yield f"{one.topic} was silent for {seconds(one.length):.0f} s{still}"
+        elif topics:
+            named = next(iter(topics)) if len(topics) == 1 else counted(len(topics), "topic")
+            yield f"{named} fell silent {len(self.silences)} times (see silences)"
+        if len(self.clock_steps) == 1:
+            [(_, by)] = self.clock_steps
+            how = (
+                f"{seconds(by):.3g} s ahead" if by > 0 else f"back by {seconds(-by):.3g} s or more"
+            )
+            yield f"the clock was set {how}"
+        elif self.clock_steps:
+            yield f"the clock was set {len(self.clock_steps)} times (see clock_steps)"

@@ -1,0 +1,357 @@
+"""Results about motion: poses, velocities, transforms, paths, visits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.geometry import yaw
+from ros2_memory.core.reply import (
+    AGO,
+    LOCAL,
+    MINUTES,
+    NAME,
+    OBJECTS,
+    PLAIN,
+    POSE,
+    SECONDS,
+    TIME,
+    TOTAL,
+    XYZ,
+    YAW,
+    Keys,
+    an_object,
+    digits,
+    keys,
+    objects,
+    result,
+    seconds,
+    vector,
+)
+from ros2_memory.core.timebase import Ns, unix_from_ns
+from ros2_memory.results.base import AnswerWithNotes
+
+if TYPE_CHECKING:
+    from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
+    from ros2_memory.analysis.transform_tree import FrameEdge
+    from ros2_memory.core.model import Geodetic, JsonValue, Pose, Quaternion, Transform, Twist
+
+_GEODETIC: Final = keys(digits(8)("latitude"), digits(8)("longitude"), digits(4)("altitude"))
+
+
+def _waypoints(mark: str) -> Keys:
+    """Returns the keys of a waypoint; `mark` is that of those that no drawn way leads to."""
+    return keys(
+        TIME("timestamp", "time"),
+        XYZ.spread("position"),
+        YAW("yaw", "yaw_rad"),
+        PLAIN(mark, "jump").if_any,
+    )
+
+
+@result(
+    POSE("pose"),
+    an_object(_GEODETIC).spread("geodetic"),
+    TIME("timestamp", "time"),
+    "topic",
+    NAME("frame_id", "pose.frame_id"),
+    SECONDS("age_s").if_known,
+)
+class Position(AnswerWithNotes):
+    """Where the robot was, in the pose's own frame.
+
+    `geodetic` is set for a satellite receiver; the pose's coordinates are NaN then.
+    """
+
+    topic: str
+    time: Ns
+    pose: Pose
+    age: Ns | None = None
+    geodetic: Geodetic | None = None
+
+
+@result(
+    XYZ("linear", "twist.linear"),
+    XYZ("angular", "twist.angular"),
+    TIME("timestamp", "time"),
+    "topic",
+    NAME("frame_id", "twist.frame_id"),
+    SECONDS("age_s").if_known,
+)
+class Velocity(AnswerWithNotes):
+    """How fast the robot moved, in the twist's own frame."""
+
+    topic: str
+    time: Ns
+    twist: Twist
+    age: Ns | None = None
+
+
+@result(
+    XYZ("translation", "transform.translation"),
+    vector("xyzw", 6)("rotation"),
+    YAW("yaw"),
+    TIME("timestamp", "time"),
+    "parent",
+    "child",
+    "clock",
+    SECONDS("age_s").if_known,
+)
+class TransformAt(AnswerWithNotes):
+    """The pose of `child` in `parent` at `time`.
+
+    `clock` is what `time` is in: `stamp` (header stamps) or `log` (log time).
+    """
+
+    parent: str
+    child: str
+    time: Ns
+    transform: Transform
+    clock: str
+    age: Ns | None = None
+
+    @property
+    def rotation(self) -> Quaternion:
+        """Of the two quaternions of the rotation, the one with w >= 0."""
+        x, y, z, w = self.transform.rotation
+        return (-x, -y, -z, -w) if w < 0 else (x, y, z, w)
+
+    @property
+    def yaw(self) -> float:
+        """Its heading (rad)."""
+        return yaw(self.rotation)
+
+
+@result("frames", objects(keys("parent", "child", "static"))("transforms", "sorted_edges"))
+class Frames(AnswerWithNotes):
+    """The frame graph as it was recorded."""
+
+    edges: tuple[FrameEdge, ...]
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The names of all frames, sorted."""
+        return tuple(sorted({name for edge in self.edges for name in (edge.parent, edge.child)}))
+
+    @property
+    def sorted_edges(self) -> list[FrameEdge]:
+        """The edges by the names of their frames."""
+        return sorted(self.edges, key=lambda edge: (edge.parent, edge.child))
+
+
+@result(
+    digits(4)("distance_m", "known.totals.distance_m"),
+    digits(4)("avg_speed", "known.avg_speed"),
+    digits(4)("max_speed", "known.max_speed"),
+    digits(3)("duration_s"),
+    digits(3)("recorded_s").if_known,
+    objects(_waypoints("jump"))("waypoints", "trajectory.waypoints"),
+    "topic",
+    NAME("frame_id"),
+    TIME("start"),
+    TIME("end"),
+    LOCAL("local", "start", "end"),
+    PLAIN("poses", "trajectory.poses"),
+    digits(4)("path_sum_m", "trajectory.totals.path_sum_m").when("trajectory.is_noisy"),
+    digits(4)("gap_m", "trajectory.totals.gap_m").when("trajectory.totals.gaps"),
+    span=("start", "end"),
+)
+class TrajectorySummary(AnswerWithNotes):
+    """The driven path in a window, from one pose topic in log-time order.
+
+    `skipped`: how much of the time from its first to its last pose the clock skipped. `unrecorded`:
+    for how much of the rest no poses were recorded.
+    """
+
+    topic: str
+    frame_id: str
+    start: Ns
+    end: Ns
+    trajectory: Trajectory
+    skipped: Ns = 0
+    unrecorded: Ns = 0
+
+    @property
+    def known(self) -> Trajectory | None:
+        """The path, if it has a valid pose."""
+        return self.trajectory if self.trajectory.is_known else None
+
+    @property
+    def duration_s(self) -> float | None:
+        """The time (s) from its first to its last pose."""
+        known = self.known
+        return None if known is None else known.totals.duration_s - unix_from_ns(self.skipped)
+
+    @property
+    def recorded_s(self) -> float | None:
+        """The part of it (s) that has poses, where that is not all."""
+        lasted_s = self.duration_s if self.unrecorded else None
+        return None if lasted_s is None else lasted_s - unix_from_ns(self.unrecorded)
+
+
+@result(
+    "where",
+    digits(4)("distance_m"),
+    digits(4)("avg_speed"),
+    digits(4)("max_speed"),
+    SECONDS("duration_s"),
+    "visits",
+    TIME("start"),
+    TIME("end"),
+    LOCAL("local", "start", "end"),
+    objects(_waypoints("entered"))("waypoints"),
+    "topic",
+    NAME("frame_id"),
+    span=("start", "end"),
+)
+class DrivenInside(AnswerWithNotes):
+    """The path driven inside a region in a window.
+
+    Attributes:
+        topic: of the poses.
+        frame_id: of the waypoints.
+        where: the region's name, or its bounds.
+        visits: how often the robot was inside; `duration` is how long in all.
+        start: log time at which the first visit began; None where there was none.
+        end: at which the last one ended.
+        distance_m: metres driven inside.
+        max_speed: over a second (m/s).
+        waypoints: of the drawn path; `jump` marks the first of a visit.
+    """
+
+    topic: str
+    frame_id: str
+    where: JsonValue
+    visits: int
+    duration: Ns
+    start: Ns | None
+    end: Ns | None
+    distance_m: float
+    max_speed: float
+    waypoints: tuple[Waypoint, ...]
+
+    @property
+    def avg_speed(self) -> float:
+        """The distance by the duration (m/s)."""
+        lasted_s = seconds(self.duration)
+        return self.distance_m / lasted_s if lasted_s else 0.0
+
+
+@result(
+    TIME("arrived"),
+    TIME("departed"),
+    LOCAL("local", "arrived", "departed"),
+    SECONDS("duration_s"),
+    digits(3)("closest_m").if_known,
+    TIME("closest_at").if_known,
+    AGO("ago_s", "departed"),
+    PLAIN("already_inside").if_any,
+    PLAIN("still_inside").if_any,
+    PLAIN("restarts_since", "restarts").if_any,
+)
+class Visit:
+    """A time in which the robot was near a place.
+
+    Attributes:
+        arrived: log time of its first pose there; None if it was there before the searched time.
+        departed: of its last one; None if it is still there, by a recent pose.
+        duration: from the first to the last known pose there.
+        closest_m: distance (m, in the plane) of the nearest recorded pose; the robot may have been
+            nearer between two messages. None where the place is no circle.
+        closest_at: log time of that pose; None likewise.
+        restarts: how often odometry was reset since.
+        already_inside: it was not seen to enter: `arrived` is when the window, or its poses, begin.
+        still_inside: it was not seen to leave: `departed` is when the window, or its poses, end.
+    """
+
+    arrived: Ns | None
+    departed: Ns | None
+    duration: Ns
+    closest_m: float | None
+    closest_at: Ns | None
+    restarts: int
+    already_inside: bool = False
+    still_inside: bool = False
+
+
+@result(
+    "place",
+    MINUTES("minutes", "duration"),
+    "entries",
+    "exits",
+    TIME("first_entry", "first").if_known,
+    TIME("last_exit", "last").if_known,
+)
+class PlaceVisits:
+    """How long the robot was in a named place, and how often it was seen to enter and to leave.
+
+    `first` is the first entry, `last` the last exit; None without one.
+    """
+
+    place: str
+    entries: int
+    exits: int
+    duration: Ns
+    first: Ns | None
+    last: Ns | None
+
+
+@result(
+    NAME("frame_id").merged("inherited"),
+    PLAIN("where").if_known,
+    PLAIN("x").if_known,
+    PLAIN("y").if_known,
+    PLAIN("radius_m").if_known,
+    PLAIN("there_now").merged("who"),
+    OBJECTS("visits").along("departed"),
+    TOTAL("total", "total", "all_counted").merged("added"),
+    PLAIN("entries").if_known.merged("added"),
+    PLAIN("exits").if_known.merged("added"),
+    MINUTES("minutes", "duration").merged("added"),
+    PLAIN("more").if_any,
+    span=("oldest", "now"),
+    where=("is_of_places", keys(NAME("frame_id"), OBJECTS("places").along("last_exit"))),
+)
+class Visits(AnswerWithNotes):
+    """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
+
+    Attributes:
+        where: the name of the place, where it has one.
+        x: of a circle, with y and radius_m; None of another region.
+        total: how many were found.
+        all_counted: whether these are all; a note says how far back they were counted.
+        duration: of all of these.
+        entries: in how many of them the robot was seen to enter; None where that is not known.
+        exits: likewise, to leave.
+        places: of every named place, where none was asked for; then there are no visits.
+    """
+
+    frame_id: str
+    x: float | None
+    y: float | None
+    radius_m: float | None
+    visits: tuple[Visit, ...]
+    more: bool
+    total: int
+    now: Ns
+    duration: Ns = 0
+    entries: int | None = None
+    exits: int | None = None
+    all_counted: bool = True
+    where: str | None = None
+    places: tuple[PlaceVisits, ...] | None = None
+
+    @property
+    def there_now(self) -> bool:
+        """Whether the robot is still there."""
+        return any(visit.departed is None for visit in self.visits)
+
+    @property
+    def oldest(self) -> Ns | None:
+        """The oldest time of the reply."""
+        ends = (at for visit in self.visits for at in (visit.arrived, visit.departed))
+        return min((at for at in ends if at is not None), default=None)
+
+    @property
+    def is_of_places(self) -> bool:
+        """Whether it is about every named place."""
+        return self.places is not None

@@ -1,0 +1,409 @@
+"""Results about things: where they are and were, and what differs between two windows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.reply import (
+    AGO,
+    INSIDE,
+    NAME,
+    OBJECT,
+    OBJECTS,
+    PAIRS,
+    PLAIN,
+    TIME,
+    TOTAL,
+    YAW,
+    Absent,
+    Keys,
+    Scope,
+    Unit,
+    an_object,
+    by_name,
+    digits,
+    itself_if,
+    keys,
+    moment,
+    objects,
+    result,
+    unit,
+    vector,
+)
+from ros2_memory.core.text import shortened
+from ros2_memory.results.base import AnswerWithNotes
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import JsonValue, Vector3
+    from ros2_memory.core.timebase import Ns
+
+_XY: Final = vector("xy", 2)
+_LONGEST_NAME: Final = 100
+"""Characters of the text of an error."""
+_MISSED: Final = "not_seen_where_expected"
+_LABEL: Final = unit(lambda label: shortened(label, 40))
+
+
+@result(
+    TIME("from", "start"),
+    TIME("to", "end"),
+    _XY("place"),
+    INSIDE("inside"),
+    PLAIN("times", "count"),
+)
+class ThingStay:
+    """An interval in which a thing was at a place (m): first and last seen there, and how often."""
+
+    start: Ns
+    end: Ns
+    place: Vector3
+    count: int
+    inside: tuple[str, ...] = ()
+
+
+@result(PAIRS.spread("state", "by_state"), PLAIN("looks").if_any)
+class StillThere:
+    """The state of a thing since it was last seen, as in the reply.
+
+    Attributes:
+        state: `in_view`, `seen_since`, `not_looked_at_since` or `not_seen_where_expected`.
+        at: when it was seen again, last seen, or known to be missed.
+        looks: detector messages that should have had it.
+    """
+
+    state: str
+    at: Ns
+    looks: int = 0
+
+    @property
+    def by_state(self) -> dict[str, JsonValue]:
+        """The time under its state."""
+        return {self.state: moment(self.at)}
+
+
+def _other_frame(frame_id: str, scope: Scope) -> JsonValue | Absent:
+    """Returns a frame that is not that of the whole reply."""
+    return Absent.ABSENT if frame_id == getattr(scope.answer, "frame_id", None) else frame_id
+
+
+def thing(most_stays: int) -> Keys:
+    """Returns the keys of a thing with so many of its newest places."""
+    return keys(
+        PLAIN("label").in_short,
+        PLAIN("also_seen_as").if_any,
+        PLAIN("misread_as").if_any,
+        PLAIN("moves").if_any.in_short,
+        PLAIN("at_once").if_known.in_short,
+        vector("xyz", 2)("place").in_short,
+        digits(2)("spread_m"),
+        Unit(_other_frame)("frame_id").in_short,
+        INSIDE("inside").in_short,
+        TIME("first_seen", "first"),
+        TIME("last_seen", "last").in_short,
+        AGO("ago_s", "last"),
+        "count",
+        an_object(keys(digits(3)("best"), digits(3)("median")))(
+            "score", itself_if("best")
+        ).if_known,
+        an_object(keys(_XY.spread("robot"), YAW("yaw")))("seen_from", itself_if("robot")).if_known,
+        OBJECT("still_there").if_known,
+        PLAIN("moved_times").if_known.in_short,
+        OBJECTS("moved").last(most_stays, "").if_any,
+    )
+
+
+@result()
+class Thing:
+    """One thing that detectors saw, or one label of things that move by themselves.
+
+    Attributes:
+        also_seen_as: other spellings that it was seen under, the commonest first; `misread_as`:
+            labels of other things.
+        place: its last one (m), in `frame_id`; `spread_m` is the root mean square distance of its
+            detections there.
+        inside: the named places that it is in, the smallest first.
+        best, median: of its scores; None without any.
+        robot: x, y (m) and yaw (rad) from which it was last seen; None where that is not known.
+        moved: its places in order, where there are several.
+        at_once: how many were seen at the same time: of what moves by itself, and of several things
+            at one place; else None.
+        moves: whether it moves by itself.
+    """
+
+    label: str
+    also_seen_as: tuple[str, ...]
+    place: Vector3
+    spread_m: float
+    frame_id: str
+    inside: tuple[str, ...]
+    first: Ns
+    last: Ns
+    count: int
+    best: float | None
+    median: float | None
+    robot: tuple[float, float, float] | None
+    still_there: StillThere | None
+    moved: tuple[ThingStay, ...] = ()
+    misread_as: tuple[str, ...] = ()
+    at_once: int | None = None
+    moves: bool = False
+
+    @property
+    def yaw(self) -> float | None:
+        """The heading of the robot then (rad)."""
+        return None if self.robot is None else self.robot[2]
+
+    @property
+    def moved_times(self) -> int | None:
+        """How often it moved, where it has several places."""
+        return len(self.moved) - 1 if self.moved else None
+
+    @property
+    def missed_there(self) -> StillThere | None:
+        """What is known since it was last seen, if it was missed."""
+        known = self.still_there
+        return known if known is not None and known.state == _MISSED else None
+
+
+SHORT_THING: Final = Keys((*thing(1).short.keys, OBJECT("still_there", "missed_there").if_known))
+"""What a thing is, where it was last, and whether it was missed there."""
+
+
+def listed_things(form: Keys) -> Keys:
+    """Returns the keys of things, each with these keys."""
+    return keys(
+        NAME("frame_id").merged("inherited"),
+        objects(form)("things").along("last_seen"),
+        TOTAL("total", "total", "all_counted").merged("added"),
+        PAIRS("labels").merged("counted"),
+    )
+
+
+@result(*listed_things(thing(8)).keys)
+class Things(AnswerWithNotes):
+    """Things, those seen last first; `labels` counts all of them, also those that are not shown."""
+
+    frame_id: str
+    things: tuple[Thing, ...]
+    total: int
+    labels: tuple[tuple[str, int], ...]
+    now: Ns
+    all_counted: bool = True
+
+
+class Pair(NamedTuple):
+    """A number in both compared windows."""
+
+    this: float | None
+    other: float | None
+
+
+def _pair(places: int) -> Unit:
+    """Returns the unit of pairs whose numbers are rounded to so many places."""
+    return an_object(keys(digits(places)("this"), digits(places)("with", "other")))
+
+
+def _named_pairs(places: int) -> Unit:
+    """Returns the unit of pairs by name."""
+    return by_name(_pair(places), _LONGEST_NAME)
+
+
+@result(
+    _LABEL("label"),
+    an_object(keys(_XY.spread("place"), INSIDE("inside"), TIME("last_seen", "end")))(
+        "was", "before"
+    ).if_known,
+    an_object(keys(_XY.spread("place"), INSIDE("inside"), TIME("first_seen", "start")))(
+        "is", "after"
+    ).if_known,
+    TIME("missed_by", "missed").if_known,
+    PLAIN("looks").when("missed"),
+)
+class ComparedThing:
+    """A thing in both windows: where it was in the earlier, and in the later.
+
+    Attributes:
+        before: None where it was not known then; `after`: None where it was not seen then.
+        missed: when it was not seen where expected.
+        looks: detector messages that should have had it.
+    """
+
+    label: str
+    before: ThingStay | None
+    after: ThingStay | None
+    missed: Ns | None = None
+    looks: int = 0
+
+
+@result(
+    PLAIN("times", "count"),
+    "at_once",
+    _XY.spread("place"),
+    INSIDE("inside"),
+    TIME("last_seen", "last"),
+)
+class MoverSeen:
+    """A mover in a window: the most at once, how often it was seen, and where last."""
+
+    at_once: int
+    count: int
+    place: Vector3
+    inside: tuple[str, ...]
+    last: Ns
+
+
+@result(_LABEL("label"), OBJECT("was", "before").if_known, OBJECT("is", "after").if_known)
+class ComparedMover:
+    """A mover in the earlier window and in the later; None where it was not seen."""
+
+    label: str
+    before: MoverSeen | None
+    after: MoverSeen | None
+
+
+def _differences(most: int) -> Keys:
+    """Returns the keys of compared things, with so many of each kind, twice as many that moved."""
+    return keys(
+        *(
+            OBJECTS(name, source).first(shown, "total").if_any
+            for name, source, shown in (
+                ("moved", "moved", 2 * most),
+                ("appeared", "appeared", most),
+                ("not_seen_where_expected", "missed", most),
+                ("not_looked_at", "not_looked_at", most),
+                ("not_comparable", "not_comparable", most),
+                ("movers", "movers", most),
+            )
+        )
+    )
+
+
+@result()
+class ComparedThings:
+    """The things that differ between two windows; `same` counts those that do not.
+
+    `not_comparable`: seen in both, in the coordinates of different runs of odometry.
+    """
+
+    moved: tuple[ComparedThing, ...]
+    appeared: tuple[ComparedThing, ...]
+    missed: tuple[ComparedThing, ...]
+    not_looked_at: tuple[ComparedThing, ...]
+    same: int
+    movers: tuple[ComparedMover, ...] = ()
+    not_comparable: tuple[ComparedThing, ...] = ()
+
+    @property
+    def is_any(self) -> bool:
+        """Whether anything differs."""
+        found = (self.moved, self.appeared, self.missed, self.not_looked_at, self.not_comparable)
+        return any((*found, self.movers))
+
+
+class StandstillPlace(NamedTuple):
+    """A place (m) and the named one it is in: seconds for which the robot stood, since when first.
+
+    `since` has no time where it did not stand there.
+    """
+
+    place: tuple[float, float]
+    inside: tuple[str, ...]
+    seconds: Pair
+    since: tuple[Ns | None, Ns | None]
+
+    @property
+    def this_since(self) -> Ns | None:
+        """Since when it stood there in this window."""
+        return self.since[0]
+
+    @property
+    def with_since(self) -> Ns | None:
+        """Since when it stood there in the other."""
+        return self.since[1]
+
+
+class FarFromOther(NamedTuple):
+    """A point of a path (m): its distance from the other, and when the robot was first there."""
+
+    place: tuple[float, float]
+    inside: tuple[str, ...]
+    away_m: float
+    time: Ns
+
+
+_STANDSTILLS: Final = objects(
+    keys(
+        _XY.spread("place"),
+        INSIDE("inside"),
+        _pair(0).spread("seconds"),
+        TIME("this_since").if_known,
+        TIME("with_since").if_known,
+    )
+)
+_FAR: Final = an_object(
+    keys(_XY.spread("place"), INSIDE("inside"), digits(1)("away_m"), TIME("t", "time"))
+)
+
+
+def compared(most: int) -> Keys:
+    """Returns the keys of a comparison, with so many of each kind that differs.
+
+    A part in which nothing differs is left out.
+    """
+    return keys(
+        _pair(1)("duration_s", "lengths"),
+        _pair(1)("recorded_s", "recorded").in_short,
+        PAIRS.spread("frames"),
+        an_object(_differences(most))("things"),
+        PLAIN("things_unchanged", "things.same").in_short,
+        _named_pairs(2)("way").if_any.in_short,
+        _STANDSTILLS("stood_at", "stood").first(most, "total").if_any,
+        by_name(_FAR)("farthest_apart").if_any,
+        _named_pairs(2)("minutes", "places").first(most, "total").if_any,
+        _named_pairs(0)("errors").first(most, "total").if_any.in_short,
+        _named_pairs(0)("silent_s", "silences").first(most, "total").if_any,
+    )
+
+
+@result(*compared(5).keys)
+class Comparison(AnswerWithNotes):
+    """What differs between two windows.
+
+    Attributes:
+        lengths: of the windows (s), and `recorded` how much of each was recorded.
+        frame_id: of the things' places.
+        way: numbers by name: metres, m/s, seconds and counts.
+        way_frame_id: frame of the places where the robot stood, and of the points of the path.
+        stood: where it stood in one window longer than in the other.
+        farthest: the points of this path, and of the other one, that are farthest from the other
+            and from this; None where the paths are the same.
+        places: minutes in each named place.
+        errors: reports of each error.
+        silences: seconds for which each topic was silent.
+    """
+
+    lengths: Pair
+    recorded: Pair
+    frame_id: str
+    things: ComparedThings
+    way: tuple[tuple[str, Pair], ...]
+    places: tuple[tuple[str, Pair], ...]
+    errors: tuple[tuple[str, Pair], ...]
+    silences: tuple[tuple[str, Pair], ...]
+    way_frame_id: str = ""
+    stood: tuple[StandstillPlace, ...] = ()
+    farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
+
+    @property
+    def farthest_apart(self) -> list[tuple[str, FarFromOther]]:
+        """The farthest points, with the window that they are of."""
+        named = zip(("this", "with"), self.farthest, strict=True)
+        return [(name, point) for name, point in named if point is not None]
+
+    @property
+    def frames(self) -> dict[str, JsonValue]:
+        """The frames that places are in, where there are any; that of the path if it is another."""
+        frames: list[JsonValue] = [self.frame_id or None] * self.things.is_any
+        frames += [self.way_frame_id] * bool(self.stood or self.farthest_apart)
+        named = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
+        return dict(named)
