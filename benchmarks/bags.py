@@ -156,7 +156,9 @@ class Recording:
         for number, (log_time, publish_time, topic, payload) in enumerate(rows):
             if topic not in known:
                 known.add(topic)
-                schema = next(each for each in _schemas(self.topics) if self.topics[topic].type == each[1])
+                schema = next(
+                    each for each in _schemas(self.topics) if self.topics[topic].type == each[1]
+                )
                 parts.append(_schema(*schema) + _channel(topic, self.topics))
                 size += len(parts[-1])
             entries.setdefault(topic, []).append(_ENTRY.pack(log_time, size))
@@ -170,7 +172,10 @@ class Recording:
             packed = packer.compress(b"".join(parts))
             data += _record(
                 0x06,
-                struct.pack("<QQQI", *times, size, 0) + _ZSTD + struct.pack("<Q", len(packed)) + packed,
+                struct.pack("<QQQI", *times, size, 0)
+                + _ZSTD
+                + struct.pack("<Q", len(packed))
+                + packed,
             )
             length, indexes = len(data) - at, {}
             for channel, found in entries.items():

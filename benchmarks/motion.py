@@ -59,7 +59,7 @@ class Interval(NamedTuple):
 
 
 def building(chance: np.random.Generator) -> tuple[Room, ...]:
-    """Draws five to nine rooms along a corridor; the first has the dock, the last is not entered."""
+    """Draws five to nine rooms; the first has the dock, and the last is never entered."""
     names = chance.permutation(_NAMES)
     at = [0.0, 0.0]
     rooms = []

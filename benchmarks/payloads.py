@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, Protocol, cast
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
