@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Prints the table; the exit code is 0 whatever was measured, 1 where there is no world."""
     given = _parser().parse_args(argv)
     size = given.days if given.world == worlds.HOME else given.bags
-    seed = int((given.seed or report.commit())[:16], 16)
+    seed = int((given.seed or report.commit()).split()[0][:16], 16)
     try:
         place = worlds.made(given.world, seed, size, given.dir, jobs=given.jobs)
     except FileNotFoundError as error:

@@ -50,7 +50,7 @@ def commit() -> str:
         program = ["git", "-C", str(root), *words]
         return subprocess.run(program, check=False, capture_output=True, text=True).stdout.strip()
 
-    return f"{git('rev-parse', 'HEAD')[:12]}{' with changes' if git('status', '-s', 'src') else ''}"
+    return f"{git('rev-parse', 'HEAD')[:16]}{' with changes' if git('status', '-s', 'src') else ''}"
 
 
 def machine() -> str:
