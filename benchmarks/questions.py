@@ -109,7 +109,7 @@ def questions(told: Mapping[str, JsonValue], seed: int) -> list[Question]:
     """Returns the questions of a world of a drawn robot, or of one of strangers."""
     facts = Facts(told, np.random.default_rng([seed, 7])) if "topics" in told else None
     if facts is None:
-        return [*_about_all(None), Question("find_things", "find_things", {})]
+        return [*_about_all(None), *_of_strangers()]
     return [
         *_at_a_time(facts),
         *_last_match(facts),
@@ -246,6 +246,22 @@ def _about_all(facts: Facts | None) -> Iterator[Question]:
     yield Question("list topics", "list_recorded_topics", {}, topics)
     yield Question("data_time_range", "data_time_range", {}, topics)
     yield Question("memory_status", "memory_status", {})
+
+
+def _of_strangers() -> Iterator[Question]:
+    """Yields questions that need no knowledge of the bags."""
+    ever: dict[str, JsonValue] = {"start": 0.0, "end": 4e9}
+    text: dict[str, JsonValue] = {"topic": "*", "condition_type": "contains", "value": NEVER}
+    number: dict[str, JsonValue] = {"topic": "/odom", "condition_type": "above", "value": 9e9}
+    number |= {"field": _SPEED}
+    logged: dict[str, JsonValue] = {**text, "topic": "/rosout", "value": "a"}
+    yield Question("last match: text of any topic, never", "find_last_match", text)
+    yield Question("last match: a number of /odom, never", "find_last_match", number)
+    yield Question("text", "find_matches", logged)
+    yield Question("trajectory of everything", "trajectory_summary", ever)
+    yield Question("recap of everything", "recap", ever)
+    yield Question("visits: a place", "visits", {"x": 0.0, "y": 0.0, "frame_id": "odom"})
+    yield Question("find_things", "find_things", {})
 
 
 def _a(noun: str) -> str:

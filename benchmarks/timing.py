@@ -21,6 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
+from benchmarks.worlds import STRANGERS
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.cli.maintenance.index import fill_catalogue
@@ -83,6 +84,8 @@ def overrides(place: Path) -> list[str]:
         words += ["deployment=fleet", fleet, "fleet.shared_map=true"]
     else:
         words.append(f"recording.bag_dir='{place / 'bags'}'")
+    if facts["kind"] == STRANGERS:
+        words.append("storage=rosbag2")  # reads .db3, too
     if facts.get("lake"):
         words += ["lake=duckdb", f"lake.warehouse='{place / 'lake'}'"]
     return words
