@@ -293,7 +293,11 @@ class World:
     def facts(self) -> dict[str, JsonValue]:
         """Returns what questions are drawn from."""
         first, last = (int(self.clock(np.array([t]))[0]) for t in (0.0, self.parts[-1].stop - 0.5))
-        off: list[JsonValue] = [(self.clock(np.array(gap)) / 1e9).tolist() for gap in self.off]
+        begun = self.clock(np.array([gap[0] for gap in self.off])) / 1e9
+        off: list[JsonValue] = [
+            [at, at + stop - start]
+            for at, (start, stop) in zip(begun.tolist(), self.off, strict=True)
+        ]
         frames: list[JsonValue] = ["map", *self.frames, self.camera[0]]
         labels: list[JsonValue] = [*sorted({thing.label for thing in self.things})]
         return {
