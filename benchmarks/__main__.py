@@ -1,4 +1,7 @@
-"""`python -m benchmarks`: makes the bags, asks every side every question, prints what it took."""
+"""`python -m benchmarks`: draws a world by a seed, fills its memory, asks it, prints one table.
+
+The seed is the hash of the commit that is measured, so that nobody can tune for its world.
+"""
 
 from __future__ import annotations
 
@@ -6,121 +9,117 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, cast
 
-from benchmarks import backlog, commands, digests, footprint, ours, report, serving
-from benchmarks.bags import HOUR, MESSAGES_OF_A_SPLIT, WEEK, made
-from benchmarks.copies import copied
-from benchmarks.questions import QUESTIONS, Case
-from benchmarks.timing import agreed, timed
-from benchmarks.week import RECORDINGS, WEEK_QUESTIONS, Week
+from benchmarks import plain, report, timing, worlds
+from benchmarks.bags import Topic
+from benchmarks.questions import questions
+from benchmarks.report import Line, milliseconds
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from benchmarks.bags import History
     from benchmarks.questions import Question
-    from benchmarks.report import Figure, Row
-
-T = TypeVar("T")
+    from benchmarks.timing import Asked, Filled
+    from ros2_memory.core.model import JsonValue
 
 _DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks"
-_HOW: Final = (
-    "Medians; the page cache is warm for every side. plain: rosbags, one Reader a bag. "
-    "floor: open, read, decompress, decode what is returned."
-)
-_ENOUGH_S: Final = 20.0
-"""A side that has taken so long in all is not asked in further runs."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the benchmark; the exit code is 0 whatever was measured."""
-    parser = _parser()
-    asked = parser.parse_args(argv)
-    known = WEEK_QUESTIONS if asked.catalogue else QUESTIONS
-    slugs = asked.only or list(known)
-    if strange := [slug for slug in slugs if slug not in known]:
-        parser.error(f"{', '.join(strange)}: the questions here are {', '.join(known)}")
-    history = made(asked.dir, HOUR if asked.catalogue else asked.bags)
-    about = report.machine()
-    linking = (
-        f"{RECORDINGS * HOUR} names in {RECORDINGS} recordings for " if asked.catalogue else ""
+    """Prints the table; the exit code is 0 whatever was measured, 1 where there is no world."""
+    given = _parser().parse_args(argv)
+    size = given.days if given.world == worlds.HOME else given.bags
+    seed = int((given.seed or report.commit()).split()[0][:16], 16)
+    try:
+        place = worlds.made(given.world, seed, size, given.dir, jobs=given.jobs)
+    except FileNotFoundError as error:
+        print(f"skipped: {error}")
+        return 1
+    if given.robots:
+        place = worlds.fleet_of(place, given.robots, lake=given.lake)
+    facts = json.loads((place / "world.json").read_bytes())
+    title = (
+        f"{given.world}, seed {seed:x}: {facts['bags']:,} bags of {facts['bytes'] / 1e6:,.0f} MB"
     )
-    print(f"{linking}{_described(history)}\n{about}\n{_HOW}\n", flush=True)
-    if asked.catalogue:
-        rows, figures = _week(history, slugs, asked.runs, whole=not asked.only)
-    else:
-        rows, figures = _hour(history, slugs, asked.runs, whole=not asked.only)
-    print("\n" + report.as_table(rows, figures))
-    if asked.json is not None:
-        bags = RECORDINGS * HOUR if asked.catalogue else history.bags
-        told = report.as_json(rows, figures, about) | {"bags": bags}
-        asked.json.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+    print(report.head(title), flush=True)
+    lines = []
+    asked = [each for each in questions(facts, seed) if given.only in each.words]
+    for line in _measured(place, facts, asked, fills=not given.keep, yardsticks=not given.ours):
+        lines.append(line)
+        print(report.row(line), flush=True)
+    if given.json is not None:
+        told = {
+            "title": title,
+            "commit": report.commit(),
+            "lines": [line._asdict() for line in lines],
+        }
+        given.json.write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def measured(questions: Mapping[str, Callable[[T], Question]], case: T, runs: int) -> list[Row]:
-    """Asks the questions of a case, one after the other.
-
-    Raises:
-        DisagreementError: two sides gave different answers.
-    """
-    rows = []
-    for slug, build in questions.items():
-        print(f"{slug} ...", file=sys.stderr, flush=True)
-        question = build(case)
-        found = timed(question.sides, runs, at_most_s=_ENOUGH_S)
-        agreed(found, silent=question.silent)
-        rows.append(report.row(slug, question, found))
-    return rows
-
-
-def _hour(
-    history: History, slugs: Sequence[str], runs: int, *, whole: bool
-) -> tuple[list[Row], list[Figure]]:
-    case = Case(history, ours.settings_for(history.folder))
-    rows = measured({slug: QUESTIONS[slug] for slug in slugs}, case, runs)
-    if not whole:
-        return rows, []
-    return rows, [
-        digests.cost(case, runs),
-        *backlog.figures(history),
-        *footprint.figures(history),
-        *commands.figures(history),
-    ]
+def _measured(
+    place: Path,
+    facts: dict[str, JsonValue],
+    asked: Sequence[Question],
+    *,
+    fills: bool,
+    yardsticks: bool,
+) -> Iterator[Line]:
+    if fills:
+        bags, size = cast("int", facts["bags"]), cast("int", facts["bytes"])
+        yield from _filling(timing.filled(place), "fill", bags, size)
+        if facts.get("lake"):
+            yield from _filling(timing.shipped(place), "ship", bags, size)
+    # A robot of a fleet alone could be asked as plain rosbags are.
+    alone = "topics" in facts and "robots" not in facts
+    bags_of_it = plain.bags_of(place) if yardsticks and alone else []
+    timing.imported(place, asked)
+    starts = []
+    for question in asked:
+        found = timing.asked(place, question)
+        starts.append(found.start_ms)
+        yield _line(question, found, bags_of_it)
+    if starts:
+        yield Line("start: look at all bags", milliseconds(min(starts)))
+    ours = timing.server(place, asked)
+    yield Line("all questions in one server", milliseconds(sum(ours.spent_ms)))
+    yield Line("resident after them / peak", f"{ours.resident_mb:.0f} / {ours.peak_mb:.0f} MB")
 
 
-def _week(
-    hour: History, slugs: Sequence[str], runs: int, *, whole: bool
-) -> tuple[list[Row], list[Figure]]:
-    copies = copied(hour, RECORDINGS)
-    week = Week(copies, ours.settings_for(copies.folder))
-    rows = measured({slug: WEEK_QUESTIONS[slug] for slug in slugs}, week, runs)
-    return rows, serving.figures(copies.folder, copies.bags, hour.end) if whole else []
+def _filling(filled: Filled, words: str, bags: int, size: int) -> Iterator[Line]:
+    yield Line(f"{words}, for each bag", milliseconds(filled.seconds * 1e3 / bags))
+    share = f"{filled.stored / bags / 1e3:.2f} kB ({filled.stored / size:.1%} of the bags)"
+    yield Line("stored, for each bag", share)
+    yield Line(f"peak memory of {words}", f"{filled.peak_mb:.0f} MB")
 
 
-def _described(history: History) -> str:
-    size_kb = sum(split.path.stat().st_size for split in history.splits()) / history.bags / 1e3
-    return f"{history.bags} bags of {MESSAGES_OF_A_SPLIT} messages, {size_kb:.0f} kB each"
+def _line(question: Question, found: Asked, bags: Sequence[plain.Bag]) -> Line:
+    theirs = least = ""
+    if question.plain is not None and bags:
+        spent, is_scaled = plain.asked(bags, question.plain)
+        theirs = f"{'~' if is_scaled else ''}{milliseconds(spent * 1e3)}"
+        if question.tool == "get_position_at":
+            topic = Topic(question.plain.topic, "nav_msgs/msg/Odometry")
+            least = milliseconds(plain.floor(bags, topic, question.plain.stop - 1) * 1e3)
+    times = milliseconds(found.first_ms, found.again_ms)
+    return Line(question.words, times, theirs, least, found.told, found.trouble)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--bags", type=int, default=HOUR, help=f"splits of 10 s ({WEEK}: a week)")
-    parser.add_argument(
-        "--catalogue",
-        action="store_true",
-        help=f"a week of {WEEK} bags that only the catalogue knows, made of one hour's",
-    )
-    parser.add_argument("--runs", type=int, default=5, help="how often each side is asked")
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        metavar="QUESTION",
-        help=f"{', '.join(QUESTIONS)}; with --catalogue {', '.join(WEEK_QUESTIONS)}",
-    )
+    parser.add_argument("--world", choices=worlds.KINDS, default=worlds.HOME)
+    parser.add_argument("--days", type=int, default=2, help="of a home")
+    parser.add_argument("--bags", type=int, default=2_000, help="of splits")
+    parser.add_argument("--robots", type=int, help="a fleet, each with a third of the recordings")
+    parser.add_argument("--lake", action="store_true", help="the fleet's bags are in a lake")
+    parser.add_argument("--seed", metavar="HEX", help="default: the commit's hash")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only questions named so")
+    parser.add_argument("--keep", action="store_true", help="ask what is stored, fill nothing")
+    parser.add_argument("--ours", action="store_true", help="without the yardsticks")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that write a world")
+    parser.add_argument("--dir", type=Path, default=_DIR, help="where worlds are kept")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
-    parser.add_argument("--dir", type=Path, default=_DIR, help="where bags are kept between runs")
     return parser
 
 

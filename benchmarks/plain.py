@@ -1,127 +1,140 @@
-"""The first yardstick: plain rosbags, frozen.
+"""The two yardsticks: plain rosbags, and the physical floor.
 
-For every bag that overlaps the question, newest first where the question is,
+Plain rosbags: for every bag that overlaps the question, newest first where the question is,
 `rosbags.rosbag2.Reader(path)`, `messages(connections of the topic, start, stop)`,
-`typestore.deserialize_cdr`, the condition in Python, and stop at the answer. Which bags overlap is
-known to it beforehand and costs nothing.
+`typestore.deserialize_cdr`, the condition in Python, and stop at the answer. The floor: open, read
+the bytes of one chunk, decompress, decode one message. Which bags overlap, and where in them the
+message lies, is known beforehand and costs nothing.
 """
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING, cast
+import json
+import os
+import struct
+import time
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from benchmarks.bags import SPLIT_NS
 from benchmarks.payloads import typestore
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from benchmarks.bags import Split
-    from benchmarks.views import DetectionArray, OdometryMessage
+    from benchmarks.bags import Topic
+
+MOST_BAGS: Final = 40
+"""So many bags are read; the time of more is scaled up."""
+_CHUNK_HEAD: Final = struct.calcsize("<BQQQQII") + len(b"zstd") + struct.calcsize("<Q")
+"""From the start of a chunk record to its data, where its compression is `zstd`."""
 
 
-def index(paths: Sequence[Path]) -> list[tuple[str, int]]:
-    """Messages by topic over all bags, having opened each."""
-    counts: dict[str, int] = {}
-    for path in paths:
-        with Reader(path) as reader:
-            for connection in reader.connections:
-                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    return sorted(counts.items())
+class Bag(NamedTuple):
+    """A bag that has an end: first and last log time in nanoseconds."""
+
+    path: Path
+    start: int
+    stop: int
 
 
-def messages(path: Path, topic: str, start: int, stop: int) -> Iterator[tuple[int, object]]:
-    """Log times and messages of one bag in `[start, stop)`."""
-    with Reader(path) as reader:
-        wanted = [each for each in reader.connections if each.topic == topic]
-        for connection, moment, raw in reader.messages(wanted, start, stop):
-            yield moment, typestore().deserialize_cdr(raw, connection.msgtype)
+class Scan(NamedTuple):
+    """What plain rosbags are asked: a topic in a window, and which messages count.
+
+    Attributes:
+        topic: its name; empty: only which topics there are.
+        start: the first log time, in nanoseconds.
+        stop: the end of the window.
+        meets: whether a message counts.
+        is_last: whether the newest that counts is the answer, so that older bags are not read.
+    """
+
+    topic: str
+    start: int
+    stop: int
+    meets: Callable[[object], bool] = lambda _: True
+    is_last: bool = False
 
 
-def position_at(
-    splits: Sequence[Split], topic: str, start: int, stop: int
-) -> tuple[int, float, float] | None:
-    """Log time and place of the newest pose in `[start, stop)`."""
-    for split in reversed(_overlapping(splits, start, stop)):
-        found = list(messages(split.path, topic, start, stop))
-        if found:
-            return _place(*found[-1])
-    return None
+def bags_of(place: Path) -> list[Bag]:
+    """Returns a world's closed bags, oldest first; they are noted beside them."""
+    noted = place / "bags.json"
+    if not noted.is_file():
+        rows = []
+        for path in sorted((place / "bags").rglob("*.mcap")):
+            with path.open("rb") as stream:
+                try:
+                    summary = make_reader(stream).get_summary()
+                except McapError:
+                    continue  # the power failed
+            if summary is not None and summary.statistics is not None:
+                times = summary.statistics.message_start_time, summary.statistics.message_end_time
+                rows.append([str(path.relative_to(place)), *times])
+        noted.write_text(json.dumps(rows), encoding="utf-8")
+    found = [Bag(place / name, *times) for name, *times in json.loads(noted.read_bytes())]
+    return sorted(found, key=lambda bag: bag.start)
 
 
-def samples(
-    splits: Sequence[Split], topic: str, start: int, stop: int, at_most: int
-) -> list[tuple[int, float, float]]:
-    """Evenly spaced poses of a window, the first and the last among them."""
-    found = [
-        each
-        for split in _overlapping(splits, start, stop)
-        for each in messages(split.path, topic, start, stop)
-    ]
-    count = min(at_most, len(found))
-    if count < 2:
-        return [_place(*each) for each in found[-count:]]
-    indices = [k * (len(found) - 1) // (count - 1) for k in range(count)]
-    return [_place(*found[at]) for at in indices]
+def asked(bags: Sequence[Bag], scan: Scan) -> tuple[float, bool]:
+    """Returns the processor time (s) of a scan, and whether it was scaled up."""
+    among = [bag for bag in bags if bag.start < scan.stop and scan.start <= bag.stop]
+    for bag in among[-1:]:
+        _count(bag, scan)  # compiles the decoders, which ours has done, too
+    begun, read = time.process_time(), 0
+    for bag in reversed(among[-MOST_BAGS:]):
+        read += 1
+        if _count(bag, scan) and scan.is_last:
+            return time.process_time() - begun, False
+    spent = time.process_time() - begun
+    return spent * len(among) / max(read, 1), len(among) > read
 
 
-def path_length(splits: Sequence[Split], topic: str, start: int, stop: int) -> float:
-    """Metres driven in a window."""
-    length = 0.0
-    before: tuple[float, float, float] | None = None
-    for split in _overlapping(splits, start, stop):
-        for _, message in messages(split.path, topic, start, stop):
-            at = cast("OdometryMessage", message).pose.pose.position
-            here = (at.x, at.y, at.z)
-            if before is not None:
-                length += math.dist(before, here)
-            before = here
-    return length
-
-
-def last_match(splits: Sequence[Split], topic: str, meets: Callable[[object], bool]) -> int | None:
-    """Log time of the newest message that meets a condition."""
-    for split in reversed(splits):
-        newest: int | None = None
-        for moment, message in messages(split.path, topic, split.start, split.start + SPLIT_NS):
-            if meets(message):
-                newest = moment
-        if newest is not None:
-            return newest
-    return None
-
-
-def shows(label: str) -> Callable[[object], bool]:
-    """Whether a detection array has a label that contains this one."""
-    folded = label.casefold()
-
-    def meets(message: object) -> bool:
-        array = cast("DetectionArray", message)
-        return folded in array.skill.casefold() or any(
-            folded in each.label.casefold() for each in array.detections
+def _count(bag: Bag, scan: Scan) -> int:
+    with Reader(bag.path) as reader:
+        wanted = [each for each in reader.connections if each.topic == scan.topic]
+        if not wanted:
+            return 0
+        return sum(
+            scan.meets(typestore().deserialize_cdr(raw, connection.msgtype))
+            for connection, _, raw in reader.messages(wanted, scan.start, scan.stop)
         )
 
-    return meets
 
+def floor(bags: Sequence[Bag], topic: Topic, at: int) -> float:
+    """Returns the processor time (s) of reading and decoding the one message that answers."""
+    bag = next((bag for bag in reversed(bags) if bag.start <= at <= bag.stop), bags[-1])
+    with bag.path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        found = list(make_reader(stream).iter_messages([topic.name], ending_at=at))
+    if summary is None or not found:
+        raise ValueError(
+            f"{bag.path.name} has no message of {topic.name} before the time asked for"
+        )
+    _, channel, message = found[-1]
+    index = next(
+        each
+        for each in summary.chunk_indexes
+        if channel.id in each.message_index_offsets
+        and each.message_start_time <= message.log_time <= each.message_end_time
+    )
+    place, length = index.chunk_start_offset + _CHUNK_HEAD, index.compressed_size
 
-def near(x: float, y: float, tolerance_m: float) -> Callable[[object], bool]:
-    """Whether an odometry message is within a distance of a place, in the plane."""
+    unpacker = zstandard.ZstdDecompressor()
 
-    def meets(message: object) -> bool:
-        at = cast("OdometryMessage", message).pose.pose.position
-        return math.hypot(at.x - x, at.y - y) <= tolerance_m
+    def unpacked() -> bytes:
+        descriptor = os.open(bag.path, os.O_RDONLY)
+        try:
+            return unpacker.decompress(os.pread(descriptor, length, place))
+        finally:
+            os.close(descriptor)
 
-    return meets
-
-
-def _overlapping(splits: Sequence[Split], start: int, stop: int) -> list[Split]:
-    return [each for each in splits if each.start < stop and start < each.start + SPLIT_NS]
-
-
-def _place(moment: int, message: object) -> tuple[int, float, float]:
-    at = cast("OdometryMessage", message).pose.pose.position
-    return moment, at.x, at.y
+    begins = unpacked().index(message.data)
+    begun, rounds = time.process_time(), 50
+    for _ in range(rounds):
+        payload = unpacked()[begins : begins + len(message.data)]
+        typestore().deserialize_cdr(payload, topic.type)
+    return (time.process_time() - begun) / rounds

@@ -1,287 +1,304 @@
-"""The questions of an hour: how each side asks, and what is aimed at."""
+"""The questions: a fixed list over a world, each drawn by the seed.
+
+A question knows how the server is asked, and, where plain rosbags can answer it, how they are.
+"""
 
 from __future__ import annotations
 
-import random
+import json
+import math
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from operator import attrgetter, eq, gt, lt
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
-from benchmarks import digests, floor, ours, plain
-from benchmarks.bags import HOUR, ODOM, SCENE, SPLIT_NS
-from benchmarks.copies import copied
-from benchmarks.motion import NOWHERE
-from benchmarks.payloads import NEVER_SEEN
-from benchmarks.timing import FLOOR, OURS, PLAIN
+import numpy as np
+
+from benchmarks.plain import Scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
 
-    from benchmarks.bags import History, Split
-    from benchmarks.timing import Ask, Side
-    from ros2_memory.config import Settings
-    from ros2_memory.history.context import Memory
+    from ros2_memory.core.model import JsonValue
 
-_SAMPLES: Final = 100
-_POINTS: Final = 20
-_POINTS_BY_TOOL: Final = 200
-_TOLERANCE_M: Final = 0.5
-_TOLERANCE_NS: Final = 100_000_000
-_INSIDE_NS: Final = 3_005_000_000
-"""How far a window begins and ends inside a split, and between two messages."""
+NEVER: Final = "xylograph quibble"
+"""A text that no world contains."""
+_Meets: TypeAlias = "Callable[[object], bool]"
+_Value = TypeVar("_Value")
+_HOUR: Final = 3600.0
+_AROUND_S: Final = 2.0
+_DAY: Final = 24 * _HOUR
+_SPEED: Final = "linear_velocity.x"
 
 
-class Target(NamedTuple):
-    """What is aimed at: `plain` times faster than plain, within `floor` times the floor, or both.
-
-    `seconds` is a limit by itself.
-    """
-
-    plain: float | None = None
-    floor: float | None = None
-    seconds: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """One question, the sides that answer it, and the aim.
-
-    Attributes:
-        words: what is asked.
-        sides: how each side answers; `ours` is among them.
-        target: the aim.
-        silent: the sides whose answer is not one that can be compared.
-        units: how many answers one timed ask gives.
-        plain_bags: on how many bags the plain side is measured where those are not all; its time
-            is then multiplied by `plain_scale`.
-        plain_scale: see there.
-    """
+class Question(NamedTuple):
+    """A call of a tool, in words of its own."""
 
     words: str
-    sides: Mapping[str, Side]
-    target: Target = field(default_factory=Target)
-    silent: Collection[str] = ()
-    units: int = 1
-    plain_bags: int | None = None
-    plain_scale: float = 1.0
+    tool: str
+    arguments: Mapping[str, JsonValue]
+    plain: Scan | None = None
 
 
 @dataclass
-class Case:
-    """What the questions are asked of; `known` says whether the catalogue is to know every bag."""
+class Facts:
+    """What a world was drawn to be (`world.json`), and where in it questions are asked."""
 
-    history: History
-    settings: Settings
-    known: bool = True
+    facts: Mapping[str, JsonValue]
+    chance: np.random.Generator
+    start: float = field(init=False)
+    end: float = field(init=False)
 
-    @cached_property
-    def memory(self) -> Memory:
-        """A memory that knows the folder."""
-        memory = ours.memory(self.settings)
-        memory.index.refresh()
-        if self.known:
-            digests.made_known(memory, self.settings)
-        return memory
+    def __post_init__(self) -> None:
+        self.start, self.end = self.number("start"), self.number("end")
 
-    @cached_property
-    def splits(self) -> list[Split]:
-        """All bags."""
-        return list(self.history.splits())
+    def number(self, name: str) -> float:
+        """Returns a number of the world."""
+        return cast("float", self.facts[name])
 
-    @property
-    def hour(self) -> list[Split]:
-        """The bags of the last hour."""
-        return self.splits[-HOUR:]
+    def text(self, name: str) -> str:
+        """Returns a text of the world."""
+        return cast("str", self.facts[name])
 
-    @property
-    def window(self) -> tuple[int, int]:
-        """The last hour in nanoseconds; it begins and ends inside a split."""
-        return self.hour[0].start + _INSIDE_NS, self.history.end - _INSIDE_NS
+    def point(self, name: str) -> dict[str, JsonValue]:
+        """Returns a place of the world as `{x, y}`."""
+        x, y = cast("list[float]", self.facts[name])
+        return {"x": round(x, 3), "y": round(y, 3)}
 
-    @cached_property
-    def places(self) -> list[floor.Needed]:
-        """The chunks of the last hour that hold odometry."""
-        return floor.needed(self.hour, ODOM)
+    def topic(self, role: str) -> str:
+        """Returns the name of the topic with a role."""
+        return cast("dict[str, str]", self.facts["topics"])[role]
 
-    @cached_property
-    def chance(self) -> random.Random:
-        """Which moments are asked about; the same in every run of the program."""
-        return random.Random(4)  # noqa: S311 - a draw that must repeat, nothing secret
+    def state(self, doing: str) -> str:
+        """Returns the status text while the robot does something."""
+        return cast("dict[str, str]", self.facts["states"])[doing]
 
-    def moments(self, count: int) -> list[tuple[Split, int]]:
-        """Different splits of the hour, and in each a moment between two poses."""
-        chosen = self.chance.sample(self.hour, min(count, len(self.hour)))
-        between = SPLIT_NS // ODOM.messages
-        return [
-            (split, split.start + self.chance.randrange(5, ODOM.messages) * between + between // 2)
-            for split in chosen
-        ]
+    def drawn(self, name: str) -> str:
+        """Returns one of a list of names, or of the keys of a table."""
+        return str(self.chance.choice(sorted(cast("list[str]", self.facts[name]))))
 
+    def moment(self) -> float:
+        """Returns a time in the middle of the world at which the robot was on."""
+        off = cast("list[list[float]]", self.facts["off"])
+        while True:
+            share = self.chance.uniform(0.15, 0.85)
+            at = round(self.start + share * (self.end - self.start), 3)
+            if not any(first - _AROUND_S < at < last + _AROUND_S for first, last in off):
+                return at
 
-def index(case: Case) -> Question:
-    """Indexing a cold directory."""
-    paths = [split.path for split in case.splits]
-    some = paths[-HOUR:]
+    def window(self, seconds: float) -> dict[str, JsonValue]:
+        """Returns a window of so long, or of the whole world where it is shorter."""
+        long = min(seconds, self.end - self.start)
+        start = self.start + self.chance.uniform(0.0, 1.0) * (self.end - self.start - long)
+        return {"start": round(start, 3), "end": round(start + long, 3)}
 
-    def mine() -> Sequence[Ask]:
-        # Under another name, where no catalogue lies.
-        bare = copied(case.history, 1)
-        memory = ours.memory(ours.settings_for(bare.folder))
-        return [lambda: ours.counts(memory)]
-
-    return Question(
-        f"index a cold directory of {len(paths)} bags (summaries only)",
-        {
-            OURS: mine,
-            PLAIN: lambda: [lambda: plain.index(some)],
-            FLOOR: lambda: [lambda: floor.open_and_read_summaries(paths)],
-        },
-        Target(plain=40, floor=20),
-        silent={FLOOR} if len(some) == len(paths) else {FLOOR, PLAIN},
-        plain_bags=None if len(some) == len(paths) else len(some),
-        plain_scale=len(paths) / len(some),
-    )
+    def scan(
+        self,
+        role: str,
+        meets: _Meets = lambda _: True,
+        window: Mapping[str, JsonValue] | None = None,
+        *,
+        is_last: bool = False,
+    ) -> Scan:
+        """Returns what plain rosbags are asked; over all time, where no window is given."""
+        times = [cast("float", (window or {}).get(name, math.inf)) for name in ("start", "end")]
+        start, stop = (int(t * 1e9) if t < math.inf else None for t in times)
+        return Scan(self.topic(role), start or 0, stop or 2**63 - 1, meets, is_last)
 
 
-def point_cold(case: Case) -> Question:
-    """One moment, nothing cached."""
-    return _point(case, cached=False)
-
-
-def point_cached(case: Case) -> Question:
-    """One moment, asked before."""
-    return _point(case, cached=True)
-
-
-def point_tool(case: Case) -> Question:
-    """One moment, through all of the server but its transport."""
-    asked = case.moments(_POINTS)
-    at_s = [moment / 1e9 for _, moment in asked]
-    at_s = (at_s * (_POINTS_BY_TOOL // len(at_s)))[:_POINTS_BY_TOOL]
-    return Question(
-        f"the same by a tool call, JSON in and out ({len(at_s)} calls)",
-        {OURS: lambda: [lambda: ours.positions_by_tool(case.memory, case.settings, at_s)]},
-        units=len(at_s),
-    )
-
-
-def samples(case: Case) -> Question:
-    """A hundred samples of an hour."""
-    start, stop = case.window
-    inside = [each for each in floor.located(case.places, ODOM) if start <= each.log_time < stop]
-    last = len(inside) - 1
-    kept = [inside[nth * last // (_SAMPLES - 1)] for nth in range(_SAMPLES)]
-    return Question(
-        f"{_SAMPLES} samples of an hour of odometry",
-        {
-            OURS: lambda: [lambda: ours.samples(case.memory, ODOM.name, start, stop, _SAMPLES)],
-            PLAIN: lambda: [lambda: plain.samples(case.hour, ODOM.name, start, stop, _SAMPLES)],
-            FLOOR: lambda: [lambda: floor.poses(case.places, kept)],
-        },
-        Target(plain=35, floor=2.5),
-    )
-
-
-def trajectory(case: Case) -> Question:
-    """The way driven in an hour."""
-    start, stop = case.window
-    return Question(
-        "trajectory of an hour",
-        {
-            OURS: lambda: [lambda: ours.path_length(case.memory, ODOM.name, start, stop)],
-            PLAIN: lambda: [lambda: plain.path_length(case.hour, ODOM.name, start, stop)],
-            FLOOR: lambda: [lambda: floor.unpack_all(case.places)],
-        },
-        Target(plain=400, floor=1),
-        silent={FLOOR},
-    )
-
-
-def seen(case: Case) -> Question:
-    """A thing that was never seen."""
-    return _never(
-        case,
-        f'find_last_match "{NEVER_SEEN}", never seen',
-        lambda: ours.last_match(case.memory, SCENE.name, "contains", NEVER_SEEN),
-        lambda bags: plain.last_match(bags, SCENE.name, plain.shows(NEVER_SEEN)),
-        Target(plain=10_000),
-    )
-
-
-def near(case: Case) -> Question:
-    """A place where the robot never was."""
-    x, y = NOWHERE
-    place: dict[str, float | int | str | bool | None] = {"x": x, "y": y}
-    return _never(
-        case,
-        "near_position, never there",
-        lambda: ours.last_match(case.memory, ODOM.name, "near_position", dict(place)),
-        lambda bags: plain.last_match(bags, ODOM.name, plain.near(x, y, _TOLERANCE_M)),
-        Target(),
-    )
-
-
-def _point(case: Case, *, cached: bool) -> Question:
-    asked = case.moments(_POINTS)
-    needed = [floor.needed([split], ODOM) for split, _ in asked]
-    newest = [
-        max(each for each in floor.located(place, ODOM) if each.log_time <= moment)
-        for place, (_, moment) in zip(needed, asked, strict=True)
+def questions(told: Mapping[str, JsonValue], seed: int) -> list[Question]:
+    """Returns the questions of a world of a drawn robot, or of one of strangers."""
+    facts = Facts(told, np.random.default_rng([seed, 7])) if "topics" in told else None
+    if facts is None:
+        return [*_about_all(None), *_of_strangers()]
+    return [
+        *_at_a_time(facts),
+        *_last_match(facts),
+        *_matches(facts),
+        *_ranges(facts),
+        *_motion(facts),
+        *_about_all(facts),
     ]
 
-    def mine() -> Sequence[Ask]:
-        if cached:
-            memory = case.memory
-            for _, moment in asked:
-                ours.position_at(memory, ODOM.name, moment / 1e9)
-        else:
-            memory = ours.forgetful(case.memory, case.settings, case.splits[0], ODOM.name)
-        return [partial(ours.position_at, memory, ODOM.name, moment / 1e9) for _, moment in asked]
 
-    return Question(
-        f"point query, {'asked before' if cached else 'nothing cached'}",
-        {
-            OURS: mine,
-            PLAIN: lambda: [
-                partial(
-                    plain.position_at, [split], ODOM.name, moment - _TOLERANCE_NS, moment + 1000
-                )
-                for split, moment in asked
-            ],
-            FLOOR: lambda: [
-                partial(floor.pose, place[0], message)
-                for place, message in zip(needed, newest, strict=True)
-            ],
-        },
-        Target(plain=300) if cached else Target(plain=8, floor=7),
+def _at_a_time(facts: Facts) -> Iterator[Question]:
+    at = facts.moment()
+    ns = int(at * 1e9)
+    before = Scan(facts.topic("odom"), ns - 10**9, ns + 1, is_last=True)
+    place: dict[str, JsonValue] = {"timestamp": at, "tolerance_s": 5}
+    yield Question("position at a time", "get_position_at", place, before)
+    in_map: dict[str, JsonValue] = {**place, "timestamp": facts.moment(), "frame_id": "map"}
+    yield Question("position in map at a time", "get_position_at", in_map)
+    value: dict[str, JsonValue] = {
+        "topic": facts.topic("battery"),
+        "timestamp": at,
+        "tolerance_s": 30,
+    }
+    scan = Scan(facts.topic("battery"), ns - 30 * 10**9, ns + 1, is_last=True)
+    yield Question("value at a time", "get_topic_at_time", value, scan)
+    frames = cast("list[str]", facts.facts["frames"])
+    arguments: dict[str, JsonValue] = {"parent": frames[0], "child": frames[-1]}
+    arguments["timestamp"] = facts.moment()
+    yield Question("transform at a time", "get_transform_at", arguments)
+
+
+def _last_match(facts: Facts) -> Iterator[Question]:
+    def asked(
+        words: str, role: str, kind: str, value: JsonValue, meets: _Meets,
+        **more: JsonValue,
+    ) -> Question:  # fmt: skip
+        condition = {"topic": facts.topic(role), "condition_type": kind, "value": value, **more}
+        return Question(
+            f"last match: {words}",
+            "find_last_match",
+            condition,
+            facts.scan(role, meets, is_last=True),
+        )
+
+    number = round(float(facts.chance.uniform(0.45, 0.7)), 9)
+    yield asked("text, never", "rosout", "contains", NEVER, _has("msg", NEVER))
+    yield asked("label, never", "objects", "contains", NEVER, _sees(NEVER))
+    yield asked("label", "objects", "contains", label := facts.drawn("labels"), _sees(label))
+    outside, inside = "number outside its range, never", "number inside its range, never"
+    yield asked(outside, "odom", "above", 9.0, _is(gt, "twist.twist.linear.x", 9.0), field=_SPEED)
+    yield asked(
+        inside, "battery", "equals", number, _is(eq, "percentage", number), field="percentage"
     )
+    never, dock = facts.point("never_there"), facts.point("dock")
+    yield asked("place, never", "odom", "near_position", never, _near(never))
+    yield asked("place, often", "odom", "near_position", dock, _near(dock))
+    rare = facts.text("rare")
+    yield asked("text, rare", "speech", "contains", rare, _has("data", rare))
+    driving = facts.state("driving")
+    yield asked("text, often", "status", "equals", driving, _is(eq, "data", driving))
 
 
-def _never(
-    case: Case,
-    words: str,
-    mine: Ask,
-    theirs: Callable[[Sequence[Split]], object],
-    target: Target,
-) -> Question:
-    """A search that finds nothing in all the bags; plain is measured on an hour of them."""
-    bags, hour = len(case.splits), len(case.hour)
-    return Question(
-        f"{words}, {bags} bags",
-        {OURS: lambda: [mine], PLAIN: lambda: [partial(theirs, case.hour)]},
-        target,
-        plain_bags=None if hour == bags else hour,
-        plain_scale=bags / hour,
-    )
+def _matches(facts: Facts) -> Iterator[Question]:
+    label, state = facts.drawn("labels"), facts.state("looking")
+    logged = facts.text("logged")
+    conditions: list[tuple[str, str, str, JsonValue, dict[str, JsonValue], _Meets]]
+    conditions = [
+        ("text", "rosout", "contains", logged, {}, _has("msg", logged)),
+        ("state", "status", "equals", state, {}, _is(eq, "data", state)),
+        ("label", "objects", "contains", label, {}, _sees(label)),
+        ("boolean", "docked", "equals", True, {}, _is(eq, "data", True)),
+        ("number", "battery", "below", 0.4, {"field": "percentage"}, _is(lt, "percentage", 0.4)),
+    ]
+    for words, role, kind, value, more, meets in conditions:
+        condition: dict[str, JsonValue] = {"topic": facts.topic(role), "condition_type": kind}
+        condition |= {"value": value, **more}
+        for by in ("day", "hour"):
+            arguments: dict[str, JsonValue] = {**condition, "by": by}
+            scan = facts.scan(role, meets)
+            yield Question(f"{words} by {by}", "find_matches", arguments, scan)
+    docked: JsonValue = {"topic": facts.topic("docked"), "condition_type": "equals", "value": False}
+    seen: dict[str, JsonValue] = {
+        "topic": facts.topic("objects"),
+        "condition_type": "contains",
+        "value": label,
+    }
+    yield Question("label while not docked", "find_matches", {**seen, "while": docked})
+    yield Question("label in a room", "find_matches", {**seen, "where": facts.drawn("rooms")})
+    day = facts.window(_DAY)
+    scan = facts.scan("objects", _sees(label), day)
+    yield Question("label of a day", "find_matches", {**seen, **day}, scan)
 
 
-QUESTIONS: Final[Mapping[str, Callable[[Case], Question]]] = {
-    "index": index,
-    "point-cold": point_cold,
-    "point-cached": point_cached,
-    "point-tool": point_tool,
-    "samples": samples,
-    "trajectory": trajectory,
-    "never-seen": seen,
-    "never-near": near,
-}
+def _ranges(facts: Facts) -> Iterator[Question]:
+    tool, whole = "get_topic_in_range", facts.window(math.inf)
+    hour, day = facts.window(_HOUR), facts.window(_DAY)
+    odom, battery = facts.topic("odom"), facts.topic("battery")
+    only: dict[str, JsonValue] = {"topic": battery, "fields": ["percentage"]}
+    speed: dict[str, JsonValue] = {"topic": odom, "fields": [_SPEED]}
+    scan = facts.scan("odom", window=hour)
+    yield Question("100 samples of an hour", tool, {"topic": odom, **hour}, scan)
+    yield Question("a field of a day", tool, {**only, **day}, facts.scan("battery", window=day))
+    yield Question("a field by hour", tool, {**only, **whole, "by": "hour"}, facts.scan("battery"))
+    yield Question("speed by hour", tool, {**speed, **whole, "by": "hour"}, facts.scan("odom"))
+
+
+def _motion(facts: Facts) -> Iterator[Question]:
+    week = facts.window(math.inf)
+    spans: dict[str, dict[str, JsonValue]]
+    spans = {"hour": facts.window(_HOUR), "day": facts.window(_DAY), "week": week}
+    for words, span in spans.items():
+        scan = facts.scan("odom", window=span)
+        yield Question(f"trajectory of {_a(words)}", "trajectory_summary", span, scan)
+    yield Question("trajectory by day", "trajectory_summary", {**week, "by": "day"})
+    for words, span in spans.items():
+        yield Question(f"recap of {_a(words)}", "recap", span)
+    yield Question("visits: a place, often", "visits", facts.point("dock"))
+    yield Question("visits: a place, never", "visits", facts.point("never_there"))
+    yield Question("visits: a room", "visits", {"where": facts.drawn("rooms")})
+    yield Question("visits: all rooms", "visits", {})
+    last = max(facts.end - 2.0 * _DAY, facts.start)
+    half = (facts.end - last) / 2.0
+    days: dict[str, JsonValue] = {"start": last + half, "end": facts.end}
+    days |= {"with_start": last, "with_end": last + half}
+    yield Question("compare two days", "compare", days)
+    yield Question("find_things", "find_things", {})
+    yield Question("find_things: a label", "find_things", {"label": facts.drawn("labels")})
+    where: JsonValue = facts.drawn("rooms")
+    yield Question("find_things: a room", "find_things", {"where": where})
+
+
+def _about_all(facts: Facts | None) -> Iterator[Question]:
+    topics = Scan("", 0, 2**63 - 1) if facts else None
+    yield Question("list topics", "list_recorded_topics", {}, topics)
+    yield Question("data_time_range", "data_time_range", {}, topics)
+    yield Question("memory_status", "memory_status", {})
+
+
+def _of_strangers() -> Iterator[Question]:
+    """Yields questions that need no knowledge of the bags."""
+    ever: dict[str, JsonValue] = {"start": 0.0, "end": 4e9}
+    text: dict[str, JsonValue] = {"topic": "*", "condition_type": "contains", "value": NEVER}
+    number: dict[str, JsonValue] = {"topic": "/odom", "condition_type": "above", "value": 9e9}
+    number |= {"field": _SPEED}
+    logged: dict[str, JsonValue] = {**text, "topic": "/rosout", "value": "a"}
+    yield Question("last match: text of any topic, never", "find_last_match", text)
+    yield Question("last match: a number of /odom, never", "find_last_match", number)
+    yield Question("text", "find_matches", logged)
+    yield Question("trajectory of everything", "trajectory_summary", ever)
+    yield Question("recap of everything", "recap", ever)
+    yield Question("visits: a place", "visits", {"x": 0.0, "y": 0.0, "frame_id": "odom"})
+    yield Question("find_things", "find_things", {})
+
+
+def _a(noun: str) -> str:
+    return f"an {noun}" if noun == "hour" else f"a {noun}"
+
+
+def _has(name: str, needle: str) -> _Meets:
+    read, folded = attrgetter(name), needle.casefold()
+    return lambda message: folded in cast("str", read(message)).casefold()
+
+
+def _is(compare: Callable[[_Value, _Value], bool], name: str, value: _Value) -> _Meets:
+    read = attrgetter(name)
+    return lambda message: compare(read(message), value)
+
+
+def _near(place: Mapping[str, JsonValue]) -> _Meets:
+    read, (x, y) = attrgetter("pose.pose.position"), cast("list[float]", [*place.values()])
+    return lambda message: math.hypot(read(message).x - x, read(message).y - y) <= 0.5
+
+
+def _sees(label: str) -> _Meets:
+    """Whether an array of detections, or a JSON text, has a label that contains this one."""
+    label_of, class_of = attrgetter("label"), attrgetter("results")
+
+    def meets(message: object) -> bool:
+        text = getattr(message, "data", None)
+        if isinstance(text, str):
+            return any(label in cast("str", one["label"]) for one in json.loads(text)["found"])
+        for one in cast("list[object]", attrgetter("detections")(message)):
+            named = (
+                [attrgetter("hypothesis.class_id")(kind) for kind in class_of(one)]
+                if hasattr(one, "results")
+                else [label_of(one)]
+            )
+            if any(label in name for name in named):
+                return True
+        return False
+
+    return meets

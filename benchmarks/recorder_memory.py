@@ -20,12 +20,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from mcap.writer import CompressionType, Writer
 from tests.support import stub_ros2
 
-from benchmarks.bags import QOS, SPLIT_NS, SPLITS_OF_A_RECORDING, WEEK
-from benchmarks.footprint import resident_mb
+from benchmarks.bags import Recording, Row, Topic
 from benchmarks.report import machine
+from benchmarks.timing import resident_mb
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import identity_of
 
@@ -37,7 +36,10 @@ _DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks" / "re
 _TOPICS: Final = 12
 _MESSAGES: Final = 3
 """Of each topic in a bag: the daemon's memory depends on how many topics there are, not on this."""
-_LATCHED: Final = "/tf_static"
+_SPLIT_NS: Final = 10 * 10**9
+_SPLITS: Final = 60
+"""Of a recording."""
+_WEEK: Final = 60_480
 _PASSES: Final = 3
 """Deletions that are waited for."""
 _PATIENCE_S: Final = 600.0
@@ -48,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.recorder_memory", description=__doc__
     )
-    parser.add_argument("--bags", type=int, default=WEEK, help="splits of 10 s")
+    parser.add_argument("--bags", type=int, default=_WEEK, help="splits of 10 s")
     parser.add_argument("--setup", type=Path, help="a ROS setup file with ros2 bag record")
     parser.add_argument("--dir", type=Path, default=_DIR, help="where the bags lie meanwhile")
     asked = parser.parse_args(argv)
@@ -68,8 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _make_week(bag_dir: Path, bags: int) -> int:
     """Makes bags that end now, listed as the recorder's own; returns their bytes."""
-    start = time.time_ns() - bags * SPLIT_NS
-    numbers = range(0, bags, SPLITS_OF_A_RECORDING)
+    start = time.time_ns() - bags * _SPLIT_NS
+    numbers = range(0, bags, _SPLITS)
     with ProcessPoolExecutor() as pool:
         sizes = [*pool.map(partial(_record, bag_dir, start, bags), numbers, chunksize=8)]
     identities = {each.name: identity_of(each) for each in bag_dir.iterdir()}
@@ -79,38 +81,25 @@ def _make_week(bag_dir: Path, bags: int) -> int:
 
 def _record(bag_dir: Path, start: int, bags: int, first: int) -> int:
     """Writes one recording from its first bag on; returns its bytes."""
-    began = start + first * SPLIT_NS
+    began = start + first * _SPLIT_NS
     stamp = time.strftime("%Y%m%d_%H%M%S", time.gmtime(began / 1e9))
-    folder = bag_dir / f"rec_{stamp}"
-    folder.mkdir(parents=True)
-    size = 0
-    for nth in range(min(SPLITS_OF_A_RECORDING, bags - first)):
-        path = folder / f"{folder.name}_{nth}.mcap"
-        at = began + nth * SPLIT_NS
-        _write(path, at, with_latched=not nth)
-        size += path.stat().st_size
-        os.utime(path, ns=(at + SPLIT_NS, at + SPLIT_NS))
-    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n", encoding="utf-8")
-    os.utime(folder, ns=(began, began))
-    return size
+    topics = [Topic(f"/robot/topic_{nth}", "std_msgs/msg/String") for nth in range(_TOPICS - 1)]
+    topics.append(Topic("/tf_static", "std_msgs/msg/String", "transient_local"))
+    recording = Recording(bag_dir / f"rec_{stamp}", topics)
+    for nth in range(min(_SPLITS, bags - first)):
+        recording.write(_rows(began + nth * _SPLIT_NS, with_latched=not nth))
+    recording.close()
+    os.utime(recording.folder, ns=(began, began))
+    return sum(split.path.stat().st_size for split in recording.splits)
 
 
-def _write(path: Path, start: int, *, with_latched: bool) -> None:
-    with path.open("wb") as stream:
-        writer = Writer(stream, compression=CompressionType.NONE)
-        writer.start("ros2", "benchmark")
-        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
-        topics = [f"/robot/sensors/topic_{number}" for number in range(_TOPICS - 1)]
-        for number, topic in enumerate([*topics, _LATCHED]):
-            latched = topic == _LATCHED
-            qos = QOS.format(durability="transient_local" if latched else "volatile")
-            channel = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos})
-            if latched and not with_latched:
-                continue
-            for nth in range(1 if latched else _MESSAGES):
-                at = start + number * 1_000_003 + nth * SPLIT_NS // _MESSAGES
-                writer.add_message(channel, at, b"\0\1\0\0\2\0\0\0x\0", at)
-        writer.finish()
+def _rows(start: int, *, with_latched: bool) -> list[Row]:
+    rows = []
+    for topic in range(_TOPICS if with_latched else _TOPICS - 1):
+        for nth in range(1 if topic == _TOPICS - 1 else _MESSAGES):
+            at = start + topic * 1_000_003 + nth * _SPLIT_NS // _MESSAGES
+            rows.append(Row(at, at, topic, b"\0\1\0\0\2\0\0\0x\0"))
+    return sorted(rows)
 
 
 def _peak_mb(folder: Path, size: int, setup: Path | None) -> float:

@@ -8,10 +8,10 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from benchmarks.digests import made_known
 from benchmarks.home import replies
 from benchmarks.home.judging import wrong_fields
 from benchmarks.home.questions import KINDS
+from benchmarks.timing import made_known
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError

@@ -63,7 +63,6 @@ UNMEASURED: Final = (
     "test_trajectory.py::test_a_long_way_is_drawn_in_bounded_memory",
     "test_trajectory.py::test_a_path_in_very_many_pieces_is_held_in_bounded_memory",
     "test_visits.py",
-    "test_week.py",
 )
 """Files, or tests of a file by how their names begin, that are not measured.
 

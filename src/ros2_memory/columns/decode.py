@@ -122,6 +122,35 @@ def decoded(
     return map(_unless_error, found())
 
 
+def with_all_messages(reader: BagReader, path: Path, table: Table, window: TimeWindow) -> Table:
+    """Returns a table in which each message has a row, also one that cannot be decoded.
+
+    Where there is such a message no row has columns: the bag has to be asked about each of them.
+
+    Raises:
+        BagError: as by `BagReader.records`.
+    """
+    if not table.undecodable:
+        return table
+    channel = table.channel
+    records = [
+        record
+        for record in reader.records(path, [channel.topic], window)
+        if record.channel.schema == channel.schema
+    ]
+    times = np.array([record.log_time for record in records], np.int64)
+    hashes = np.array([zlib.crc32(record.payload) for record in records], np.int64)
+    return Table(
+        channel,
+        times,
+        np.array([record.publish_time for record in records], np.int64),
+        np.zeros(times.size, np.int64),
+        left_out={"": f"some cannot be decoded: {table.undecodable_reason}"},
+        payload_hashes=None if table.payload_hashes is None else hashes,
+        definition=table.definition,
+    )
+
+
 def _unless_error(item: T | BagError) -> T:
     if isinstance(item, BagError):
         raise item

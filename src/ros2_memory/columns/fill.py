@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.coverage import shared_times
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.store import LONG_NS, PART_NS, BagKey
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
@@ -186,11 +186,15 @@ class Filling:
         second = next(groups, None)
         key, is_current = self._key(bag), partial(self._may_be_stored, bag)
         if second is None and bag.end - bag.start <= LONG_NS:
-            tables = _sound(bag, first)
+            tables = self._whole(bag, first)
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
-        every = (_sound(bag, tables) for tables in chain(begin, groups))
+        every = (self._whole(bag, tables) for tables in chain(begin, groups))
         return self.store.put_long(key, bag, every, hashed=hashed, is_current=is_current)
+
+    def _whole(self, bag: BagFile, tables: Sequence[Table]) -> list[Table]:
+        everything = TimeWindow.everything()
+        return [with_all_messages(self._reader, bag.path, table, everything) for table in tables]
 
     def _may_be_stored(self, bag: BagFile) -> bool:
         """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
@@ -267,20 +271,6 @@ class Filling:
 def _is_hashed(channel: Channel, *, everything: bool) -> bool:
     """Returns whether payloads of a channel are hashed: a latched message may come again later."""
     return everything or channel.latched
-
-
-def _sound(bag: BagFile, tables: Sequence[Table]) -> Sequence[Table]:
-    """Returns the tables.
-
-    Raises:
-        BagError: a message cannot be decoded. The bag is read for each question then, which says
-            so.
-    """
-    for table in tables:
-        if table.undecodable:
-            reason = f"{table.channel.topic}: {table.undecodable_reason}"
-            raise BagError(str(bag.path), reason)
-    return tables
 
 
 def _mtime_ns(path: Path) -> Ns:

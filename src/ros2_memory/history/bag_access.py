@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.core.errors import (
     BagContradictionError,
     BagError,
@@ -269,10 +270,11 @@ class BagAccess:
         With `hashed` they have the hashes of all payloads, else those of latched channels alone.
         """
         self.check_deadline()
+        part = _indexed_part(bag, TimeWindow.everything())
         groups = decoded(
             self.memory.reader,
             bag.path,
-            _indexed_part(bag, TimeWindow.everything()),
+            part,
             topics=[topic],
             hashed=lambda channel: hashed or channel.latched,
         )
@@ -289,19 +291,9 @@ class BagAccess:
                 return
             self._track_source(bag)
             for table in tables:
-                self._note_undecodable(table)
-                yield table
+                with suppress(BagError):  # it was read before, and what is lost was noted
+                    yield with_all_messages(self.memory.reader, bag.path, table, part)
             self.check_deadline()
-
-    def _note_undecodable(self, table: Table) -> None:
-        """Notes that messages have no row, because they cannot be decoded."""
-        if table.undecodable:
-            self.notes.complete = False
-            topic, type_name = table.channel.topic, table.channel.type
-            kind = Reason(
-                f"could not be decoded: {table.undecodable_reason}", "topic", of="messages of "
-            )
-            self.notes.add(Note(kind, f"{topic} ({type_name})"))
 
     def all_of(
         self, segment: Segment, topic: str
