@@ -60,7 +60,7 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     Returns:
         None where the columns do not hold them all: then the bag has to be read.
     """
-    if table.definition is None:
+    if table.definition is None or "" in table.left_out:
         return None
     values = Values(table)
     try:

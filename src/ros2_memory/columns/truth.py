@@ -107,7 +107,9 @@ class ColumnCondition:
     def truth(self, table: Table) -> Truth:
         """Returns which rows of a table meet the condition."""
         rows, definition = len(table), table.definition
-        plan = None if definition is None else self._plan(definition, table.channel.type)
+        plan = None
+        if definition is not None and "" not in table.left_out:
+            plan = self._plan(definition, table.channel.type)
         if plan is None:
             return _truth(rows, unknown(rows))
         values = Values(table)
