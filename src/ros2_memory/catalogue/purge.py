@@ -10,23 +10,19 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed, unpacked
 from ros2_memory.catalogue.sql import NO_TOPIC, PACKED_IN, TABLES, delete_entries
 from ros2_memory.columns.database import ROW_ID_BITS
+from ros2_memory.columns.forget import PATIENCE_S, leftovers, rewrite
 from ros2_memory.core.errors import BagError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-PATIENCE_S: Final = 10.0
-"""How long other programs may use the file before it is given up to empty its log."""
-_PAUSE_S: Final = 0.05
-_ASIDE: Final = ".aside"
 _KEYS: Final = {
     "held": f"id >> {ROW_ID_BITS:d} = ?",
     "tales": f"id >> {ROW_ID_BITS:d} = ?",
@@ -47,18 +43,13 @@ def purge(file: Path, bags: Sequence[str]) -> None:
         BagError: it cannot be changed, or another program uses it all the time.
     """
     try:
-        for each in (*file.parent.glob(f"{file.name}{_ASIDE}*"), *_copies(file)):
+        for each in leftovers(file):
             each.unlink(missing_ok=True)
         if file.is_file() and not file.is_symlink():
             _purge(file, bags)
     except (OSError, sqlite3.Error, ValueError, LookupError) as error:
         reason = f"the catalogue may still contain deleted data ({error}); delete the file"
         raise BagError(str(file), f"{file.name}: {reason}") from error
-
-
-def _copies(file: Path) -> list[Path]:
-    """Returns copies that were being made when a program ended."""
-    return [*file.parent.glob(f".{file.name}.*.tmp*")]
 
 
 def _purge(file: Path, bags: Sequence[str]) -> None:
@@ -84,23 +75,7 @@ def _purge(file: Path, bags: Sequence[str]) -> None:
         except BaseException:
             base.execute("ROLLBACK")
             raise
-        give_up_s = time.monotonic() + PATIENCE_S
-        for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
-            while not _done(base, statement):
-                if time.monotonic() > give_up_s:
-                    raise sqlite3.OperationalError("other programs use it all the time")
-                time.sleep(_PAUSE_S)
-
-
-def _done(base: sqlite3.Connection, statement: str) -> bool:
-    """Executes a statement; returns False if another program holds a lock."""
-    try:
-        row = base.execute(statement).fetchone()
-    except sqlite3.OperationalError as error:
-        if (error.sqlite_errorcode & 0xFF) not in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
-            raise
-        return False
-    return row is None or not row[0]
+        rewrite(base)
 
 
 def _renew_model(base: sqlite3.Connection, topic: int, kind: str, model: bytes) -> None:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.coverage import shared_times
 from ros2_memory.columns.decode import decoded, with_all_messages
-from ros2_memory.columns.store import LONG_NS, PART_NS, BagKey
+from ros2_memory.columns.store import LONG_NS, BagKey
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
@@ -137,11 +138,7 @@ class Filling:
                 slots[(*slot, number in hashed)].append((number, bag))
         for (_, begin, _), bags in slots.items():
             if self._is_over(begin, timeline):
-                size = sum(bag.size for _, bag in bags)
-                length = sum(bag.end - bag.start for _, bag in bags) // NS_PER_S
-                budget = max(
-                    round(self._limits.max_share * size), LEAST_BYTES_PER_S * (length + len(bags))
-                )
+                budget = self._budget([bag for _, bag in bags])
                 if self.store.merge([number for number, _ in bags], budget):
                     done += len(bags)
         return done
@@ -190,7 +187,15 @@ class Filling:
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
         every = (self._whole(bag, tables) for tables in chain(begin, groups))
-        return self.store.put_long(key, bag, every, hashed=hashed, is_current=is_current)
+        return self.store.put_long(
+            key, bag, every, hashed=hashed, budget=self._budget([bag]), is_current=is_current
+        )
+
+    def _budget(self, bags: Sequence[BagFile]) -> int:
+        """Returns how many bytes the columns of some bags may take."""
+        size = sum(bag.size for bag in bags)
+        length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
+        return max(round(self._limits.max_share * size), LEAST_BYTES_PER_S * length)
 
     def _whole(self, bag: BagFile, tables: Sequence[Table]) -> list[Table]:
         everything = TimeWindow.everything()

@@ -13,7 +13,6 @@ that says which of its messages count. Its number is never used twice.
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections import defaultdict
 from dataclasses import dataclass
@@ -26,26 +25,33 @@ from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
-from ros2_memory.columns.parts import pack_rows, packed_part
+from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.table import Zone
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.columns.writing import (
+    PART_NS,
+    LongBag,
+    delete_bags,
+    insert_bag,
+    insert_parts,
+    lacks_definitions,
+    topic_of,
+    within,
+)
 from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.parts import PackedPart
     from ros2_memory.columns.stored import StoredTable
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Definition, IntArray
 
 FILE: Final = "columns.sqlite"
-PART_NS: Final[Ns] = 600 * NS_PER_S
-"""Bags of one recording that begin in the same ten minutes become one part for each topic."""
 LONG_NS: Final[Ns] = 2 * PART_NS
 """A bag that lasts longer becomes parts at once."""
 
@@ -76,7 +82,6 @@ CREATE TABLE deletion (id INTEGER PRIMARY KEY AUTOINCREMENT);
 """,
 )
 
-_MOST_INTEGER: Final = 2**63 - 1
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
 
 
@@ -361,10 +366,10 @@ class ColumnStore(Database):
             stored = is_current()
             if not stored:
                 return
-            _delete(connection, [key.path])
-            definitions = self._definitions if _lacks_definitions(tables) else ""
-            number = _insert_bag(connection, key, bag, definitions, hashed=hashed)
-            entries = [Entry(*_topic_of(connection, table), table) for table in tables]
+            delete_bags(connection, [key.path])
+            definitions = self._definitions if lacks_definitions(tables) else ""
+            number = insert_bag(connection, key, bag, definitions, hashed=hashed)
+            entries = [Entry(*topic_of(connection, table), table) for table in tables]
             connection.execute(
                 "INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries, places=False))
             )
@@ -378,38 +383,35 @@ class ColumnStore(Database):
         groups: Iterable[Sequence[Table]],
         *,
         hashed: bool,
+        budget: int,
         is_current: Callable[[], bool] = lambda: True,
     ) -> bool:
         """Stores a bag as parts, group by group; returns whether it did.
 
         A bag that is stored in part is none: it has its key only once the last group is written.
-        Arguments are as for `put`.
+        Its rows go where that is not reached.
+
+        Args:
+            key: of the bag.
+            bag: the bag, for its times.
+            groups: all of its messages, in several goes. What they raise is raised here.
+            hashed: whether all tables have the hashes of their payloads.
+            budget: how many bytes the parts may take, as for `merge`.
+            is_current: as for `put`, asked with each group.
         """
-        number = 0
-        stored = lacks_definitions = False
-
-        def begin(connection: sqlite3.Connection) -> None:
-            nonlocal number
-            _delete(connection, [key.path])
-            number = _insert_bag(connection, key._replace(size=-1), bag, "", hashed=hashed)
-
-        def end(connection: sqlite3.Connection) -> None:
-            nonlocal stored
-            stored = is_current()
-            size = key.size if stored else -1
-            definitions = self._definitions if lacks_definitions else ""
-            connection.execute(
-                "UPDATE bag SET size = ?, definitions = ? WHERE id = ?", (size, definitions, number)
-            )
-
-        if not self.write(begin):
+        long = LongBag(key, bag, self._definitions, is_current, budget)
+        if not (self.write(partial(long.begin, hashed=hashed)) and long.goes_on):
             return False
-        for tables in groups:
-            lacks_definitions |= _lacks_definitions(tables)
-            parts = [part for table in tables if len(table) for part in _in_parts(table)]
-            if not self.write(partial(_insert_rows, parts=parts, bag=number)):
-                return False
-        return self.write(end) and stored
+        is_whole = False
+        try:
+            for tables in groups:
+                if not (self.write(partial(long.add, tables=tables)) and long.goes_on):
+                    return False
+            is_whole = self.write(long.end) and long.goes_on
+        finally:
+            if not is_whole:
+                self.write(long.delete_half)
+        return is_whole
 
     def merge(self, bags: Sequence[int], budget: int) -> bool:
         """Makes parts of bags of one recording; returns whether it did.
@@ -436,10 +438,10 @@ class ColumnStore(Database):
                     if len(table):
                         found[table.number].append((bag, table))
             packed = {
-                topic: packed_part(topics[topic].layout, tables) for topic, tables in found.items()
+                topic: [packed_part(topics[topic].layout, tables)]
+                for topic, tables in found.items()
             }
-            for topic, part in _within(packed, budget).items():
-                _insert_part(connection, topic, part)
+            insert_parts(connection, within(packed, budget))
             connection.execute(
                 "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
                 (json.dumps(numbers),),
@@ -449,7 +451,7 @@ class ColumnStore(Database):
 
     def delete(self, paths: Sequence[str]) -> bool:
         """Deletes bags, and the parts that have rows of none that is left."""
-        return self.write(partial(_delete, paths=paths))
+        return self.write(partial(delete_bags, paths=paths))
 
     def used_bytes(self) -> int:
         """Returns the bytes of the file that hold something."""
@@ -462,136 +464,3 @@ class ColumnStore(Database):
             return (pages - free) * size
 
         return self.read(ask, 0)
-
-
-def _within(parts: Mapping[int, PackedPart], budget: int) -> dict[int, PackedPart]:
-    """Returns parts without the data of the largest, as many as are beyond the budget (bytes)."""
-    found: dict[int, PackedPart] = {}
-    for topic in sorted(parts, key=lambda topic: parts[topic].size):
-        part = parts[topic]
-        budget -= part.size
-        found[topic] = part if budget >= 0 else part.without_data()
-    return found
-
-
-def _in_parts(table: Table) -> Iterator[Table]:
-    """Yields the rows of a table by the ten minutes that they are in."""
-    slots = table.log_times // PART_NS
-    edges = np.flatnonzero(np.diff(slots)) + 1
-    for rows in np.split(np.arange(len(table)), edges):
-        yield table.rows(rows)
-
-
-def _insert_rows(connection: sqlite3.Connection, parts: Sequence[Table], bag: int) -> None:
-    for table in parts:
-        topic, layout = _topic_of(connection, table)
-        part = pack_rows(layout, table, np.full(len(table), bag, np.int64))
-        _insert_part(connection, topic, part)
-
-
-def _lacks_definitions(tables: Sequence[Table]) -> bool:
-    """Returns whether other definitions may decode what these could not."""
-    return any("" in table.left_out for table in tables)
-
-
-def _insert_bag(
-    connection: sqlite3.Connection, key: BagKey, bag: BagFile, definitions: str, *, hashed: bool
-) -> int:
-    messages = sum(topic.count for topic in bag.summary.topics)
-    cursor = connection.execute(
-        "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
-        " definitions) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, bag.start, bag.end, messages, hashed, definitions),
-    )
-    return int(cursor.lastrowid or 0)
-
-
-def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> None:
-    cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags) VALUES (?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags)),
-    )
-    connection.executemany(
-        "INSERT INTO part_column VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        [
-            (
-                cursor.lastrowid,
-                path,
-                packed.codec,
-                packed.count,
-                _storable(packed.zone.least),
-                _storable(packed.zone.greatest),
-                packed.zone.nulls,
-                packed.error,
-                packed.zone.words,
-                packed.data or None,
-            )
-            for path, packed in part.columns.items()
-        ],
-    )
-
-
-def _storable(bound: int | float | None) -> int | float | None:  # noqa: PYI041 - unlike
-    """Returns the bound of a zone as SQLite can store it: a uint64 may be too large."""
-    if isinstance(bound, int) and bound > _MOST_INTEGER:
-        return math.nextafter(float(bound), math.inf)
-    return bound
-
-
-def _topic_of(connection: sqlite3.Connection, table: Table) -> tuple[int, Layout]:
-    """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
-    channel, layout = table.channel, Layout.of(table, table.definition)
-    schema = channel.schema
-    definition = _number_of(
-        connection,
-        "definition",
-        {"type": schema.name, "encoding": schema.encoding, "text": schema.text},
-    )
-    topic = _number_of(
-        connection,
-        "topic",
-        {
-            "name": channel.topic,
-            "encoding": channel.encoding,
-            "latched": channel.latched,
-            "definition": definition,
-            "layout": layout.to_json(),
-        },
-    )
-    return topic, layout
-
-
-def _number_of(
-    connection: sqlite3.Connection, table: str, values: Mapping[str, str | bytes | int]
-) -> int:
-    """Returns the id of the row with these values, which is inserted if it is new."""
-    given = tuple(values.values())
-    where = " AND ".join(f"{name} = ?" for name in values)
-    row = connection.execute(f"SELECT id FROM {table} WHERE {where}", given).fetchone()
-    if row is not None:
-        return int(row[0])
-    names, marks = ", ".join(values), ", ".join("?" * len(given))
-    cursor = connection.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", given)
-    return int(cursor.lastrowid or 0)
-
-
-def _delete(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
-    numbers = [
-        row[0]
-        for row in connection.execute(
-            "SELECT id FROM bag WHERE path IN (SELECT value FROM json_each(?))",
-            (json.dumps(paths),),
-        )
-    ]
-    if not numbers:
-        return
-    connection.executemany("DELETE FROM bag WHERE id = ?", [(number,) for number in numbers])
-    connection.executemany("DELETE FROM split WHERE bag = ?", [(number,) for number in numbers])
-    # A part goes with the last of its bags.
-    gone = connection.execute(
-        "SELECT id FROM part WHERE NOT EXISTS"
-        " (SELECT 1 FROM json_each(part.bags) JOIN bag ON bag.id = value)"
-    ).fetchall()
-    connection.executemany("DELETE FROM part_column WHERE part = ?", gone)
-    connection.executemany("DELETE FROM part WHERE id = ?", gone)
-    connection.execute("INSERT INTO deletion DEFAULT VALUES")

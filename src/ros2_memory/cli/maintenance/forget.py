@@ -32,9 +32,8 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, FORGOTTEN, Erasure, Forgetting, ForgottenBag
-from ros2_memory.bootstrap import build_reader, catalogue_paths, supposed_own
+from ros2_memory.bootstrap import build_reader, catalogue_paths, column_paths, supposed_own
 from ros2_memory.catalogue.purge import purge
-from ros2_memory.catalogue.store import BagKey
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
@@ -54,6 +53,7 @@ from ros2_memory.cli.options import (
     spinner,
 )
 from ros2_memory.cli.output import format_time
+from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.config import Settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import (
@@ -142,6 +142,8 @@ def forget(
             if plan.kept
             else "nothing to delete: no closed bag has messages in the window"
         )
+        # Of bags that retention deleted, something derived may be left.
+        _forget_derived(settings, (), dry_run=dry_run)
     elif dry_run:
         print_line(f"would be deleted: {_describe(plan)}")
         for bag in plan.to_delete:
@@ -150,8 +152,8 @@ def forget(
         print_line(f"to be deleted: {_describe(plan)}")
         if not yes:
             typer.confirm("Delete them? This cannot be undone.", abort=True)
-        counts, firsts = _contents(build_reader(settings), plan.to_delete)
-        kept += _delete(memory, plan, carrier, counts, firsts)
+        contents = _contents(build_reader(settings), plan.to_delete)
+        kept += _delete(settings, memory, plan, carrier, contents)
     if kept or interrupted:
         raise typer.Exit(EXIT_NEGATIVE)
 
@@ -260,6 +262,8 @@ class _Taking:
         _print_kept(kept)
         if not survey.holders and not erasure.files:
             print_line("no such message is in the window")
+            # Of bags that retention deleted, something derived may be left.
+            _forget_derived(self._settings, (), dry_run=self._dry_run)
             return bool(kept)
         size = sum(path.stat().st_size for path in {each.paths[0] for each in survey.holders})
         what = (
@@ -291,9 +295,27 @@ class _Taking:
 
     def _forget_derived(self, erasure: Erasure) -> None:
         self._memory.index.refresh()
-        for path in catalogue_paths(self._settings):
-            for each in {path, *path.parent.glob(f"*-{path.name}")}:  # of one recording alone
-                purge(each, erasure.files)
+        _forget_derived(self._settings, erasure.files)
+
+
+def _forget_derived(settings: Settings, files: Sequence[str], *, dry_run: bool = False) -> None:
+    """Deletes what is derived from bags, and from those that retention deleted before.
+
+    Args:
+        settings: of this deployment.
+        files: the bags, by their paths in the bag directory.
+        dry_run: whether nothing is to be deleted.
+
+    Raises:
+        BagError: some of it may still be there.
+    """
+    if dry_run:
+        return
+    for path in catalogue_paths(settings):
+        for each in {path, *path.parent.glob(f"*-{path.name}")}:  # of one recording alone
+            purge(each, files)
+    for path in column_paths(settings):
+        forget_columns(path, settings.recording.bag_dir, files)
 
 
 def _describe_erasure(erasure: Erasure) -> str:
@@ -440,11 +462,11 @@ def _contents(
 
 
 def _delete(
+    settings: Settings,
     memory: Memory,
     plan: Plan,
     carrier: Carrier,
-    counts: Mapping[Path, Counter[str]],
-    firsts: Mapping[Path, Ns],
+    contents: tuple[Mapping[Path, Counter[str]], Mapping[Path, Ns]],
 ) -> list[str]:
     """Deletes the planned bags that are still there; returns a line for each that is kept.
 
@@ -454,7 +476,8 @@ def _delete(
     Raises:
         BagError: latched messages cannot be carried; nothing is deleted then.
     """
-    kept = []
+    kept: list[str] = []
+    counts, firsts = contents
     with spinner("deleting"), _recorder_locked_out(plan.bag_dir) as recorder:
         snapshot = memory.index.refresh()
         present = {*snapshot.bags}
@@ -486,9 +509,10 @@ def _delete(
                 remove_emptied(plan.bag_dir, recording)
             except OSError as error:
                 kept.append(f"{recording}: {error}")
-        if memory.recall is not None:
-            paths_in_catalogue = [BagKey.of(bag, plan.bag_dir).path for bag in deleted]
-            memory.recall.catalogue.forget(paths_in_catalogue)
+        try:
+            _forget_derived(settings, [_name(bag.path, plan.bag_dir) for bag in deleted])
+        except BagError as error:
+            kept.append(error.reason)
         notes = [*_correct_metadata(plan, deleted, open_recordings, counts)]
     line = f"deleted: {counted(len(deleted), 'bag')}, {freed / MB:.1f} MB"
     if carried is not None:

@@ -1,0 +1,115 @@
+"""Deletes bags from a store of columns, so that no byte of its file reveals their content.
+
+Deleting rows is not enough. A part has rows of bags that retention deleted before, until its last
+bag goes; its zones and words are of those, too. SQLite's `secure_delete` overwrites what is deleted
+where it lies, but not the copies that stay in a page when rows move to another one, so the whole
+file is written again. And the write-ahead log has everything that was written last.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.columns.store import TABLES
+from ros2_memory.columns.writing import delete_bags
+from ros2_memory.core.errors import BagError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+PATIENCE_S: Final = 10.0
+"""How long other programs may use the file before it is given up to empty its log."""
+_PAUSE_S: Final = 0.05
+
+
+def forget(file: Path, bag_dir: Path, bags: Sequence[str]) -> None:
+    """Deletes bags from a store, and deletes stores that were set aside.
+
+    Also those whose files are gone. The bags that have rows in one part with them go, too: they are
+    stored again.
+
+    Args:
+        file: the store; nothing is done if it is absent.
+        bag_dir: the bag directory.
+        bags: their paths below it.
+
+    Raises:
+        BagError: it cannot be changed, is of another version, or another program uses it all the
+            time.
+    """
+    try:
+        for leftover in leftovers(file):
+            leftover.unlink(missing_ok=True)
+        if file.is_file() and not file.is_symlink():
+            address = f"{file.absolute().as_uri()}?mode=rw"
+            with closing(
+                sqlite3.connect(address, uri=True, timeout=PATIENCE_S, isolation_level=None)
+            ) as base:
+                _forget(base, bag_dir, bags)
+                rewrite(base)
+    except (OSError, sqlite3.Error, ValueError) as error:
+        reason = f"the columns may still contain deleted data ({error}); delete the file"
+        raise BagError(str(file), f"{file.name}: {reason}") from error
+
+
+def leftovers(file: Path) -> list[Path]:
+    """Returns what was set aside of a database, and copies that a program did not finish."""
+    return [*file.parent.glob(f"{file.name}.aside*"), *file.parent.glob(f".{file.name}.*.tmp*")]
+
+
+def rewrite(base: sqlite3.Connection) -> None:
+    """Writes a database again without what was deleted, and empties its write-ahead log.
+
+    Raises:
+        sqlite3.Error: there is no space for that, or other programs read it all the time.
+    """
+    give_up_s = time.monotonic() + PATIENCE_S
+    for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
+        while not _done(base, statement):
+            if time.monotonic() > give_up_s:
+                raise sqlite3.OperationalError("other programs use it all the time")
+            time.sleep(_PAUSE_S)
+
+
+def _forget(base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str]) -> None:
+    if base.execute("PRAGMA user_version").fetchone()[0] != TABLES.version:
+        raise ValueError("it is of another version")
+    for pragma in TABLES.pragmas:
+        base.execute(f"PRAGMA {pragma}")
+    base.execute("BEGIN IMMEDIATE")
+    try:
+        stored = [path for (path,) in base.execute("SELECT path FROM bag")]
+        gone = [path for path in stored if not (bag_dir / path).exists()]
+        delete_bags(base, [*bags, *gone])
+        # Without those beside them another part of the same ten minutes may lack a bag.
+        while beside := _beside_deleted(base):
+            delete_bags(base, beside)
+        base.execute("COMMIT")
+    except BaseException:
+        base.execute("ROLLBACK")
+        raise
+
+
+def _beside_deleted(base: sqlite3.Connection) -> list[str]:
+    """Returns the bags that have rows in one part with bags that are deleted."""
+    rows = base.execute(
+        "SELECT DISTINCT bag.path FROM part, json_each(part.bags) JOIN bag ON bag.id = value"
+        " WHERE EXISTS (SELECT 1 FROM json_each(part.bags) AS other"
+        " WHERE other.value NOT IN (SELECT id FROM bag))"
+    )
+    return [path for (path,) in rows]
+
+
+def _done(base: sqlite3.Connection, statement: str) -> bool:
+    """Executes a statement; returns False if another program holds a lock."""
+    try:
+        row = base.execute(statement).fetchone()
+    except sqlite3.OperationalError as error:
+        if (error.sqlite_errorcode & 0xFF) not in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+            raise
+        return False
+    return row is None or not row[0]

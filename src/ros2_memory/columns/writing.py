@@ -1,0 +1,240 @@
+"""What is written into the tables of a store: bags, their topics and their parts."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.columns.layout import Layout
+from ros2_memory.columns.parts import pack_rows
+from ros2_memory.core.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    import sqlite3
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from ros2_memory.columns.parts import PackedPart
+    from ros2_memory.columns.store import BagKey
+    from ros2_memory.columns.table import Table
+    from ros2_memory.core.model import BagFile
+
+PART_NS: Final[Ns] = 600 * NS_PER_S
+"""Bags of one recording that begin in the same ten minutes become one part for each topic."""
+_MOST_INTEGER: Final = 2**63 - 1
+
+
+class LongBag:
+    """A bag that is written in several transactions.
+
+    Attributes:
+        goes_on: whether it may be written on, as the last transaction found.
+
+    Args:
+        key: of the bag.
+        bag: the bag.
+        definitions: as `ColumnStore` has them.
+        is_current: whether the bag may be stored.
+        budget: how many bytes its parts may take.
+    """
+
+    def __init__(
+        self,
+        key: BagKey,
+        bag: BagFile,
+        definitions: str,
+        is_current: Callable[[], bool],
+        budget: int,
+    ) -> None:
+        self.goes_on = False
+        self._key = key
+        self._bag = bag
+        self._definitions = definitions
+        self._is_current = is_current
+        self._share = budget / max(_messages_of(bag), 1)
+        self._lacks_definitions = False
+        self._number = 0
+
+    def begin(self, connection: sqlite3.Connection, *, hashed: bool) -> None:
+        """Inserts the bag with a key that none has, in place of what its path was stored with."""
+        self.goes_on = self._is_current()
+        if self.goes_on:
+            delete_bags(connection, [self._key.path])
+            half = self._key._replace(size=-1)
+            self._number = insert_bag(connection, half, self._bag, "", hashed=hashed)
+
+    def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> None:
+        """Inserts some of its messages, as parts of ten minutes each."""
+        if not self._may_go_on(connection):
+            return
+        self._lacks_definitions |= lacks_definitions(tables)
+        packed: dict[int, list[PackedPart]] = defaultdict(list)
+        for table in tables:
+            topic, layout = topic_of(connection, table)
+            for rows in _in_parts(table) if len(table) else ():
+                numbers = np.full(len(rows), self._number, np.int64)
+                packed[topic].append(pack_rows(layout, rows, numbers))
+        budget = round(self._share * sum(len(table) for table in tables))
+        insert_parts(connection, within(packed, budget))
+
+    def end(self, connection: sqlite3.Connection) -> None:
+        """Gives the bag its key: now it is stored."""
+        if self._may_go_on(connection):
+            definitions = self._definitions if self._lacks_definitions else ""
+            connection.execute(
+                "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
+                (self._key.size, definitions, self._number),
+            )
+
+    def delete_half(self, connection: sqlite3.Connection) -> None:
+        """Deletes what was written of it."""
+        rows = connection.execute("SELECT path FROM bag WHERE id = ?", (self._number,))
+        delete_bags(connection, [path for (path,) in rows.fetchall()])
+
+    def _may_go_on(self, connection: sqlite3.Connection) -> bool:
+        # Meanwhile it may have been deleted, or another program may store it.
+        row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
+        self.goes_on = row is not None and self._is_current()
+        return self.goes_on
+
+
+def within(parts: Mapping[int, Sequence[PackedPart]], budget: int) -> dict[int, list[PackedPart]]:
+    """Returns the parts of topics; of the largest that are beyond the budget (bytes) no data."""
+    sizes = {topic: sum(part.size for part in parts[topic]) for topic in parts}
+    found: dict[int, list[PackedPart]] = {}
+    for topic in sorted(parts, key=lambda topic: sizes[topic]):
+        budget -= sizes[topic]
+        kept = budget >= 0
+        found[topic] = [part if kept else part.without_data() for part in parts[topic]]
+    return found
+
+
+def _in_parts(table: Table) -> Iterator[Table]:
+    """Yields the rows of a table by the ten minutes that they are in."""
+    slots = table.log_times // PART_NS
+    edges = np.flatnonzero(np.diff(slots)) + 1
+    for rows in np.split(np.arange(len(table)), edges):
+        yield table.rows(rows)
+
+
+def lacks_definitions(tables: Sequence[Table]) -> bool:
+    """Returns whether other definitions may decode what these could not."""
+    return any("" in table.left_out for table in tables)
+
+
+def _messages_of(bag: BagFile) -> int:
+    return sum(topic.count for topic in bag.summary.topics)
+
+
+def insert_bag(
+    connection: sqlite3.Connection, key: BagKey, bag: BagFile, definitions: str, *, hashed: bool
+) -> int:
+    """Inserts a bag; returns its number."""
+    cursor = connection.execute(
+        "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
+        " definitions) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (*key, bag.start, bag.end, _messages_of(bag), hashed, definitions),
+    )
+    return int(cursor.lastrowid or 0)
+
+
+def insert_parts(connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]]) -> None:
+    """Inserts parts, by the numbers of their topics."""
+    for topic, some in parts.items():
+        for part in some:
+            _insert_part(connection, topic, part)
+
+
+def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> None:
+    cursor = connection.execute(
+        "INSERT INTO part (topic, first_ns, last_ns, messages, bags) VALUES (?, ?, ?, ?, ?)",
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags)),
+    )
+    connection.executemany(
+        "INSERT INTO part_column VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [
+            (
+                cursor.lastrowid,
+                path,
+                packed.codec,
+                packed.count,
+                _storable(packed.zone.least),
+                _storable(packed.zone.greatest),
+                packed.zone.nulls,
+                packed.error,
+                packed.zone.words,
+                packed.data or None,
+            )
+            for path, packed in part.columns.items()
+        ],
+    )
+
+
+def _storable(bound: int | float | None) -> int | float | None:  # noqa: PYI041 - unlike
+    """Returns the bound of a zone as SQLite can store it: a uint64 may be too large."""
+    if isinstance(bound, int) and bound > _MOST_INTEGER:
+        return math.nextafter(float(bound), math.inf)
+    return bound
+
+
+def topic_of(connection: sqlite3.Connection, table: Table) -> tuple[int, Layout]:
+    """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
+    channel, layout = table.channel, Layout.of(table, table.definition)
+    schema = channel.schema
+    definition = _number_of(
+        connection,
+        "definition",
+        {"type": schema.name, "encoding": schema.encoding, "text": schema.text},
+    )
+    topic = _number_of(
+        connection,
+        "topic",
+        {
+            "name": channel.topic,
+            "encoding": channel.encoding,
+            "latched": channel.latched,
+            "definition": definition,
+            "layout": layout.to_json(),
+        },
+    )
+    return topic, layout
+
+
+def _number_of(
+    connection: sqlite3.Connection, table: str, values: Mapping[str, str | bytes | int]
+) -> int:
+    """Returns the id of the row with these values, which is inserted if it is new."""
+    given = tuple(values.values())
+    where = " AND ".join(f"{name} = ?" for name in values)
+    row = connection.execute(f"SELECT id FROM {table} WHERE {where}", given).fetchone()
+    if row is not None:
+        return int(row[0])
+    names, marks = ", ".join(values), ", ".join("?" * len(given))
+    cursor = connection.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", given)
+    return int(cursor.lastrowid or 0)
+
+
+def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
+    """Deletes bags, and the parts that have rows of none that is left."""
+    numbers = [
+        row[0]
+        for row in connection.execute(
+            "SELECT id FROM bag WHERE path IN (SELECT value FROM json_each(?))",
+            (json.dumps(paths),),
+        )
+    ]
+    if not numbers:
+        return
+    connection.executemany("DELETE FROM bag WHERE id = ?", [(number,) for number in numbers])
+    connection.executemany("DELETE FROM split WHERE bag = ?", [(number,) for number in numbers])
+    # A part goes with the last of its bags.
+    gone = connection.execute(
+        "SELECT id FROM part WHERE NOT EXISTS"
+        " (SELECT 1 FROM json_each(part.bags) JOIN bag ON bag.id = value)"
+    ).fetchall()
+    connection.executemany("DELETE FROM part_column WHERE part = ?", gone)
+    connection.executemany("DELETE FROM part WHERE id = ?", gone)
+    connection.execute("INSERT INTO deletion DEFAULT VALUES")
