@@ -225,7 +225,7 @@ class BinnedWindow:
         empty = [not any(values) for _, values in rows]
         if self._since is not None:
             is_late = self.bins.edges[1:] > self._since
-            counted = self.bins.member[is_late].any(axis=0).tolist()
+            counted: list[bool] = np.any(self.bins.member[is_late], axis=0).tolist()
             rows, empty = [*compress(rows, counted)], [*compress(empty, counted)]
         if self._by != "place":
             self._note_empty(empty, [name for name, _ in rows])
