@@ -66,7 +66,7 @@ from ros2_memory.history.reverse_search import (
     out_of_time,
     unasked_limit,
 )
-from ros2_memory.history.robots import note_robots_near, require_one_robot
+from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
 from ros2_memory.history.view import (
     AtTime,
     TimeRange,
@@ -79,11 +79,7 @@ from ros2_memory.history.view import (
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
-from ros2_memory.insights.field_extremes import (
-    MAX_MESSAGES,
-    TOO_MANY,
-    extremes_of,
-)
+from ros2_memory.insights.field_extremes import extremes_of
 from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
 from ros2_memory.insights.status import (
     bags_with_remarks,
@@ -157,11 +153,8 @@ def topic_range(
         view.notes.add(f"{len(chosen)} of {total} samples, evenly spaced over the window")
     note_unread(view, window)
     note_edges(view, window)
-    extremes: tuple[results.Extremes, ...] = ()
-    if fields and total > MAX_MESSAGES:
-        view.notes.add(TOO_MANY)
-    elif fields:
-        extremes = extremes_of(view, name, window, fields)
+    note_robots(view, name, window)
+    extremes = extremes_of(view, name, window, fields, total) if fields else ()
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )

@@ -347,7 +347,7 @@ def goals(ns: int, statuses: Mapping[int, int], topic: str = "/drive/_action/sta
     return Msg(topic, "action_msgs/msg/GoalStatusArray", ns, body)
 
 
-def battery(ns: int, percentage: float) -> Msg:
+def battery(ns: int, percentage: float, log_time: int | None = None) -> Msg:
     """A BatteryState that discharges; `percentage` is a fraction, as the message has it."""
     body = make(
         "sensor_msgs/msg/BatteryState",
@@ -368,7 +368,8 @@ def battery(ns: int, percentage: float) -> Msg:
         location="",
         serial_number="",
     )
-    return Msg("/battery_state", "sensor_msgs/msg/BatteryState", ns, body)
+    logged = ns if log_time is None else log_time
+    return Msg("/battery_state", "sensor_msgs/msg/BatteryState", logged, body)
 
 
 def command(ns: int, vx: float, wz: float = 0.0, topic: str = "/cmd_vel") -> Msg:

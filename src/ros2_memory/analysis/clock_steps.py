@@ -3,13 +3,16 @@
 A clock that is set forward leaves a hole: for so long no topic has a message. So does a recorder
 that stalls. They differ in where the robot is afterwards: time that never passed moved nothing. So
 a hole is a step where the robot drove on both sides, and is where it would be if the hole were not
-there.
+there. And where header stamps of another clock go on in their cadence across it: from then on
+messages are recorded that much later after their stamps.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
@@ -18,8 +21,18 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.motion.odometry import TimedPosition
+    from ros2_memory.storage.base import IntArray
 
 SHORTEST_STEP_NS: Final[Ns] = 2 * NS_PER_S
+SHORTEST_BY_STAMPS_NS: Final[Ns] = NS_PER_S // 2
+"""Header stamps show shorter steps than poses do."""
+STAMPS_BESIDE_NS: Final[Ns] = 5 * NS_PER_S
+"""Delays beside a hole are measured over this long: what stays is no queue that empties."""
+_FEWEST_STAMPS: Final = 5
+_ALIKE_NS: Final[Ns] = NS_PER_S // 10
+"""By how much the delays on one side, and the steps by several topics, may differ."""
+_AGREEING: Final = 2
+"""Topics that must show a step: the clock of one sensor may be set as well."""
 BESIDE_NS: Final[Ns] = NS_PER_S
 """How the robot drives beside a hole is measured over this long."""
 _DRIVING_MPS: Final = 0.1
@@ -65,8 +78,41 @@ def holes(times: Iterable[Ns]) -> list[tuple[Ns, Ns]]:
     return [
         (before, after)
         for before, after in pairwise(sorted(set(times)))
-        if after - before >= SHORTEST_STEP_NS
+        if after - before >= SHORTEST_BY_STAMPS_NS
     ]
+
+
+def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> Ns | None:
+    """Returns by how much the delays of a topic's messages, from stamp to log time, changed.
+
+    None where that is not plain: of few messages, of delays that go up and down, or where the
+    stamps have the hole, too.
+
+    Args:
+        hole: the log times of the last message (of any topic) before it, and of the first after.
+        log_times: of messages up to `STAMPS_BESIDE_NS` from it, ns.
+        stamps: their header stamps, ns.
+    """
+    is_before = log_times <= hole[0]
+    delays = log_times - stamps
+    sides = [delays[is_before], delays[~is_before]]
+    if min(side.size for side in sides) < _FEWEST_STAMPS:
+        return None
+    if max(float(np.percentile(side, 90) - np.percentile(side, 10)) for side in sides) > _ALIKE_NS:
+        return None
+    passed = int(stamps[~is_before].min()) - int(stamps[is_before].max())
+    if not 0 < passed < (hole[1] - hole[0]) // 2:
+        return None
+    before, after = (int(np.median(side)) for side in sides)
+    return after - before
+
+
+def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | None:
+    """Returns the step that a hole is, by `delay_change` of several topics; None if it is none."""
+    if len(changes) < _AGREEING or max(changes) - min(changes) > _ALIKE_NS:
+        return None
+    by = int(np.median(changes))
+    return ClockStep(hole[0], by) if by >= SHORTEST_BY_STAMPS_NS else None
 
 
 def step_over(

@@ -48,6 +48,7 @@ BULKY_TYPES: Final = frozenset(
 )
 """Images and clouds, which have no columns in any file."""
 _BULKY: Final = "images, clouds and the like have no columns"
+_NOT_ASKED: Final = "only times were asked for"
 _DECODED_BYTES: Final = 1 << 20
 """Payloads whose decoded messages are in memory at once."""
 _EVERYTHING: Final = TimeWindow.everything()
@@ -66,6 +67,7 @@ def decoded(
     *,
     topics: Collection[str] | None = None,
     hashed: Callable[[Channel], bool] = never,
+    columns: bool = True,
     group_bytes: int = GROUP_BYTES,
 ) -> Iterator[list[Table]]:
     """Yields the messages of a bag as tables, in groups.
@@ -81,6 +83,8 @@ def decoded(
         window: of log time.
         topics: those to decode; None for all.
         hashed: of which channels the payloads are hashed.
+        columns: whether there are columns; else only the times of all messages, also of those that
+            cannot be decoded.
         group_bytes: how much a group holds, about.
 
     Raises:
@@ -95,7 +99,7 @@ def decoded(
             for channel in reader.channels(path)
             if topics is None or channel.topic in topics
         ]
-        kinds = _Kinds(reader, hashed)
+        kinds = _Kinds(reader, hashed, columns)
         kinds.look_at(channels, path, window)
         bare = {channel.topic for channel in channels}
         bare -= {channel.topic for channel in channels if kinds.of(channel).needs_payloads}
@@ -177,6 +181,7 @@ class _Kinds:
 
     reader: BagReader
     hashed: Callable[[Channel], bool]
+    columns: bool
     # By identity, since hashing a channel hashes its definition.
     _known: dict[int, _Kind] = field(default_factory=dict)
     _bulky: set[str] = field(default_factory=set)
@@ -184,6 +189,8 @@ class _Kinds:
     def look_at(self, channels: Sequence[Channel], path: Path, window: TimeWindow) -> None:
         """Finds the topics of a large file that have large messages, by the newest of each."""
         size = 0
+        if not self.columns:
+            return
         with suppress(OSError):
             size = path.stat().st_size
         if size <= LARGE_FILE_BYTES:
@@ -206,6 +213,8 @@ class _Kinds:
         return known
 
     def _plan(self, channel: Channel) -> tuple[Plan | None, str]:
+        if not self.columns:
+            return None, _NOT_ASKED
         if channel.type in BULKY_TYPES or channel.topic in self._bulky:
             return None, _BULKY
         definition = self.reader.definition(channel)

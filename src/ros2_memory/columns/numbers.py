@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -18,10 +19,10 @@ from ros2_memory.columns.shown import (
     opened,
     placed,
 )
-from ros2_memory.columns.values import Kind, Leaf, Values
+from ros2_memory.columns.values import Kind, Leaf, Made, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Floats, Ints
@@ -40,11 +41,20 @@ class FieldNumbers(NamedTuple):
         numbers: finite; int64 where all are integers that it holds, else float64.
         error: the most by which one of them is off; 0 where they are exact. Angles that are
             computed of exact quaternions may differ by their last digits.
+        errors: the most by which each of them is off, where that differs.
+        exactly: returns the exact numbers at some positions, ascending; None where only the bag
+            has them.
+        least: the exact least number, where it is known without the bag.
+        greatest: the exact greatest number, likewise.
     """
 
     rows: Ints
     numbers: Ints | Floats
     error: float
+    errors: Floats | None = None
+    exactly: Callable[[Ints], Floats] | None = None
+    least: float | None = None
+    greatest: float | None = None
 
 
 def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumbers | None:
@@ -73,10 +83,39 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
         return None
     if not known:
         return FieldNumbers(np.empty(0, np.int64), np.empty(0, np.int64), 0.0)
-    rows = np.concatenate([part.rows for part in known])
-    joined = np.concatenate([part.numbers for part in known])
+    return known[0] if len(known) == 1 else _joined(known)
+
+
+def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
+    rows = np.concatenate([part.rows for part in parts])
+    joined = np.concatenate([part.numbers for part in parts])
     order = np.argsort(rows, kind="stable")
-    return FieldNumbers(rows[order], joined[order], max(part.error for part in known))
+    errors = np.concatenate(
+        [
+            np.full(part.rows.size, part.error) if part.errors is None else part.errors
+            for part in parts
+        ]
+    )
+    ends = np.cumsum([part.rows.size for part in parts])
+
+    def exactly(among: Ints) -> Floats:
+        found = joined[order[among]].astype(np.float64)
+        for part, end in zip(parts, ends.tolist(), strict=True):
+            places = order[among] - (end - part.rows.size)
+            mine = np.flatnonzero((places >= 0) & (places < part.rows.size))
+            if part.exactly is not None and mine.size:
+                found[mine] = part.exactly(places[mine])
+        return found
+
+    is_settled = all(part.exactly is not None or part.error == 0 for part in parts)
+    error = max(part.error for part in parts)
+    return FieldNumbers(
+        rows[order],
+        joined[order],
+        error,
+        errors[order] if error else None,
+        exactly if is_settled else None,
+    )
 
 
 def _number_parts(values: Values, found: Node) -> Iterator[FieldNumbers | None]:
@@ -98,11 +137,24 @@ def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | No
     kept, rows = placed(values, leaf.level, everything, limits, surely=True)
     if len(kept) < len(placed(values, leaf.level, everything, limits, surely=False)[0]):
         return None
-    column = known.values[kept]
+    is_all = len(kept) == len(known.values)
+    column = known.values if is_all else known.values[kept]
     is_finite = np.isfinite(column)
-    column, rows = column[is_finite], rows[is_finite]
+    if not is_finite.all():
+        column, rows, kept = column[is_finite], rows[is_finite], kept[is_finite]
     is_whole = column.dtype.kind in "iu" and not (column > _LARGEST_INT64).any()
-    error = float(np.max(known.error, initial=0.0))
-    if is_whole:
-        return FieldNumbers(rows, column.astype(np.int64), error)
-    return FieldNumbers(rows, column.astype(np.float64), error)
+    found = FieldNumbers(
+        rows,
+        column.astype(np.int64) if is_whole else column.astype(np.float64, copy=False),
+        float(np.max(known.error, initial=0.0)),
+    )
+    if isinstance(known.error, np.ndarray):
+        found = found._replace(errors=known.error[kept])
+    if known.exactly is not None:
+        exactly = known.exactly
+        found = found._replace(exactly=lambda among: exactly(kept[among]))
+    elif found.error and is_all and leaf.made in {Made.STORED, Made.REAL}:
+        zone = values.zone(leaf)
+        if zone is not None and math.isfinite(zone.low) and math.isfinite(zone.high):
+            return found._replace(least=zone.low, greatest=zone.high)
+    return found

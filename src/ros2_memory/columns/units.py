@@ -11,7 +11,7 @@ from ros2_memory.columns.parts import BAG, LOG_TIME, PAYLOAD_HASH, PUBLISH_TIME
 from ros2_memory.core.errors import QueryTimeoutError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -188,6 +188,23 @@ class Rows:
     def last(self) -> Ns:
         """A log time (ns) that none of the rows is later than."""
         return self._unit.last
+
+    @property
+    def span(self) -> tuple[Ns, Ns]:
+        """Log times (ns) of the first and the last row, inclusive."""
+        if self.index is None:
+            return self._unit.first, self._unit.last
+        times = self.times
+        return int(times[0]), int(times[-1])
+
+    def bag_rows(self) -> Iterator[tuple[BagFile, IntArray]]:
+        """Yields each bag with the positions of its rows among those that count, ascending."""
+        numbers = self._unit.bag_numbers()
+        if self.index is not None:
+            numbers = numbers[self.index]
+        bags = self._unit.bags()
+        for number in np.unique(numbers).tolist():
+            yield bags[number], np.flatnonzero(numbers == number)
 
     def bag(self, row: int) -> BagFile:
         """Returns the bag of one of the rows that count."""

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from itertools import groupby
+from itertools import compress, groupby
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
 
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
-from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps, unix_text
+from ros2_memory.history.coverage import (
+    note_edges,
+    note_unread,
+    recorded_reach,
+    recording_gaps,
+    unix_text,
+)
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.results import Bins, Usual
@@ -39,7 +46,10 @@ class BinnedWindow:
     """A window of the memory, cut into bins, to which columns of values are added.
 
     Attributes:
-        window: the part of it that the memory reaches.
+        asked: the whole window.
+        counted: what of it is counted: what the memory reaches, without bags that a wrong clock
+            dated unless it has nothing else, and since when there was time to count.
+        window: the same without the tolerance of its bounds.
         bins: its bins.
         gaps: when nothing was recorded in it.
         elapsed: how much time passed between moments of it.
@@ -52,16 +62,19 @@ class BinnedWindow:
     """
 
     def __init__(self, view: View, asked: TimeWindow, by: By, topics: Sequence[str]) -> None:
-        snapshot = view.snapshot
         self.view = view
         self.asked = asked
         self._by = by
         self._topics = tuple(topics)
         start, end = asked.asked()
-        if snapshot.earliest is not None and snapshot.latest is not None:
-            start, end = max(start, snapshot.earliest), min(end, snapshot.latest)
+        reach = recorded_reach(view.snapshot, asked)
+        if reach is not None:
+            start, end = max(start, reach[0]), min(end, reach[1])
         if end < start:
             raise no_data_between(view, self._topics, asked)
+        self.counted = asked
+        if reach is not None:
+            self.counted = asked.intersect(TimeWindow(reach[0], reach[1] + 1))
         # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
         self.window = TimeWindow(start, max(end, start + 1))
         self.bins: TimeBins = (
@@ -74,9 +87,7 @@ class BinnedWindow:
         self.usual_exit: Usual | None = None
         self.gaps = list(recording_gaps(view, self.window))
         self.elapsed = elapsed_in(view, self.window)
-        recorded = self._lengths([self._ends]) - self._lengths(self.gaps)
-        total = self._total([self._ends]) - self._total(self.gaps)
-        self.add("recorded_s", "duration", recorded.tolist(), total)
+        self._since: Ns | None = None
 
     def add(self, name: str, kind: BinColumn, values: Values, whole: float | None) -> None:
         """Adds a column, and its value for all bins together."""
@@ -88,7 +99,7 @@ class BinnedWindow:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
         spans = [
             (each.first, each.last)
-            for each in self.view.stream.overlapping_bags(topics, self.window)
+            for each in self.view.stream.overlapping_bags(topics, self.counted)
         ]
         pause = 2 * _split_ns(self.view)
         heard: list[tuple[Ns, Ns]] = []
@@ -110,8 +121,9 @@ class BinnedWindow:
 
     def add_held(self, held: TrueIntervals) -> None:
         """Adds how often something began, how long it held, and its first and last time."""
-        starts, stops = held.starts.clip(*self._ends), held.stops.clip(*self._ends)
-        begins = starts[held.begun]
+        inside = (held.stops >= self.counted.start) & (held.starts < self.counted.stop)
+        starts, stops = (some[inside].clip(*self._ends) for some in (held.starts, held.stops))
+        begins = starts[held.begun[inside]]
         self.add_counts("count", begins)
         self.add_lengths(
             "seconds", "duration", list(zip(starts.tolist(), stops.tolist(), strict=True))
@@ -162,7 +174,7 @@ class BinnedWindow:
 
     def _lengths(self, spans: Sequence[tuple[Ns, Ns]]) -> NDArray[np.int64]:
         """Returns how much time (ns) of half-open spans passed in each bin."""
-        starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
+        starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._ends)
         lengths = self.bins.lengths(starts, stops)
         for skipped in self.elapsed.skipped:
             lengths -= self.bins.lengths(starts.clip(*skipped), stops.clip(*skipped))
@@ -176,12 +188,18 @@ class BinnedWindow:
 
     @property
     def _ends(self) -> tuple[Ns, Ns]:
-        return self.window.start, self.window.stop
+        start = self.window.start if self._since is None else max(self.window.start, self._since)
+        return start, max(start, self.window.stop)
 
-    def note_since(self, since: Ns | None) -> None:
-        """Notes that what is before a moment was not counted, if there is one."""
+    def count_since(self, since: Ns | None) -> None:
+        """Leaves out what is before a moment, and notes that it was not counted, if there is one.
+
+        To be called before columns are added.
+        """
         if since is None:
             return
+        self._since = since
+        self.counted = self.counted.intersect(TimeWindow(since, MAX_NS))
         self.view.notes.complete = False
         self.view.notes.add(
             f"only what is after {unix_text(since)} is counted: "
@@ -189,15 +207,28 @@ class BinnedWindow:
             "ask about a shorter window"
         )
 
+    def _add_recorded(self) -> None:
+        """Adds how long something was recorded, as the first column."""
+        recorded = self._lengths([self._ends]) - self._lengths(self.gaps)
+        total = self._total([self._ends]) - self._total(self.gaps)
+        self._columns.insert(0, ("recorded_s", "duration"))
+        self._values.insert(0, recorded.tolist())
+        self._all.insert(0, total)
+
     def answer(self) -> Bins:
         """Returns the answer, with notes on what could not be read."""
+        self._add_recorded()
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
         columns = zip(*self._values, strict=True)
         rows = [*zip(self.bins.names, columns, strict=True)]
         empty = [not any(values) for _, values in rows]
+        if self._since is not None:
+            is_late = self.bins.edges[1:] > self._since
+            counted: list[bool] = np.any(self.bins.member[is_late], axis=0).tolist()
+            rows, empty = [*compress(rows, counted)], [*compress(empty, counted)]
         if self._by != "place":
-            self._note_empty(empty)
+            self._note_empty(empty, [name for name, _ in rows])
             rows = [row for row, is_empty in zip(rows, empty, strict=True) if not is_empty]
         return Bins(
             by=self._by,
@@ -212,13 +243,14 @@ class BinnedWindow:
             notes=self.view.notes.sentences(),
         )
 
-    def _note_empty(self, empty: Sequence[bool]) -> None:
+    def _note_empty(self, empty: Sequence[bool], names: Sequence[str]) -> None:
         """Notes the bins in which nothing was recorded: several in a row by the first and last."""
         spans: list[str] = []
-        for is_empty, some in groupby(zip(empty, self.bins.names, strict=True), lambda e: e[0]):
-            names = [name for _, name in some]
+        for is_empty, some in groupby(zip(empty, names, strict=True), lambda row: row[0]):
+            of_span = [name for _, name in some]
             if is_empty:
-                spans.append(names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}")
+                one = len(of_span) == 1
+                spans.append(of_span[0] if one else f"{of_span[0]} to {of_span[-1]}")
         if spans:
             more = len(spans) - _MOST_SPANS
             shown = ", ".join(spans[:_MOST_SPANS]) + (f" and {more} more" if more > 0 else "")

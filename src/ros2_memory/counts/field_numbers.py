@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -16,16 +17,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder
-from ros2_memory.analysis.field_ranges import FieldRangesBuilder
+from ros2_memory.analysis.conditions import leaves
 from ros2_memory.analysis.payload_templates import template_for
-from ros2_memory.catalogue.field_columns import encode_field_ranges, field_column
 from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.counts.segment_fold import Digested, SegmentFold
-from ros2_memory.history.bag_groups import DigestKind, store_shared
-from ros2_memory.insights.field_extremes import numbers_in
+from ros2_memory.counts.segment_fold import SegmentFold
+from ros2_memory.history.bag_groups import DigestKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,9 +34,10 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.segment_fold import Folded
-    from ros2_memory.history.bag_groups import Group, Span
+    from ros2_memory.counts.segment_fold import Digested, Folded
+    from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Record
@@ -47,8 +47,9 @@ _Sample: TypeAlias = tuple[list[float], ...]
 """The numbers of each field in one message."""
 
 _MOST_AT_ONCE: Final = 1024
-_ONE_BY_ONE: Final = 64
-"""Groups of several bags that are looked up one by one; then all are read."""
+_LARGEST: Final = sys.float_info.max
+_SUMMARY: Final = frozenset({"bytes", "numbers"})
+"""The keys of a summary in place of numbers that are too many to show."""
 
 
 class FieldNumbers(NamedTuple):
@@ -107,8 +108,6 @@ class FieldReader:
         )
         self._kind = f"numbers {json.dumps(self._fields)}"
         self.failures: list[UndecodableError] = []
-        self._shared: dict[tuple[int, ...], Digested[Numbers]] | None = None
-        self._asked = 0
         self._decoder = BulkDecoder(self._decode, self._template, self._apply)
 
     def over(self, window: TimeWindow, edges: Sequence[Ns]) -> Folded[NumberTable]:
@@ -126,47 +125,8 @@ class FieldReader:
             edges=edges,
             cut_ns=0,
             failures=self.failures,
-            unread=self._of_shared,
-            question="by ranges",
         )
         return fold.over(self._view, self._topic, window)
-
-    def _of_shared(self, group: Group) -> Digested[Numbers] | None:
-        """Returns the numbers of recordings that overlap, by what `store_shared_ranges` stored."""
-        if group.may_be_relatched or len(group.bags) < 2:
-            return None
-        bags, question = self._view.bags, f"{_SHARED.name} {self._topic}"
-        entries = bags.entry_numbers(group.bags)
-        if entries is None:
-            return None
-        key = tuple(entries)
-        self._asked += 1
-        # Where few are asked for, as at the ends of a window, the others need not be decoded.
-        if self._shared is None and self._asked <= _ONE_BY_ONE:
-            answer = bags.cached_answer(question, group.bags, str)
-            return None if answer is None else self._of_answers({key: answer}).get(key)
-        if self._shared is None:
-            self._shared = self._of_answers(bags.cached_answers(question))
-        return self._shared.get(key)
-
-    def _of_answers(
-        self, answers: Mapping[tuple[int, ...], str]
-    ) -> dict[tuple[int, ...], Digested[Numbers]]:
-        keys: list[tuple[int, ...]] = []
-        spans: list[Span] = []
-        rows: list[tuple[int, str, bytes]] = []
-        for key, answer in answers.items():
-            try:
-                packed, first, last = json.loads(answer)
-                text, ranges = _SHARED.decode(bytes.fromhex(packed))
-                field_column([(0, text, ranges)], "")
-            except (ValueError, TypeError, LookupError, AttributeError):
-                continue  # a damaged file can hold anything
-            rows.append((len(keys), text, ranges))
-            keys.append(key)
-            spans.append((int(first), int(last)))
-        found = _numbers_of([field_column(rows, field) for field in self._fields])
-        return {keys[at]: Digested(numbers, *spans[at]) for at, numbers in found.items()}
 
     def between(self, first: Ns, last: Ns) -> Numbers | None:
         """Returns the numbers between two log times (inclusive); None without a message."""
@@ -242,6 +202,17 @@ class FieldReader:
         )
 
 
+def numbers_in(value: JsonValue) -> Iterator[float]:
+    """Yields the numbers of a field; not those of a summary in place of an array."""
+    if isinstance(value, dict) and value.keys() <= _SUMMARY:
+        return  # its numbers are counts, not the field's values
+    for leaf in leaves(value):
+        if isinstance(leaf, bool) or not isinstance(leaf, int | float):
+            continue
+        if -_LARGEST <= leaf <= _LARGEST:
+            yield leaf
+
+
 def _numbers_of(columns: Sequence[FieldColumn]) -> dict[int, Numbers]:
     """Returns, by entry, the numbers of all fields, where the sums of all are known."""
     found: dict[int, list[FieldNumbers]] = {}
@@ -260,53 +231,6 @@ def _numbers_of(columns: Sequence[FieldColumn]) -> dict[int, Numbers]:
     return {number: tuple(each) for number, each in found.items() if len(each) == len(columns)}
 
 
-def store_shared_ranges(view: View, topic: str, window: TimeWindow) -> int:
-    """Stores the ranges of all fields in recordings that overlap; returns of how many groups."""
-    return store_shared(view, topic, _SHARED, partial(_collected, view), window)
-
-
-def _collected(
-    view: View, messages: Iterable[StoredMessage]
-) -> tuple[tuple[str, bytes] | None, Span | None]:
-    """Returns the encoded ranges of messages, and the first and the last of their times."""
-    builder = FieldRangesBuilder()
-    reader, extractor = view.memory.reader, view.memory.extractor
-
-    def decode(record: Record) -> None:
-        builder.add(extractor.exact(reader.decode(record), record.channel.type))
-
-    def template(record: Record, _: None) -> PayloadTemplate | None:
-        return template_for(reader, extractor, record)
-
-    def apply(
-        template: PayloadTemplate, _: None, records: Sequence[Record], rows: Bytes
-    ) -> list[None]:
-        builder.add_rows(template, rows)
-        return [None] * len(records)
-
-    decoder = BulkDecoder(decode, template, apply)
-    times: list[Ns] = []
-    rest = iter(messages)
-    while some := list(islice(rest, _MOST_AT_ONCE)):
-        times += [each.time for each in some]
-        if any(decoder.decode([each.record for each in some])):
-            builder.give_up()
-    if not times:
-        return None, None
-    return encode_field_ranges(builder.ranges()), (times[0], times[-1])
-
-
-def _encoded_ranges(ranges: tuple[str, bytes]) -> bytes:
-    return b"\n".join((ranges[0].encode("utf-8", "surrogatepass"), ranges[1]))
-
-
-def _decoded_ranges(packed: bytes) -> tuple[str, bytes]:
-    text, _, ranges = packed.partition(b"\n")
-    return text.decode("utf-8", "surrogatepass"), ranges
-
-
-_SHARED: Final = DigestKind("ranges", lambda *_: {}, _encoded_ranges, _decoded_ranges)
-"""The ranges of all fields of recordings that overlap; single bags have digests of their own."""
 _AT_FIRST: Final[Ns] = -1
 """Means the time of the first message, which `_table` inserts."""
 

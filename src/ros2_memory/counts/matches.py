@@ -83,19 +83,19 @@ def count_matches(
     asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest)))
     topics = matching_topics(view, topic)
     binned = BinnedWindow(view, asked, by, topics)
-    binned.add_heard("topic_s", topics)
-    note_robots_on(view, topics, asked)
-    held = None
+    note_robots_on(view, topics, binned.counted)
+    held, since = None, None
     # Events have labels without scores.
     by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
     alone = where is None and during is None and len(topics) == 1
     if alone and by_events:
         held, since = _by_events(binned, topics[0], condition, value)
-        binned.note_since(since if held is not None else None)
     if held is None:
-        spans, since = read_sightings(view, topic, condition, Scope(view, asked, where, during))
+        scope = Scope(view, binned.counted, where, during)
+        spans, since = read_sightings(view, topic, condition, scope)
         held = TrueIntervals.of([(first, last, True) for first, last in spans])
-        binned.note_since(since)
+    binned.count_since(since)
+    binned.add_heard("topic_s", topics)
     binned.add_held(held)
     return binned.answer()
 
@@ -114,7 +114,7 @@ def _by_events(
     if wanted is None and (condition.field is not None or not isinstance(value, str)):
         return None, None
     label = condition if wanted is None else None
-    folded = _events(view, topic, binned.asked, label)
+    folded = _events(view, topic, binned.counted, label)
     _note_limits(view, topic, folded)
     if wanted is not None:
         return _flag_held(folded, condition, _gaps_of(binned, topic), wanted=wanted), folded.since
@@ -254,7 +254,7 @@ def _spans_of(
 
 def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     """Returns the gaps in the recording, each until the first message of a topic after it."""
-    firsts = [each.first for each in binned.view.stream.overlapping_bags([topic], binned.asked)]
+    firsts = [each.first for each in binned.view.stream.overlapping_bags([topic], binned.counted)]
     return [
         (begin, min((each for each in firsts if each >= begin), default=end))
         for begin, end in binned.gaps

@@ -6,24 +6,28 @@ import math
 from bisect import bisect_right
 from functools import partial
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
+from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
 from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.bag_fold import shares_of
+from ros2_memory.history.counting import Counted, count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
+from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import open_span
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from typing import TypeAlias
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
@@ -66,6 +70,7 @@ def count_range(
             f"{len(names)} fields by {by} in {size} bins are too many for one reply: "
             "name fewer fields, or ask about a shorter window"
         )
+    numbers = _numbers(view, name, binned, names) if names else None
     counts, first, last = _counted(view, name, binned)
     if not counts.any():
         raise no_data_between(view, (name,), asked)
@@ -74,8 +79,9 @@ def count_range(
     held = [counts.astype(bool) & each for each in member.T]
     binned.add("first", "time", [_extreme(first[each], min) for each in held], first.min())
     binned.add("last", "time", [_extreme(last[each], max) for each in held], last.max())
-    if names:
-        _add_numbers(view, name, binned, names)
+    for field, cells in zip(names, numbers or (), strict=True):
+        _add_columns(binned, field, cells)
+    note_robots(view, name, binned.counted)
     return binned.answer()
 
 
@@ -85,59 +91,63 @@ def _extreme(times: Times, which: Callable[[Iterable[Ns]], Ns]) -> Ns | None:
 
 def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times, Times]:
     """Returns for each piece how many messages it holds, and when the first and the last came."""
-    edges = binned.bins.edges[1:-1].tolist()
+    edges = binned.bins.edges[1:-1]
     size = len(binned.bins.member)
     counts, first, last = [0] * size, [MAX_NS] * size, [MIN_NS] * size
-    for share in shares_of(view, topic, binned.asked):
-        view.bags.check_deadline()
-        for held in _held(view, topic, share, binned.asked, edges):
-            piece = bisect_right(edges, held.first)
-            counts[piece] += held.messages
-            first[piece] = min(first[piece], held.first)
-            last[piece] = max(last[piece], held.last)
+    of_columns = view.memory.columns is not None
+    count = count_messages if of_columns else _counted_by_shares
+    for counted in count(view, topic, binned.counted, edges):
+        counts[counted.piece] += counted.messages
+        first[counted.piece] = min(first[counted.piece], counted.first)
+        last[counted.piece] = max(last[counted.piece], counted.last)
     return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
 
 
-class _Held(NamedTuple):
-    """How many messages were recorded between two times, both of messages."""
-
-    messages: int
-    first: Ns
-    last: Ns
+def _counted_by_shares(
+    view: View, topic: str, window: TimeWindow, edges: Times
+) -> Iterator[Counted]:
+    """Does as `count_messages` where there are no columns: in a lake."""
+    for share in shares_of(view, topic, window):
+        view.bags.check_deadline()
+        yield from _held(view, topic, share, window, edges.tolist())
 
 
 def _held(
     view: View, topic: str, share: Share, window: TimeWindow, edges: Sequence[Ns]
-) -> Sequence[_Held]:
+) -> Sequence[Counted]:
     """Returns the messages of a share between edges; remembered where a window covers the share."""
     digests = view.bags.digests_of(share.segment)
     inner = tuple(edge for edge in edges if share.first < edge <= share.last)
+    begin = bisect_right(edges, share.first)
     if digests is None or not share.is_covered_by(window):
-        return _counted_in(view, topic, share, window, inner)
+        return _counted_in(view, topic, share, window, edges)
     # A list of none or one: what cannot be read now is counted again.
-    known: list[Sequence[_Held]] = digests.derived(f"counts {topic} {inner} {share.key}", list)
-    if known:
-        return known[0]
-    with view.notes.isolated():
-        found = _counted_in(view, topic, share, window, inner)
-        if view.notes.complete:
-            known.append(found)
-    return found
+    known: list[Sequence[Counted]] = digests.derived(f"counts {topic} {inner} {share.key}", list)
+    if not known:
+        with view.notes.isolated():
+            found = _counted_in(view, topic, share, window, inner)
+            if view.notes.complete:
+                known.append(found)
+    else:
+        found = [*known[0]]
+    return [counted._replace(piece=begin + counted.piece) for counted in found]
 
 
 def _counted_in(
     view: View, topic: str, share: Share, window: TimeWindow, edges: Sequence[Ns]
-) -> list[_Held]:
+) -> list[Counted]:
     """Counts the messages of a share between edges.
 
     Messages are read where recordings overlap; the times of messages where a bag lies on both
     sides of an edge.
     """
-    found: dict[int, _Held] = {}
+    found: dict[int, Counted] = {}
 
     def add(piece: int, count: int, first: Ns, last: Ns) -> None:
-        known = found.get(piece, _Held(0, first, last))
-        found[piece] = _Held(known.messages + count, min(known.first, first), max(known.last, last))
+        known = found.get(piece, Counted(piece, 0, first, last))
+        found[piece] = Counted(
+            piece, known.messages + count, min(known.first, first), max(known.last, last)
+        )
 
     def is_uncut(group: Group) -> bool:
         begin, end = (bisect_right(edges, at) for at in (group.first, group.last))
@@ -155,20 +165,57 @@ def _counted_in(
     return [*found.values()]
 
 
-def _add_numbers(view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]) -> None:
-    reader = FieldReader(view, topic, fields)
-    folded = reader.over(binned.asked, binned.bins.edges[1:-1].tolist())
-    binned.note_since(folded.since)
-    if reader.failures:
+def _numbers(
+    view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]
+) -> list[Sequence[_Cell | None]]:
+    """Returns for each field the numbers in each bin, and in all of them together."""
+    if view.memory.columns is None:
+        return _numbers_by_shares(view, topic, binned, fields)
+    found = PieceNumbers(view, topic, fields, binned.bins.edges[1:-1])
+    found.collect(binned.counted)
+    binned.count_since(found.since)
+    _note_failures(view, found.failures)
+    pieces = [np.flatnonzero(member).tolist() for member in binned.bins.member.T]
+    pieces.append([*range(len(binned.bins.member))])
+    return [[_cell(found, field, some) for some in pieces] for field in range(len(fields))]
+
+
+def _cell(found: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | None:
+    """Returns the numbers of a field in some pieces; None if there are none."""
+    parts = [part for piece in pieces for part in found.parts(field, piece)]
+    least = found.extreme(field, pieces, LEAST)
+    greatest = found.extreme(field, pieces, GREATEST)
+    if least is None or greatest is None:
+        return None
+    mean = _mean(math.fsum(part.total for part in parts), sum(part.size for part in parts))
+    return _Cell(mean, (least[0] + 0.0, least[1]), (greatest[0] + 0.0, greatest[1]))
+
+
+def _mean(total: float, count: int) -> float:
+    # Plus 0.0: no reply says -0.0.
+    return float(f"{total / count:.{_MEAN_DIGITS}g}") + 0.0
+
+
+def _note_failures(view: View, failures: Sequence[UndecodableError]) -> None:
+    if failures:
         view.notes.complete = False
-        reason = reader.failures[0].reason
+        reason = failures[0].reason
         view.notes.add(f"messages left out, since they cannot be decoded: {reason}")
+
+
+def _numbers_by_shares(
+    view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]
+) -> list[Sequence[_Cell | None]]:
+    """Does as `_numbers` where there are no columns: in a lake."""
+    reader = FieldReader(view, topic, fields)
+    folded = reader.over(binned.counted, binned.bins.edges[1:-1].tolist())
+    binned.count_since(folded.since)
+    _note_failures(view, reader.failures)
     firsts = [at for part in folded.parts for at in part.first]
     among = binned.bins.among(firsts)
     rows = [np.flatnonzero(each) for each in (*among.T, np.ones(len(firsts), np.bool_))]
     extremes = _Extremes(reader, folded.parts)
-    for at, field in enumerate(fields):
-        _add_columns(binned, field, [extremes.cell(at, each.tolist()) for each in rows])
+    return [[extremes.cell(at, some.tolist()) for some in rows] for at in range(len(fields))]
 
 
 class _Cell:
@@ -197,8 +244,7 @@ class _Extremes:
         total = math.fsum(self._numbers[row][field].total for row in some)
         least = self._furthest(field, some, 1)
         most = self._furthest(field, some, -1)
-        # Plus 0.0: digests do not know -0.0.
-        mean = float(f"{total / count:.{_MEAN_DIGITS}g}")
+        mean = _mean(total, count)
         return _Cell(mean, (least[0] + 0.0, least[1]), (0.0 - most[0], most[1]))
 
     def _furthest(self, field: int, rows: Sequence[int], sign: int) -> tuple[float, Ns]:

@@ -84,7 +84,7 @@ def count_path(
         edges=edges,
         failures=failures,
     )
-    folded = fold.over(view, name, asked)
+    folded = fold.over(view, name, binned.counted)
     if not folded.parts:
         if failures:
             raise with_notes(view, asked, undecodable(failures[0]))
@@ -94,10 +94,10 @@ def count_path(
         view.notes.add(
             f"poses left out, since they cannot be decoded: {len(failures)} ({failures[0].reason})"
         )
+    binned.count_since(folded.since)
     metres = _joined(folded.parts, binned.bins.edges, fastest)
     totals = metres @ binned.bins.member
     binned.add("metres", "metres", totals.tolist(), float(metres.sum()))
-    binned.note_since(folded.since)
     require_one_robot(view, name, asked)
     return binned.answer()
 

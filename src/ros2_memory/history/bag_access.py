@@ -264,10 +264,13 @@ class BagAccess:
                 self.call.stages.add("read", spent)
                 spent = 0
 
-    def tables(self, bag: BagFile, topic: str, *, hashed: bool) -> Iterator[Table]:
+    def tables(
+        self, bag: BagFile, topic: str, *, hashed: bool, columns: bool = True
+    ) -> Iterator[Table]:
         """Yields one bag's messages of a topic as tables; a note reports what cannot be read.
 
         With `hashed` they have the hashes of all payloads, else those of latched channels alone.
+        Without `columns` they have times, and rows for messages that cannot be decoded, too.
         """
         self.check_deadline()
         part = _indexed_part(bag, TimeWindow.everything())
@@ -277,6 +280,7 @@ class BagAccess:
             part,
             topics=[topic],
             hashed=lambda channel: hashed or channel.latched,
+            columns=columns,
         )
         while True:
             try:

@@ -53,6 +53,7 @@ class Group:
 
     Attributes:
         bags: in order.
+        window: what of them is asked for.
         first: log time of the first message of the bags, in the window or not.
         last: of the last one.
         may_be_relatched: whether bags outside of the group decide which of the messages count.
@@ -70,7 +71,7 @@ class Group:
     ) -> None:
         self._stream = stream
         self._topic = topic
-        self._window = window
+        self.window = window
         self.bags = bags
         self.first = min(each.first for each in bags)
         self.last = max(each.last for each in bags)
@@ -83,7 +84,7 @@ class Group:
     @property
     def is_inside(self) -> bool:
         """Whether all messages of the bags lie in the window."""
-        return all(self._window.covers(each.first, each.last) for each in self.bags)
+        return all(self.window.covers(each.first, each.last) for each in self.bags)
 
     @property
     def is_whole(self) -> bool:
@@ -92,11 +93,11 @@ class Group:
 
     def of(self, bag: BagSpan) -> Group:
         """Returns one bag of it as a group."""
-        return Group(self._stream, self._topic, self._window, [bag])
+        return Group(self._stream, self._topic, self.window, [bag])
 
     def messages(self) -> Iterator[StoredMessage]:
         """Returns the messages of the group in log-time order, each one once."""
-        return self._stream.messages([self._topic], self._window, among=self.bags)
+        return self._stream.messages([self._topic], self.window, among=self.bags)
 
     def count(self) -> int:
         """Returns how many messages of the window the group holds."""
@@ -146,7 +147,7 @@ class Group:
         """Returns the log times of the messages, in order, where none has a duplicate."""
         if len(self.bags) > 1:
             return [each.time for each in self._positions()]
-        return sorted(self._stream.bags.log_times(self.bags[0].bag, self._topic, self._window))
+        return sorted(self._stream.bags.log_times(self.bags[0].bag, self._topic, self.window))
 
     def _positions(self) -> list[MessagePosition]:
         if self._known_positions is None:
@@ -154,7 +155,7 @@ class Group:
                 MessagePosition(time, rank, nth)
                 for rank, each in enumerate(self.bags)
                 for time, equal in groupby(
-                    self._stream.bags.log_times(each.bag, self._topic, self._window)
+                    self._stream.bags.log_times(each.bag, self._topic, self.window)
                 )
                 for nth, _ in enumerate(equal)
             )

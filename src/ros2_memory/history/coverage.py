@@ -471,6 +471,24 @@ def why_nothing(when: str, *, deleted: bool) -> str:
     return f"nothing was recorded {when}"
 
 
+def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | None:
+    """Returns the first and the last moment of what the memory has that a window can show.
+
+    Without bags that a wrong clock dated, unless the window has nothing else. None without a bag.
+    """
+    if snapshot.earliest is None or snapshot.latest is None:
+        return None
+    reach = snapshot.earliest, snapshot.latest
+    if window.overlaps(*reach):
+        return reach
+    faulty = [
+        fault.bag for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
+    ]
+    if not faulty:
+        return reach
+    return min(bag.start for bag in faulty), max(bag.end for bag in faulty)
+
+
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
     """Yields where nothing was recorded, by `Snapshot.gaps`; of a window, the parts in it.
 

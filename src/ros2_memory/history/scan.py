@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ros2_memory.columns.scan import Asked, Scanner
+from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import IntArray
 
 
 def scan(
@@ -22,12 +27,16 @@ def scan(
     window: TimeWindow,
     *,
     newest_first: bool = False,
+    columns: bool = True,
+    copies: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `Scanner.rows`.
 
     What cannot be read is noted. `reached` is called before each table with a log time that what
-    is left does not lie behind (with `newest_first`: is not later than).
+    is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
+    times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
+    a message counts in each recording that holds it.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -35,7 +44,7 @@ def scan(
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed)
+        return view.bags.tables(bag, topic, hashed=hashed, columns=columns)
 
     def check(at: Ns) -> None:
         reached(at)
@@ -46,8 +55,26 @@ def scan(
         window,
         view.snapshot.timeline,
         decode,
-        shared=view.stream.duplicate_spans(topic, window),
-        relatches=view.stream.may_be_relatched([topic]),
+        shared=() if copies else view.stream.duplicate_spans(topic, window),
+        relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )
     return scanner.rows(asked, newest_first=newest_first)
+
+
+def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
+    """Yields the messages of some rows, read from their bags: bag after bag, in log-time order."""
+    times, channel = rows.times, rows.table.channel
+    for bag, positions in rows.bag_rows():
+        wanted = times[positions]
+        window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
+        left = dict(zip(*_counted(wanted), strict=True))
+        for found in view.bags.read(bag, [channel.topic], window):
+            if left.get(found.time, 0) and found.record.channel.type == channel.type:
+                left[found.time] -= 1
+                yield found
+
+
+def _counted(times: IntArray) -> tuple[list[Ns], list[int]]:
+    values, counts = np.unique(times, return_counts=True)
+    return values.tolist(), counts.tolist()

@@ -11,9 +11,11 @@ import json
 from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
+
+import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
@@ -33,16 +35,19 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import bag_overlaps, deduplicate_forward
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import only_pose_topic, require_bags
+from ros2_memory.history.scan import scan
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.columns.units import Rows
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Sessions
     from ros2_memory.index.timeline import Timeline
+    from ros2_memory.storage.base import IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +98,46 @@ class View:
         except where recordings overlap or latched messages may have been received again.
         """
         groups = groups_of(self.stream, topic, window)
-        sizes = [self.count_in(topic, group) for group in groups]
+        merged = {
+            group: self._times_in(topic, group)
+            for group in groups
+            if group.has_duplicates and self.memory.columns is not None
+        }
+        sizes = [
+            merged[group].size if group in merged else self.count_in(topic, group)
+            for group in groups
+        ]
         indices = evenly(sum(sizes), at_most)
         chosen: list[StoredMessage] = []
         begin = 0
         for group, size in zip(groups, sizes, strict=True):
             inside = indices[bisect_left(indices, begin) : bisect_left(indices, begin + size)]
-            chosen.extend(group.fetch([index - begin for index in inside]))
+            wanted = [index - begin for index in inside]
+            if group in merged:
+                chosen.extend(self._fetch(topic, merged[group], wanted))
+            else:
+                chosen.extend(group.fetch(wanted))
             begin += size
         return sum(sizes), chosen
+
+    def _fetch(
+        self, topic: str, times: IntArray, indices: Sequence[int]
+    ) -> Iterator[StoredMessage]:
+        """Yields the messages at some indices (ascending) of all that have these times."""
+        for time, positions in groupby(indices, key=lambda index: int(times[index])):
+            numbers = {index - int(np.searchsorted(times, time)) for index in positions}
+            at_once = self.stream.messages([topic], TimeWindow(time, time + 1))
+            yield from (found for nth, found in enumerate(at_once) if nth in numbers)
+
+    def _times_in(self, topic: str, group: Group) -> IntArray:
+        """Returns the log times of the messages of a group, in order, each message once."""
+        files = {span.bag.file for span in group.bags}
+        part = group.window.intersect(TimeWindow(group.first, group.last + 1))
+        parts = [np.empty(0, np.int64)]
+        for rows in scan(self, topic, part, columns=False):
+            # Splits that follow each other in another group may share a time with this one.
+            parts += [rows.times[some] for bag, some in rows.bag_rows() if bag.file in files]
+        return np.sort(np.concatenate(parts))
 
     def count_in(self, topic: str, group: Group) -> int:
         """Returns how many messages of the window a group of the topic's bags holds.
@@ -110,6 +146,8 @@ class View:
         twice: only what it does not know is read. Where it counted nothing twice, the messages of
         the group are found without reading all of them.
         """
+        if group.has_duplicates and self.memory.columns is not None:
+            return self._times_in(topic, group).size
         if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
             return group.count()
         files = {each.bag.file for each in group.bags}
@@ -160,6 +198,8 @@ class View:
 
     def _census(self, topic: str) -> dict[str, Census]:
         everything = TimeWindow.everything()
+        if self.memory.columns is not None and self.stream.may_be_relatched([topic]):
+            return _tallied_rows(scan(self, topic, everything, columns=False))
         counted = {
             type_name: Census(*stated)
             for type_name, stated in self.snapshot.timeline.totals(topic).items()
@@ -180,12 +220,16 @@ class View:
 
     def _overlap_census(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
         """Returns, by type, the messages stored in overlapping bags, and those that count."""
+        if self.memory.columns is not None:
+            once = _tallied_rows(scan(self, topic, window, columns=False))
+            stored = _tallied_rows(scan(self, topic, window, columns=False, copies=True))
+            return {type_name: (stored[type_name], once[type_name]) for type_name in once}
         bags = self.stream.overlapping_bags([topic], window)
         question = f"overlap {topic} {window.start:x} {window.stop - window.start:x}"
         known = self.bags.cached_answer(question, bags, partial(_decode_overlap, window.start))
         if known is not None:
             return known
-        stored: dict[str, Census] = {}
+        stored = {}
         everywhere = [(window.start, window.stop)]
         with self.notes.isolated():
             merged = self.stream.merged(bags, [topic], window, newest_first=False)
@@ -217,6 +261,19 @@ def _decode_overlap(start: Ns, answer: str) -> dict[str, tuple[Census, Census]]:
 
 def _census_from(start: Ns, first: Ns, last: Ns, count: int) -> Census:
     return Census(start + first, start + last, count)
+
+
+def _tallied_rows(found: Iterable[Rows]) -> dict[str, Census]:
+    """Returns a census by message type of rows in any order."""
+    counted: dict[str, Census] = {}
+    for rows in found:
+        first, last = rows.span
+        type_name = rows.table.channel.type
+        known = counted.get(type_name, Census(first, last, 0))
+        counted[type_name] = Census(
+            min(known.first, first), max(known.last, last), known.count + len(rows)
+        )
+    return counted
 
 
 def _counted(messages: Iterable[StoredMessage]) -> dict[str, Census]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.clock_steps import SHORTEST_STEP_NS
+from ros2_memory.analysis.clock_steps import SHORTEST_BY_STAMPS_NS
 from ros2_memory.analysis.silences import usual_period
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 _MOST_TOPICS: Final = 4
 _FREQUENT_NS: Final[Ns] = 1200 * NS_PER_MS
-_LACKING_NS: Final[Ns] = 1500 * NS_PER_MS
-"""Messages of so much time are missing: a step of the clock less a period and its jitter."""
+_LACKING_NS: Final[Ns] = 400 * NS_PER_MS
+"""Messages of so much time are missing: a step of the clock less its jitter."""
 _UNSTEADY: Final = 0.01
 """A rate may differ by this share of a bag's length without anything missing."""
 _PARTS_OF_AN_OCTAVE: Final = 64
@@ -152,7 +152,7 @@ def between(bags: Sequence[BagFile], rates: Rates) -> Iterator[SuspectedHole]:
     published has holes all along.
     """
     for before, after in pairwise(bags):
-        if after.start - before.end < SHORTEST_STEP_NS:
+        if after.start - before.end < SHORTEST_BY_STAMPS_NS:
             continue
         if _follows(before, after) and _is_cut(before, after, rates):
             yield SuspectedHole(before.end, after.start)

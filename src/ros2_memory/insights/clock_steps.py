@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.clock_steps import (
     BESIDE_NS,
     SHORTEST_STEP_NS,
+    STAMPS_BESIDE_NS,
     ClockStep,
     Elapsed,
+    delay_change,
     holes,
+    step_by_delays,
     step_over,
 )
 from ros2_memory.analysis.motion.odometry import GAP_PERIODS, TimedPosition, is_place
+from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -27,10 +34,12 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import add_poses
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
+from ros2_memory.history.scan import scan
 from ros2_memory.index.clock_faults import FaultyClock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import BagFile, Pose
@@ -38,16 +47,22 @@ if TYPE_CHECKING:
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import SuspectedHole
+    from ros2_memory.storage.base import IntArray
 
 _MOST_SUSPECTS: Final = 32
 """The newest suspected holes are looked at; each costs some milliseconds."""
 _MOST_TOPICS: Final = 32
+_MOST_STAMPED: Final = 8
+"""Topics of which header stamps are looked at."""
+_STAMP: Final = "header.stamp"
 
 
 def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep, ...]:
-    """Returns when the clock was set by 2 s or more (in a window), in order of time.
+    """Returns when the clock was set (in a window), in order of time.
 
-    Back by the order of log times, forward where the robot drove through the step.
+    Back by 2 s or more by the order of log times. Forward where no message of a recording was
+    logged for a while: by 2 s or more where the robot drove through that, by 0.5 s or more where
+    header stamps of two topics go on in their cadence.
     """
     window = TimeWindow.everything() if window is None else window
     return tuple(each for each in _steps_around(view, window) if window.contains(each.at))
@@ -133,20 +148,21 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         view.notes.add("steps of the clock inside of a bag are not seen in the lake")
     if suspects:
         try:
-            topic = resolve_pose_topic(view)
+            topic: str | None = resolve_pose_topic(view)
         except NoDataError:
-            suspects = []
+            topic = None
         for suspect in suspects[-_MOST_SUSPECTS:]:
             steps += _steps_in(view, topic, suspect)
     return sorted(steps)
 
 
-def _steps_in(view: View, topic: str, suspect: SuspectedHole) -> Sequence[ClockStep]:
+def _steps_in(view: View, topic: str | None, suspect: SuspectedHole) -> Sequence[ClockStep]:
     """Returns the steps in a suspected hole, by its bags or by what the catalogue has of them."""
     around = TimeWindow(suspect.first, suspect.last + 1).widened(BESIDE_NS)
-    topics = [topic] if suspect.bag is None else [topic, *_busiest(suspect.bag)]
+    topics = [] if topic is None else [topic]
+    topics += [] if suspect.bag is None else _busiest(suspect.bag)
     bags = view.stream.overlapping_bags(topics, around)
-    question = json.dumps(["clock steps", topic, suspect.first, suspect.last])
+    question = json.dumps(["clock steps by stamps", topic, suspect.first, suspect.last])
     steps = view.bags.cached_answer(question, bags, _decode)
     if steps is None:
         with view.notes.isolated():
@@ -159,15 +175,54 @@ def _decode(answer: str) -> tuple[ClockStep, ...]:
     return tuple(ClockStep(at, by) for at, by in json.loads(answer))
 
 
-def _read_steps(view: View, topic: str, suspect: SuspectedHole) -> Iterator[ClockStep]:
+def _read_steps(view: View, topic: str | None, suspect: SuspectedHole) -> Iterator[ClockStep]:
     for hole in _holes_in(view, suspect):
-        step = step_over(
-            hole,
-            _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
-            _poses(view, topic, TimeWindow(hole[1], hole[1] + BESIDE_NS)),
-        )
+        step = _step_by_stamps(view, hole)
+        if step is None and hole[1] - hole[0] >= SHORTEST_STEP_NS and topic is not None:
+            step = step_over(
+                hole,
+                _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
+                _poses(view, topic, TimeWindow(hole[1], hole[1] + BESIDE_NS)),
+            )
         if step is not None:
             yield step
+
+
+def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
+    """Returns the step that a hole is by the header stamps of topics on both sides of it."""
+    if view.memory.columns is None:
+        return None
+    around = TimeWindow(hole[0] - STAMPS_BESIDE_NS, hole[1] + STAMPS_BESIDE_NS)
+    counts: Counter[str] = Counter()
+    for bag in view.snapshot.timeline.overlapping(around):
+        counts.update({known.topic: known.count for known in bag.summary.topics})
+    changes: list[Ns] = []
+    for topic, _ in counts.most_common(_MOST_STAMPED):
+        for times, stamps in _stamps(view, topic, around).values():
+            change = delay_change(hole, times, stamps)
+            if change is not None:
+                changes.append(change)
+                break
+    return step_by_delays(hole, changes)
+
+
+def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntArray, IntArray]]:
+    """Returns the log times and header stamps of a topic in a window, of each recording."""
+    found: dict[Path, tuple[IntArray, IntArray]] = {}
+    for rows in scan(view, topic, window):
+        column = rows.table.columns.get(_STAMP)
+        if column is None or isinstance(column, Texts):
+            continue
+        stamps = np.asarray(column, np.int64)
+        stamps = stamps if rows.index is None else stamps[rows.index]
+        inside = (rows.times >= window.start) & (rows.times < window.stop)
+        times, stamps = rows.times[inside], stamps[inside]
+        known = found.get(rows.recording, (times[:0], stamps[:0]))
+        found[rows.recording] = (
+            np.concatenate([known[0], times]),
+            np.concatenate([known[1], stamps]),
+        )
+    return found
 
 
 def _holes_in(view: View, suspect: SuspectedHole) -> list[tuple[Ns, Ns]]:

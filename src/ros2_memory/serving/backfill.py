@@ -26,7 +26,6 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns, ns_from_unix
-from ros2_memory.counts.field_numbers import store_shared_ranges
 from ros2_memory.counts.sighting_runs import store_shared_texts, topics_with_texts
 from ros2_memory.history.bag_fold import JOINED_VERSION, counted_once
 from ros2_memory.history.context import Call
@@ -303,7 +302,6 @@ class Backfill:
                 poses = resolve_pose_topic(view)
                 store_shared_paths(view, poses, window)
                 store_shared_standstills(view, poses, window)
-                store_shared_ranges(view, poses, window)
             for topic in topics_with_changes(view):
                 with suppress(EpisodicError):
                     store_shared_events(view, topic, window)

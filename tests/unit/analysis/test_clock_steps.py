@@ -45,8 +45,12 @@ def test_one_pose_has_no_speed() -> None:
     assert step_over((100 * S, 108 * S), first, []) is None
 
 
-def test_holes_are_two_seconds_long_in_whatever_order_times_come() -> None:
-    assert holes([5 * S, 0, S, 3 * S, 6 * S + 1]) == [(S, 3 * S), (3 * S, 5 * S)]
+def test_holes_are_half_a_second_long_in_whatever_order_times_come() -> None:
+    half = S // 2
+    assert holes([5 * half, 0, half - 1, 3 * half, 5 * half + 9]) == [
+        (half - 1, 3 * half),
+        (3 * half, 5 * half),
+    ]
     assert holes([0, 2 * S - 1]) == []
 
 

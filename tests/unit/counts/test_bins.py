@@ -16,15 +16,13 @@ from hypothesis import strategies as st
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts import segment_fold
-from ros2_memory.counts.field_numbers import store_shared_ranges
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.view import TimeRange, View
-from ros2_memory.queries import list_recorded_topics, trajectory_summary
+from ros2_memory.queries import trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import examples
@@ -263,9 +261,6 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
         written = write_history(bags, Random(seed))
         memory = memory_of(bags, clock=FixedClock(max(written.moments) + S))
         known = recalling(memory, bags, part=part)
-        if seed % 2:
-            for topic in ("/odom", "/battery_state"):
-                store_shared_ranges(View(known, Call()), topic, TimeWindow.everything())
         for each in (memory, known, known):
             assert all(counted == read for counted, read in _counts_by_group(each))
         start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
@@ -287,50 +282,22 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
             assert asked(known, bags, name, **given_) == plain, json.dumps(given_)
 
 
-def test_fields_of_recordings_that_overlap_are_stored_before_they_are_asked_about(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_that_two_recordings_hold_count_once(tmp_path: Path) -> None:
     for number in range(3):
         begin = BEGIN + number * 10 * S
         moves = [odom(begin + at * S, number * 10.0 + at, 0.0) for at in range(13)]
         write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", moves)
     plain = memory_of(tmp_path, limits=LATEST)
-    known = recalling(plain, tmp_path)
-
-    def ask(memory: Memory) -> Bins:
-        return count_range(memory, Call(), "/odom", everything(), "day", fields=["position.x"])
-
-    answer = ask(plain)
-    assert store_shared_ranges(View(known, Call()), "/odom", TimeWindow.everything()) == 1
-    with monkeypatch.context() as patch:
-        patch.setattr(segment_fold, "READING_S", -1.0)
-        assert ask(known) == answer
-
-
-def test_messages_of_recordings_that_overlap_are_counted_by_what_the_topic_list_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(3):
-        begin = BEGIN + number * 10 * S
-        moves = [odom(begin + at * S, number * 10.0 + at, 0.0) for at in range(13)]
-        write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", moves)
-    plain = memory_of(tmp_path, limits=LATEST)
-    known = recalling(plain, tmp_path)
-
-    def ask(memory: Memory) -> Bins:
-        return count_range(memory, Call(), "/odom", everything(), "day")
-
-    answer = ask(plain)
-    assert whole(answer, "count") == 33
-    list_recorded_topics(known, Call())
-    with monkeypatch.context() as patch:
-        patch.delattr(MergedStream, "merged")
-        assert ask(known) == answer
+    for memory in (plain, recalling(plain, tmp_path)):
+        answer = count_range(memory, Call(), "/odom", everything(), "day", fields=["position.x"])
+        assert whole(answer, "count") == 33
+        assert whole(answer, "position.x.mean") == 16.0
+        assert whole(answer, "last") == BEGIN + 32 * S
 
 
 @pytest.mark.parametrize("copied", [False, True])
-def test_recordings_that_follow_each_other_at_a_full_hour_are_read_where_they_hold_a_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: bool
+def test_recordings_that_follow_each_other_at_a_full_hour_count_a_copy_once(
+    tmp_path: Path, copied: bool
 ) -> None:
     edge = BEGIN // S // 3600 * 3600 + 3600
     moves = [odom((edge + at) * S, float(at), 0.0) for at in range(-20, 20)]
@@ -339,7 +306,6 @@ def test_recordings_that_follow_each_other_at_a_full_hour_are_read_where_they_ho
     write_mcap(tmp_path / "rec_1" / "rec_1_0.mcap", [copy] * copied + moves[20:])
     plain = memory_of(tmp_path, limits=LATEST)
     known = recalling(plain, tmp_path)
-    list_recorded_topics(known, Call())
 
     def ask(memory: Memory, *fields: str, by: str = "hour") -> Bins:
         return count_range(memory, Call(), "/odom", everything(), by, fields=fields)  # type: ignore[arg-type]
@@ -348,12 +314,7 @@ def test_recordings_that_follow_each_other_at_a_full_hour_are_read_where_they_ho
     of_day = ask(plain, "position.x", by="day")
     assert [each for each in column(counts, "count").values() if each] == [20, 20]
     assert whole(numbers, "position.x.mean") == -0.5
-    with monkeypatch.context() as patch:
-        if not copied:
-            patch.delattr(MergedStream, "merged")
-        assert ask(known) == counts
-    if not copied:
-        monkeypatch.setattr(segment_fold, "READING_S", -1.0)
+    assert ask(known) == counts
     assert ask(known, "position.x") == numbers
     assert ask(known, "position.x", by="day") == of_day
     assert ask(known, "pose.pose.position.x").rows == numbers.rows

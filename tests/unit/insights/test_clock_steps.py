@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import Msg, boolean, odom, write_mcap
+from tests.support.bags import Msg, battery, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, recalling
 
@@ -103,7 +103,53 @@ def test_where_the_robot_stood_a_step_and_a_pause_are_alike(tmp_path: Path) -> N
 
 def test_a_second_is_no_step(tmp_path: Path) -> None:
     memory = recorded(tmp_path, shown=lambda t: t + 1.0 * (t > 55))
-    assert memory.index.snapshot().suspected_holes == ()
+    assert steps(memory, tmp_path) == []
+
+
+def stamped(
+    folder: Path,
+    *,
+    delay: Callable[[float], float],
+    is_lost: Callable[[float], bool] = lambda t: False,
+) -> Memory:
+    """A robot that stands, whose sensors stamp by a clock of their own, logged after a delay."""
+    for number in range(SPLITS):
+        messages: list[Msg] = []
+        for beat in range(number * SPLIT * HZ, (number + 1) * SPLIT * HZ):
+            at, logged = (
+                BEGIN * S + round((beat / HZ + extra) * S) for extra in (0.0, delay(beat / HZ))
+            )
+            if not is_lost(beat / HZ):
+                messages.append(odom(at, 1.0, 0.0, 0.0, log_time=logged))
+                messages.append(battery(at + 1000, 0.5, log_time=logged + 1))
+        messages.sort(key=lambda message: message.log_time)
+        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+    return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
+
+
+@pytest.mark.parametrize("by", [2.0, 0.8])
+@pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
+def test_a_clock_set_while_the_robot_stands_shows_in_stamps_of_another_clock(
+    tmp_path: Path, known: Callable[[Memory], Memory], when: float, by: float
+) -> None:
+    memory = known(stamped(tmp_path, delay=lambda t: by * (t > when)))
+    [step] = steps(memory, tmp_path)
+    at = BEGIN + round(when - 0.05, 1)
+    assert step == {
+        "at": pytest.approx(at, abs=1e-5),
+        "step_s": pytest.approx(by, abs=0.01),
+    }
+
+
+def test_messages_that_waited_for_the_recorder_are_no_step(tmp_path: Path) -> None:
+    def delay(t: float) -> float:
+        return max(0.0, 2.0 - 0.8 * (t - 55)) if t > 54.95 else 0.0
+
+    assert steps(stamped(tmp_path, delay=delay), tmp_path) == []
+
+
+def test_messages_that_were_lost_are_no_step(tmp_path: Path) -> None:
+    memory = stamped(tmp_path, delay=lambda t: 0.0, is_lost=lambda t: 54.95 < t < 57)
     assert steps(memory, tmp_path) == []
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import queries
+from ros2_memory.counts.field_numbers import numbers_in
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import field_extremes
@@ -81,32 +83,42 @@ def test_a_field_that_leads_into_a_list_means_all_of_it(tmp_path: Path) -> None:
     assert score.least_at == score.most_at == BEGIN
 
 
-@pytest.mark.parametrize("bound", ["MAX_MESSAGES", "MAX_NUMBERS"])
-def test_a_window_that_holds_too_much_says_so(
-    tmp_path: Path, bound: str, monkeypatch: pytest.MonkeyPatch
+def test_a_window_of_any_length_has_extremes_of_fields_that_columns_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(field_extremes, bound, 3)
-    monkeypatch.setattr(queries, "MAX_MESSAGES", field_extremes.MAX_MESSAGES)
-    answer = asked(tmp_path, [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)], "position.x")
+    monkeypatch.setattr(field_extremes, "MAX_MESSAGES", 3)
+    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)]
+    [x] = asked(tmp_path, driven, "position.x").extremes
+    assert (x.least, x.least_at, x.most, x.most_at) == (0.0, BEGIN, 8.0, BEGIN + 8 * S)
+
+
+def test_a_window_with_too_many_messages_to_read_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)]
+    [covariance] = asked(tmp_path, driven, "pose.covariance").extremes
+    assert (covariance.least, covariance.least_at) == (0.0, BEGIN)
+    monkeypatch.setattr(field_extremes, "MAX_MESSAGES", 3)
+    answer = asked(tmp_path, driven, "pose.covariance")
     assert answer.extremes == ()
     assert field_extremes.TOO_MANY in answer.notes
 
 
 @pytest.mark.parametrize("summary", [{"bytes": 921_600}, {"numbers": 2_000_000}])
 def test_a_summary_of_many_numbers_has_no_extremes(summary: JsonValue) -> None:
-    assert [*field_extremes.numbers_in(summary)] == []
-    assert [*field_extremes.numbers_in({"bytes": 1, "rate": 2})] == [2.0, 1.0]
+    assert [*numbers_in(summary)] == []
+    assert [*numbers_in({"bytes": 1, "rate": 2})] == [2.0, 1.0]
 
 
 @given(st.lists(st.lists(st.one_of(st.floats(), st.integers(-(10**400), 10**400)), max_size=4)))
 def test_extremes_are_the_least_and_the_greatest_finite_numbers(rows: list[list[float]]) -> None:
     found: dict[str, Extremes] = {}
-    finite = [[*field_extremes.numbers_in([*row, True, None, "9"])] for row in rows]
+    finite = [[*numbers_in([*row, True, None, "9"])] for row in rows]
     for time, numbers in enumerate(finite):
         if numbers:
             field_extremes._update(found, "a", time, numbers)
     flat = [number for numbers in finite for number in numbers]
-    assert sorted(map(abs, flat), reverse=True)[:1] <= [field_extremes._LARGEST]
+    assert sorted(map(abs, flat), reverse=True)[:1] <= [sys.float_info.max]
     if not flat:
         assert not found
         return
