@@ -128,6 +128,10 @@ class KnownWrong(NamedTuple):
         return is_there and self.concerns(world, call) and self.only(recorded, got)
 
 
+def _are_numbers(*values: Any) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
 def _within(absolute: float, relative: float = 0.0) -> Callable[[Any, Any], bool]:
     """Numbers that are no farther apart; of texts, which only repeat such numbers, all."""
     allowed = Tolerance(absolute, relative)
@@ -135,15 +139,17 @@ def _within(absolute: float, relative: float = 0.0) -> Callable[[Any, Any], bool
     def is_near(recorded: Any, got: Any) -> bool:
         if isinstance(recorded, str) and isinstance(got, str):
             return True
-        numbers = isinstance(recorded, int | float) and isinstance(got, int | float)
-        return numbers and allowed.allows(recorded, got)
+        return _are_numbers(recorded, got) and allowed.allows(recorded, got)
 
     return is_near
 
 
 def _is_longer(recorded: Any, got: Any) -> bool:
-    numbers = isinstance(recorded, int | float) and isinstance(got, int | float)
-    return numbers and 0 < got - recorded <= 6.0
+    return _are_numbers(recorded, got) and 0 < got - recorded <= 6.0
+
+
+def _is_less(recorded: Any, got: Any) -> bool:
+    return _are_numbers(recorded, got) and 0.88 * recorded <= got <= recorded
 
 
 def _was_null(recorded: Any, got: Any) -> bool:
@@ -225,7 +231,7 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
         "*/topic_s",
         "topic_s is larger than recorded_s where the recording paused",
         {"by": None},
-        only=lambda recorded, got: got < recorded,
+        only=lambda recorded, got: _are_numbers(recorded, got) and got < recorded,
     ),
     *(
         KnownWrong(
@@ -281,7 +287,7 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
             "*",
             "*/max_speed*",
             "max_speed is up to 11 % too high where poses are noisy",
-            only=lambda recorded, got: 0.88 * recorded <= got <= recorded,
+            only=_is_less,
         )
         for world in _NOISY
     ),
@@ -406,10 +412,7 @@ def _are_texts(values: Sequence[Any]) -> bool:
 def _same(what: str, path: tuple[str, ...], recorded: Any, got: Any) -> bool:
     if isinstance(recorded, str) and isinstance(got, str):
         return recorded == got or (not _MESSAGE & {*path} and _same_sentence(recorded, got))
-    numbers = all(
-        isinstance(value, int | float) and not isinstance(value, bool) for value in (recorded, got)
-    )
-    if not numbers or (isinstance(recorded, int) and isinstance(got, int)):
+    if not _are_numbers(recorded, got) or (isinstance(recorded, int) and isinstance(got, int)):
         return type(recorded) is type(got) and bool(recorded == got)
     return tolerance(what, path).allows(recorded, got)
 
