@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 import shutil
@@ -36,7 +37,7 @@ from ros2_memory.cli.maintenance.index import fill_catalogue
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.model import BagState
-from ros2_memory.core.timebase import NS_PER_S, WallClock
+from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.triggers.search import SplitSearch
 from ros2_memory.triggers.splits import chains_to_search
@@ -103,12 +104,15 @@ class Call:
 
 @contextmanager
 def still_time(cache: Path) -> Iterator[None]:
-    """The wall clock stands still in UTC, and catalogues lie in a folder of their own."""
+    """The wall clock stands still in UTC, no time runs out, and catalogues lie in a new folder."""
     own = {"XDG_CACHE_HOME": str(cache), "TZ": "UTC", "COLUMNS": "160", "MPLBACKEND": "agg"}
     others = [name for name in os.environ if name.startswith("MEMORY_")]
     with (
         patch.dict(os.environ, own),
         patch.object(WallClock, "now", lambda _: NOW_NS),
+        # Parts of an answer have limits of their own, after which it would be partial.
+        patch.object(Deadline, "expired", lambda _: False),
+        patch.object(Deadline, "left_s", lambda _: math.inf),
         patch("ros2_memory.config.compose", composed_once),
     ):
         for name in others:

@@ -62,6 +62,7 @@ _TOLERANCES: Final[Mapping[str, Tolerance]] = {
     "*/table/*/minutes": Tolerance(0.0101),
     "*/table/*/seconds": Tolerance(0.101),
     "*/table/*_s": Tolerance(0.101),
+    "*/table/*/metres": Tolerance(0.0101, 1e-3),
     "*/table/*_m": Tolerance(0.0101, 1e-3),
     "*/table/*speed*": Tolerance(0.0101, 1e-3),
     "plot */boxes/*": Tolerance(1.0),
