@@ -45,6 +45,10 @@ def held(name: str, *, catalogue: bool) -> None:
     world, comparison = WORLDS[name], Comparison()
     if world.absent is not None:
         pytest.skip(world.absent)
+    if name not in records():
+        pytest.skip(
+            f"not recorded yet: python -m tests.oracle.replies record --world {name} --long"
+        )
     chosen = None if LONG else short_sample()[name]
     asked = compare(world, records()[name], comparison, catalogue=catalogue, chosen=chosen)
     assert asked
@@ -56,7 +60,7 @@ def test_replies_from_bags_are_those_recorded(name: str) -> None:
     held(name, catalogue=False)
 
 
-@pytest.mark.parametrize("name", ASKED if LONG else ["session_zstd", "damaged", "robot_day_2"])
+@pytest.mark.parametrize("name", ASKED if LONG else ["session_zstd", "damaged", "resets"])
 def test_replies_with_a_catalogue_are_those_recorded(name: str) -> None:
     held(name, catalogue=True)
 
@@ -65,14 +69,16 @@ def test_the_sample_asks_every_tool_and_way_in_every_kind_of_world() -> None:
     asked: dict[str, set[str]] = {}
     there: dict[str, set[str]] = {}
     for name, numbers in short_sample().items():
+        if WORLDS[name].is_slow:
+            continue
         kind, replies = WORLDS[name].kind, records()[name].replies
         asked.setdefault(kind, set()).update(replies[number].call.what for number in numbers)
         there.setdefault(kind, set()).update(replied.call.what for replied in replies)
     assert asked == there
 
 
-def test_every_world_is_recorded() -> None:
-    assert set(records()) == set(WORLDS)
+def test_every_world_that_short_runs_ask_is_recorded() -> None:
+    assert set(records()) >= {name for name, world in WORLDS.items() if not world.long}
 
 
 def test_each_row_of_what_is_known_to_be_wrong_concerns_a_recorded_call() -> None:

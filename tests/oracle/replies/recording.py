@@ -9,7 +9,7 @@ from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Final
 
-from tests.oracle.replies.asking import Asked, still_time
+from tests.oracle.replies.asking import Asked, Call, still_time
 from tests.oracle.replies.calls import Calls, Facts
 from tests.oracle.replies.comparison import Comparison
 from tests.oracle.replies.fixture import Record, Replied
@@ -18,7 +18,6 @@ from tests.oracle.replies.worlds import WORLDS
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
-    from tests.oracle.replies.asking import Call
     from tests.oracle.replies.worlds import ReplyWorld
 
 _SAMPLE_SEED: Final = "sample 1"
@@ -47,7 +46,7 @@ def record(world: ReplyWorld, comparison: Comparison) -> Record:
         looked.stop()
         drawn = Calls(facts, Random(f"calls {world.name}"), shows_messages=world.shows_messages)
         found = Record(world.name, world.settings, facts.places)
-        calls = drawn.drawn(world.calls)
+        calls = [*drawn.drawn(world.calls), *(Call("tool", *given) for given in world.also)]
         found.replies = [Replied(*answered) for answered in asked_all(folder, found, calls)]
         quick = [replied for replied in found.replies if replied.call.what not in _SLOW]
         calls = [replied.call for replied in quick]
@@ -92,6 +91,8 @@ def compare(
 def sample(records: Mapping[str, Record], for_each_world: int) -> dict[str, set[int]]:
     """Chooses calls: in each kind of worlds one of each way and tool, and some of each world.
 
+    Of worlds in which calls take long only those, and only such that do not take longest.
+
     Args:
         records: by world.
         for_each_world: how many calls that take no long each world has at least.
@@ -102,7 +103,8 @@ def sample(records: Mapping[str, Record], for_each_world: int) -> dict[str, set[
     for name, record in records.items():
         quick = []
         for number, replied in enumerate(record.replies):
-            whats[WORLDS[name].kind, replied.call.what].append((name, number))
+            if not WORLDS[name].is_slow:
+                whats[WORLDS[name].kind, replied.call.what].append((name, number))
             if replied.call.what not in _SLOW:
                 quick.append(number)
         chosen[name].update(draw.sample(quick, min(for_each_world, len(quick))))

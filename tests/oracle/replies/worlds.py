@@ -53,6 +53,8 @@ class ReplyWorld:
         long: whether it is asked in long runs alone.
         needs: what it is a copy of, which may be absent; None where all is written.
         shows_messages: whether replies may repeat whole messages.
+        also: arguments of `find_matches` and `visits` that it is made for, and that are not drawn.
+        is_slow: whether calls take so long that a short run asks few.
     """
 
     name: str
@@ -63,6 +65,8 @@ class ReplyWorld:
     long: bool = False
     needs: Path | None = None
     shows_messages: bool = True
+    also: Sequence[tuple[str, Mapping[str, Any]]] = ()
+    is_slow: bool = False
 
     @property
     def absent(self) -> str | None:
@@ -269,6 +273,17 @@ def _damaged(folder: Path) -> None:
     files[9].write_bytes(files[9].read_bytes()[:-40])
 
 
+_PRESSED: Final = {"topic": "/bumper", "condition_type": "equals", "value": True, "limit": 50}
+_MOVES: Final = {"topic": "/odom", "field": "linear_velocity.x", "condition_type": "above"}
+_ON_THE_WAY: Final = {"x": 9.0, "y": 0.0, "radius_m": 4.0}
+_UNKNOWN: Final = (
+    ("find_matches", {**_PRESSED, "while": {**_MOVES, "value": 0.1}}),
+    ("find_matches", {**_PRESSED, "where": _ON_THE_WAY}),
+    ("visits", {"where": _ON_THE_WAY}),
+)
+"""Where the robot was, and whether it moved, is not known all the time."""
+
+
 def _odd_world(name: str, seed: int, folder: Path) -> None:
     made = odd.WORLDS[name](folder / name, Random(seed))
     assert made.folder == folder / name
@@ -277,7 +292,7 @@ def _odd_world(name: str, seed: int, folder: Path) -> None:
 def _own_worlds() -> Iterator[ReplyWorld]:
     for seed, days, calls in ((7, 2, 100), (11, 1, 140)):
         write = partial(_write_home, Scale(seed, days, 60.0))
-        yield ReplyWorld(f"home_{seed}", HOME, write, calls)
+        yield ReplyWorld(f"home_{seed}", HOME, write, calls, is_slow=days > 1)
     whole_days = partial(_write_home, Scale(13, 2, 1.0))
     yield ReplyWorld("home_13_whole_days", HOME, whole_days, 260, long=True)
     for seed in (1, 2):
@@ -302,7 +317,8 @@ def _own_worlds() -> Iterator[ReplyWorld]:
         "damaged": _damaged,
     }
     for name, write_it in made.items():
-        yield ReplyWorld(name, ODD, write_it, 80)
+        also = _UNKNOWN if name in {"silent_odometry", "two_at_once"} else ()
+        yield ReplyWorld(name, ODD, write_it, 80, also=also)
 
 
 def _write_home(scale: Scale, folder: Path) -> None:
