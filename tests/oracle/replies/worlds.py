@@ -294,10 +294,10 @@ def _own_worlds() -> Iterator[ReplyWorld]:
         write = partial(_write_home, Scale(seed, days, 60.0))
         yield ReplyWorld(f"home_{seed}", HOME, write, calls, is_slow=days > 1)
     whole_days = partial(_write_home, Scale(13, 2, 1.0))
-    yield ReplyWorld("home_13_whole_days", HOME, whole_days, 260, long=True)
+    yield ReplyWorld("home_13_whole_days", HOME, whole_days, 80, long=True)
     for seed in (1, 2):
         yield ReplyWorld(f"robot_day_{seed}", DAY, partial(_write_day, seed, SHORT), 150)
-    yield ReplyWorld("robot_day_3_six_hours", DAY, partial(_write_day, 3, FULL), 260, long=True)
+    yield ReplyWorld("robot_day_3_six_hours", DAY, partial(_write_day, 3, FULL), 80, long=True)
     pose_topics = {"two_robots": ("data.pose_topic=/boat/odom",)}
     for name in odd.WORLDS:
         for seed in (1, 2):
