@@ -31,7 +31,7 @@ import yaml
 from starlette.applications import Starlette
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.state.trigger_file import TriggerState
+from ros2_memory.bag_dir.state_files import TriggerState
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory, rules_of
 from ros2_memory.cli.maintenance.index import fill_catalogue
 from ros2_memory.config import load_settings

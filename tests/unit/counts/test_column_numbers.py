@@ -99,8 +99,8 @@ def test_extremes_of_bins_are_exact_whatever_is_stored(seed: int, part: float) -
         plain = memory_of(folder, limits=LATEST)
         stored = storing(plain, folder, draw, part=part)
         for by in ("hour", "day"):
-            expected = count_range(plain, Call(), "/odom", span(), by, fields=FIELDS)  # type: ignore[arg-type]
-            answer = count_range(stored, Call(), "/odom", span(), by, fields=FIELDS)  # type: ignore[arg-type]
+            expected = count_range(plain, Call(), "/odom", span(), by, fields=FIELDS)
+            answer = count_range(stored, Call(), "/odom", span(), by, fields=FIELDS)
             assert exact(answer) == exact(expected)
             for field in FIELDS:
                 means = cells(answer, f"{field}.mean")
