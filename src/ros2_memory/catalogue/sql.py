@@ -22,7 +22,6 @@ from ros2_memory.catalogue.codec import (
 from ros2_memory.catalogue.field_columns import encode_field_ranges
 from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
-from ros2_memory.catalogue.text_runs import encode_text_runs
 from ros2_memory.columns.database import ROW_ID_BITS, Tables
 
 if TYPE_CHECKING:
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 TABLES: Final = Tables(
-    version=11,
+    version=12,
     names=(
         "bags",
         "held",
@@ -60,7 +59,7 @@ CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
 CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
   kept INTEGER, relatched INTEGER, undecodable TEXT, fields INTEGER, ranges BLOB, zones BLOB,
-  poses BLOB, texts BLOB);
+  poses BLOB);
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB, story BLOB);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
@@ -99,14 +98,12 @@ RELATCHED: Final = "relatched"
 TRACK: Final = "track"
 SIGHTS: Final = "sights"
 RANGES: Final = "ranges"
-TEXTS: Final = "texts"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
     ZONE_MAP: "held",
     POSES: "held",
     RANGES: "held",
-    TEXTS: "held",
     STANDSTILLS: "tales",
     STORY: "tales",
     TRACK: "maps",
@@ -294,10 +291,10 @@ def map_rows(
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:
     number, bag = key
-    edges, poses, texts = topic.edges, topic.poses, topic.texts
+    edges, poses = topic.edges, topic.poses
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 12)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 11)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
@@ -309,7 +306,6 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
             *_ranges(connection, number, topic),
             packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),
             poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
-            texts and packed_by_model(connection, number, TEXTS, encode_text_runs(texts)),
         ),
     )
 

@@ -42,7 +42,6 @@ from ros2_memory.catalogue.sql import (
     STANDSTILLS,
     STORY,
     TABLES,
-    TEXTS,
     TRACK,
     UNDECODABLE,
     ZONE_MAP,
@@ -61,7 +60,6 @@ from ros2_memory.catalogue.sql import (
     topic_number,
     topic_rows,
 )
-from ros2_memory.catalogue.text_runs import decode_text_runs
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.columns.database import Database
 from ros2_memory.core.bag_summary import BagSummary
@@ -83,7 +81,6 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.digest_config import DigestConfig
     from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
-    from ros2_memory.catalogue.text_runs import TextRuns
     from ros2_memory.core.timebase import Ns
 
 FOLDER: Final = ".episodic"
@@ -242,10 +239,6 @@ class Catalogue(Database):
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""
         return self._packed_of_topic(topic, numbers, STORY, decode_topic_events, NO_EVENTS)
-
-    def text_runs(self, topic: str, numbers: Sequence[int]) -> dict[int, TextRuns]:
-        """Returns which texts each message of the topic has; not where they are too many."""
-        return self._packed_of_topic(topic, numbers, TEXTS, decode_text_runs)
 
     def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
         """Returns the frame edges of the topic; not where they are not all known."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -20,7 +19,6 @@ from ros2_memory.analysis.topic_events import (
     state_of,
 )
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
-from ros2_memory.catalogue.text_runs import TextRunsBuilder
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import detections_of
 
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector
-    from ros2_memory.catalogue.text_runs import TextRuns
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
@@ -78,8 +75,6 @@ class TopicDigest:
         kept: all its messages in order, where they are few; else None.
         relatched: whether one of its messages may repeat a message of another recording.
         fields: the range of each field with numbers; None where they are not known.
-        texts: which texts each message has; None where they are too many, and where the messages
-            are poses or transforms, whose texts are the names of frames.
         undecodable: by type, why none of its messages can be decoded; mostly empty.
     """
 
@@ -93,13 +88,12 @@ class TopicDigest:
     fields: Mapping[str, FieldRange] | None = None
     undecodable: tuple[tuple[str, str], ...] = ()
     relatched: bool = False
-    texts: TextRuns | None = None
 
 
 class _Sample(NamedTuple):
     """What one message contributes to the digest besides its numbers and edges.
 
-    `texts` are those of its value; `detections` are present if they were requested, and the
+    `detections` are present if they were requested, and the
     message was decoded alone; `pairs` are the frames of its valid transforms then, None if not
     requested.
     """
@@ -109,7 +103,6 @@ class _Sample(NamedTuple):
     state: State
     detections: tuple[Detection, ...] | None = None
     pairs: frozenset[tuple[str, str]] | None = frozenset()
-    texts: frozenset[str] = frozenset()
 
 
 class TopicCollector:
@@ -151,7 +144,6 @@ class TopicCollector:
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
         self._standstills = StandstillCollector()
         self._events = TopicEventsBuilder()
-        self._texts = TextRunsBuilder()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
@@ -188,7 +180,6 @@ class TopicCollector:
             fields=self._fields.ranges(),
             undecodable=tuple(undecodable.items()),
             relatched=self._relatched,
-            texts=None if self._pairs or self._poses is not None else self._texts.runs(),
         )
 
     def _keep(self, kept: list[Record], record: Record) -> None:
@@ -229,7 +220,6 @@ class TopicCollector:
                 self._zone_map.give_up()
                 self._fields.give_up()
                 self._pairs = self._poses = None
-                self._texts.give_up()
                 events.add_undecodable()
                 continue
             time = record.log_time
@@ -239,7 +229,6 @@ class TopicCollector:
                 events.add_empty(quiet)
                 quiet.clear()
                 events.add(time, sample.state)
-            self._texts.add(time, sample.texts)
             pose = sample.pose
             if pose is None:
                 self._poses = None
@@ -277,14 +266,14 @@ class TopicCollector:
         type_name = record.channel.type
         message = self._reader.decode(record)
         value = self._extractor.exact(message, type_name)
-        texts = frozenset(self._zone_map.add(value))
+        self._zone_map.add(value)
         self._fields.add(value)
         pairs = None
         if self._pairs is not None or self._map_transforms:
             pairs = self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
         seen = detections_of(value) if self._wants_sights(type_name) else None
-        return _Sample(*motion, state_of(value, type_name, seen), seen, pairs, texts)
+        return _Sample(*motion, state_of(value, type_name, seen), seen, pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
         """Takes the valid transforms of a message, and returns their frames."""
@@ -313,9 +302,9 @@ class TopicCollector:
             self._map.add_rows(template, records, rows)
         is_varied = template.position is not None or template.velocity is not None
         if not is_varied and not follow_numbers(template.type_name):
-            return repeat(_Sample(None, None, first.state, texts=first.texts), len(rows))
+            return repeat(_Sample(None, None, first.state), len(rows))
         return map(
-            partial(_Sample, texts=first.texts),
+            _Sample,
             template.poses(rows),
             template.speeds(rows),
             _states(template, first, rows),

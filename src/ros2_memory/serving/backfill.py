@@ -26,7 +26,6 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns, ns_from_unix
-from ros2_memory.counts.sighting_runs import store_shared_texts, topics_with_texts
 from ros2_memory.history.bag_fold import JOINED_VERSION, counted_once
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import store_shared_paths
@@ -305,8 +304,6 @@ class Backfill:
             for topic in topics_with_changes(view):
                 with suppress(EpisodicError):
                     store_shared_events(view, topic, window)
-            for topic in topics_with_texts(view):
-                store_shared_texts(view, topic, window)
         store_joined(self._memory)
 
     def prune(self) -> None:

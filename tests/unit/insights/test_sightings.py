@@ -23,7 +23,6 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import Deadline, unix_from_ns
-from ros2_memory.counts.sighting_runs import store_shared_texts
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -449,7 +448,7 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
         write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(at, True) for at in times])
     memory = memory_of(tmp_path)
     counts = []
-    for looks in range(1, 30):  # how often the clock may be looked at before the time is over
+    for looks in range(1, 60):  # how often the clock may be looked at before the time is over
         call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
         try:
             answer = find_matches(memory, call, "/bumper", "equals", value=True)
@@ -527,9 +526,6 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
         write_history(bag_dir, draw)
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
         memory = recalling(replace(plain), bag_dir, part=part)
-        if seed % 2:
-            for topic in ("/vision/a", "/dock"):
-                store_shared_texts(View(memory, Call()), topic, TimeWindow.everything())
         for topic, kind, value in ASKED:
             try:
                 expected = grouped(plain, topic, kind, value)

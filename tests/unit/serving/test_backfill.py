@@ -121,7 +121,7 @@ def test_beside_a_full_catalogue_only_bags_that_may_come_and_go_are_looked_at_ag
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [text(start, "word", "/said")])
     looked: list[TimeWindow] = []
     monkeypatch.setattr(
-        serving_backfill, "store_shared_texts", lambda _view, _topic, window: looked.append(window)
+        serving_backfill, "store_shared_events", lambda _view, _topic, window: looked.append(window)
     )
 
     def windows() -> list[TimeWindow]:

@@ -4,32 +4,19 @@ from dataclasses import replace
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.counts import sighting_runs
-from ros2_memory.counts.sighting_runs import (
-    known_sightings,
-    store_shared_texts,
-    topics_with_texts,
-)
-from ros2_memory.history.bag_fold import shares_of
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.reverse_search import ReverseSearch
-from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from tests.support.bags import detections, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
-    from ros2_memory.history.bag_fold import Share
     from ros2_memory.history.context import Memory
     from ros2_memory.results import Sightings
     from tests.support.bags import Msg
@@ -102,7 +89,7 @@ def asked(
 
 @settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]), limit=st.integers(1, 6))
-def test_sightings_are_the_same_by_texts_as_by_messages(seed: int, part: float, limit: int) -> None:
+def test_sightings_are_the_same_whatever_is_stored(seed: int, part: float, limit: int) -> None:
     draw = Random(seed)
     messages = seen(draw)
     with TemporaryDirectory() as folder:
@@ -110,8 +97,6 @@ def test_sightings_are_the_same_by_texts_as_by_messages(seed: int, part: float, 
         write(bags, [each for each, _ in messages], draw)
         plain = memory_of(bags, limits=LATEST)
         known = recalling(plain, bags, part=part)
-        if seed % 3:
-            store_shared_texts(View(known, Call()), TOPIC, TimeWindow.everything())
         start, end = sorted(draw.choice(messages)[0].log_time / S for _ in range(2))
         for oldest_first in (False, True):
             for span in ((None, None), (start, end)):
@@ -120,66 +105,3 @@ def test_sightings_are_the_same_by_texts_as_by_messages(seed: int, part: float, 
                     assert asked(known, limit, span, oldest_first=oldest_first) == answer
                 if oldest_first and span == (None, None):
                     assert answer.total == count_of(messages)
-
-
-def test_whole_bags_are_counted_without_reading_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    draw = Random(0)
-    messages = seen(draw)
-    write(tmp_path, [each for each, _ in messages], draw)
-    known = recalling(memory_of(tmp_path, limits=LATEST), tmp_path)
-    view = View(known, Call())
-    assert topics_with_texts(view) == [TOPIC]
-    assert store_shared_texts(view, TOPIC, TimeWindow.everything()) > 0
-    monkeypatch.setattr(sighting_runs, "_MOST_READ", 0)
-    for value, total in (("cup", count_of(messages)), ("spoon", None)):
-        condition = parse_condition("contains", value, 0.5)
-        found = known_sightings(
-            view,
-            ReverseSearch(view, TOPIC, condition),
-            condition,
-            TimeWindow.everything(),
-            1,
-            oldest_first=True,
-        )
-        assert (None if found is None else found.total) == total
-
-
-@pytest.mark.parametrize("part", [0.5, 1.0])
-def test_bags_of_which_none_can_hold_a_text_are_not_looked_at_one_by_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: float
-) -> None:
-    draw = Random(0)
-    write(tmp_path, [each for each, _ in seen(draw)], draw)
-    known = recalling(memory_of(tmp_path, limits=LATEST), tmp_path, part=part)
-    view = View(known, Call())
-    condition = parse_condition("contains", "spoon", 0.5)
-    asked_for = []
-
-    def counting(view: View, topic: str, window: TimeWindow) -> list[Share]:
-        asked_for.append(topic)
-        return shares_of(view, topic, window)
-
-    monkeypatch.setattr(sighting_runs, "shares_of", counting)
-    search = ReverseSearch(view, TOPIC, condition)
-    everything = TimeWindow.everything()
-    assert known_sightings(view, search, condition, everything, 1, oldest_first=False) is None
-    assert asked_for == ([] if part == 1.0 else [TOPIC])
-
-
-@pytest.mark.parametrize(
-    ("kind", "value", "more"),
-    [
-        ("contains", "true", {}),
-        ("equals", "1", {}),
-        ("contains", "cup", {"field": "detections.label"}),
-        ("contains", "cup", {"min_score": 0.5}),
-        ("above", 1, {"field": "detections.score"}),
-    ],
-)
-def test_what_more_than_texts_decides_is_left_to_the_search(
-    kind: str, value: JsonValue, more: dict[str, Any]
-) -> None:
-    assert parse_condition("contains", "cup", 0.5).is_on_texts_alone
-    assert not parse_condition(kind, value, 0.5, **more).is_on_texts_alone
