@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -110,7 +111,7 @@ def cut(bag_dir: Path, cuts: list[int], count: int = 40) -> None:
         for message in (odom(T0 + n * 50 * S, n / 3, -n / 7), text(T0 + n * 50 * S + 1, f"w{n}"))
     ]
     edges = [0, *sorted({*cuts}), len(messages)]
-    for number, (begin, end) in enumerate(zip(edges, edges[1:], strict=False)):
+    for number, (begin, end) in enumerate(pairwise(edges)):
         if begin < end:
             path = bag_dir / "rec_0" / f"rec_0_{number}.mcap"
             os.utime(write_mcap(path, messages[begin:end]), ns=(T0, T0))
