@@ -6,17 +6,17 @@ import os
 import random
 import sqlite3
 from contextlib import closing
-from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.columns import fill
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, never
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.stored import StoredTable
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
@@ -27,12 +27,13 @@ from tests.support.mcap_surgery import raw_mcap
 from tests.support.screened_bags import ScreenedBags, mode, words
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from mcap.writer import Writer
 
     from ros2_memory.columns.table import Table
+    from ros2_memory.storage.base import BagReader, Channel
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S
@@ -146,17 +147,18 @@ def test_nothing_is_stored_while_messages_are_taken_out(
     world = World.of(tmp_path)
     assert world.store.path is not None
     erasing = tmp_path / ERASING_FILE
-    decode = fill.decoded
 
-    def then_erasing(*given: object, **how: object) -> Iterator[list[Table]]:
-        yield from decode(*given, **how)  # type: ignore[arg-type]  # passed on
+    def then_erasing(
+        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
+    ) -> Iterator[list[Table]]:
+        yield from decoded(reader, path, hashed=hashed)
         erasing.write_text("{}")
 
     monkeypatch.setattr(fill, "decoded", then_erasing)
     assert world.fill() == 0
     assert count(world, "bag") == 0
     assert world.fill() == 0
-    monkeypatch.setattr(fill, "decoded", decode)
+    monkeypatch.setattr(fill, "decoded", decoded)
     erasing.unlink()
     assert world.fill() == 1
 
@@ -265,10 +267,20 @@ def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path)
 # Long bags
 
 
+def in_groups(
+    reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool] = never
+) -> Iterator[list[Table]]:
+    """Decodes a bag in five goes, as one of many gigabytes."""
+    summary = reader.summarize(path)
+    step = (summary.end - summary.start) // 5 + 1
+    for start in range(summary.start, summary.end + 1, step):
+        yield from decoded(reader, path, TimeWindow(start, start + step), hashed=hashed)
+
+
 @pytest.fixture
 def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bags are decoded in several goes, however small they are."""
-    monkeypatch.setattr(fill, "decoded", partial(decoded, group_bytes=1))
+    monkeypatch.setattr(fill, "decoded", in_groups)
 
 
 def write_long_bag(bag_dir: Path, rows: int = 60) -> Path:
@@ -300,18 +312,18 @@ def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None
     assert times(world, "/odom") == times(world.unstored(), "/odom")
 
 
-@pytest.mark.usefixtures("small_groups")
 @pytest.mark.parametrize("fault", ["undecodable", "erasing"])
 def test_half_a_bag_is_never_used_and_its_rows_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
-    write_long_bag(tmp_path, rows=400)
+    write_long_bag(tmp_path)
     world = World.of(tmp_path)
-    decode = fill.decoded
     halves: list[int] = []
 
-    def with_fault(*given: object, **how: object) -> Iterator[list[Table]]:
-        for nth, group in enumerate(decode(*given, **how)):  # type: ignore[arg-type]  # passed on
+    def with_fault(
+        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
+    ) -> Iterator[list[Table]]:
+        for nth, group in enumerate(in_groups(reader, path, hashed=hashed)):
             if nth == 3:
                 halves.append(count(world, "part"))
                 assert world.stored() == set()
@@ -332,7 +344,7 @@ def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path:
     write_long_bag(tmp_path)
     one = World.of(tmp_path)
     [bag] = one.memory.index.snapshot().bags
-    groups = decoded(one.memory.reader, bag.path, group_bytes=1)
+    groups = in_groups(one.memory.reader, bag.path)
 
     def deleted_meanwhile() -> Iterator[list[Table]]:
         yield next(groups)
