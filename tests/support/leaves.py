@@ -12,16 +12,20 @@ import numpy as np
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Table, Texts
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterator, Sequence
+    from collections.abc import Callable, Container, Iterator, Sequence
 
 FILLER: Final = "structure_needs_at_least_one_member"
 TIMES: Final = {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}
 
 
 class Comparison:
-    """What was compared: how many leaves, and which differ. All columns must have been met."""
+    """What was compared: how many leaves, and which differ. All columns must have been met.
 
-    def __init__(self) -> None:
+    `error` returns by how much the numbers of a column may differ, by its path from the table.
+    """
+
+    def __init__(self, error: Callable[[str], float] = lambda _: 0.0) -> None:
+        self._error = error
         self.leaves = 0
         self.wrong: list[str] = []
 
@@ -29,7 +33,9 @@ class Comparison:
         """Compares the rows of a table with messages in their order."""
         self._rows(table, messages, table.channel.topic)
 
-    def _rows(self, rows: Table | Elements, values: Sequence[object], where: str) -> None:
+    def _rows(
+        self, rows: Table | Elements, values: Sequence[object], where: str, around: str = ""
+    ) -> None:
         """Compares the columns of a table or of elements with a message for each row."""
         columns: dict[str, list[object]] = {
             path: list(column.values() if isinstance(column, Texts) else column.tolist())
@@ -49,26 +55,38 @@ class Comparison:
                         continue
                     met.add(own)
                     found = columns[own][row] if own in columns else "no column"
-                    self._leaf(f"{where} {own}[{row}]", found, expected)
+                    allowed = self._error(f"{around}{own}") if own in columns else 0.0
+                    self._leaf(f"{where} {own}[{row}]", found, expected, allowed)
         if values:
             self.wrong += [f"{where} {path}: extra" for path in columns.keys() - met]
         for path, found_lists in lists.items():
-            self._elements(rows.elements.get(path), found_lists, f"{where} {path}")
+            inner = rows.elements.get(path)
+            self._elements(inner, found_lists, f"{where} {path}", f"{around}{path}.")
 
-    def _leaf(self, where: str, found: object, expected: object) -> None:
+    def _leaf(self, where: str, found: object, expected: object, allowed: float) -> None:
         self.leaves += 1
-        if not same(found, expected):
+        if not same(found, expected) and not _is_near(found, expected, allowed):
             self.wrong.append(f"{where}: {found!r} for {expected!r}")
 
     def _elements(
-        self, elements: Elements | None, lists: list[tuple[int, list[object]]], where: str
+        self,
+        elements: Elements | None,
+        lists: list[tuple[int, list[object]]],
+        where: str,
+        around: str,
     ) -> None:
         """Compares elements with the list of each row."""
         owners = [row for row, entries in lists for _ in entries]
         if elements is None or owners != elements.owners.tolist():
             self.wrong.append(f"{where}: elements are missing, or belong to other rows")
             return
-        self._rows(elements, [entry for _, entries in lists for entry in entries], where)
+        self._rows(elements, [entry for _, entries in lists for entry in entries], where, around)
+
+
+def _is_near(found: object, expected: object, allowed: float) -> bool:
+    if not isinstance(found, float) or not isinstance(expected, float):
+        return False
+    return abs(found - expected) <= allowed
 
 
 def leaves(value: object, path: str = "") -> Iterator[tuple[str, object]]:

@@ -236,8 +236,8 @@ class Filling:
         """Returns which of these bags may be stored, the newest first.
 
         Those that are newer than what is stored take the place of the oldest. An older one is
-        stored only where it fits without that, even if its columns take as much as the bag: else
-        it would be deleted, and stored again, for ever.
+        stored only where it fits without that, even if it takes twice its share: else it would be
+        deleted, and stored again, for ever.
         """
         most = self._most_bytes()
         if most is None or not bags:
@@ -246,10 +246,11 @@ class Filling:
         oldest, used = self.store.oldest(), self.store.used_bytes()
         found: list[BagFile] = []
         for bag in bags:
+            size = 2 * self._budget([bag])
             is_newer = oldest is not None and bag.start >= oldest
-            used += 0 if is_newer else bag.size
-            if (bag.size if is_newer else used) <= most:
+            if (size if is_newer else used + size) <= most:
                 found.append(bag)
+                used += 0 if is_newer else size
         return found
 
     def _most_bytes(self) -> int | None:

@@ -227,11 +227,12 @@ class Scanner:
             return column
         assert self.store is not None  # noqa: S101 - as above
         data = b""
+        # The one value of a constant is its least, unless it is a text.
         if not packed.codec.endswith(" constant") or packed.codec.startswith("text"):
             stored = self.store.part_data(part, path)
             if stored is None:
                 raise GoneError
-            data = decompressed(stored)
+            data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
         self._columns.put((part, path), column, _bytes_of(column))
         return column

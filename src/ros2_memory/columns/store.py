@@ -27,7 +27,6 @@ from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
 from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import Topic
-from ros2_memory.columns.table import Zone
 from ros2_memory.columns.writing import (
     PART_NS,
     LongBag,
@@ -37,6 +36,7 @@ from ros2_memory.columns.writing import (
     lacks_definitions,
     topic_of,
     within,
+    zone_of,
 )
 from ros2_memory.storage.base import Channel, Schema
 
@@ -310,21 +310,21 @@ class ColumnStore(Database):
                 (part - self.offset,),
             )
             return {
-                path: Packed(codec, count, error, Zone(least, greatest, nulls, words), b"")
+                path: Packed(codec, count, error, zone_of(least, greatest, nulls, words), b"")
                 for path, codec, count, error, least, greatest, nulls, words in rows
             }
 
         return self.read(ask, {})
 
     def part_data(self, part: int, path: str) -> bytes | None:
-        """Returns the compressed bytes of a column; None if it is gone, or was never stored."""
+        """Returns the compressed bytes of a column; None if it is gone."""
 
         def ask(connection: sqlite3.Connection) -> bytes | None:
             row = connection.execute(
                 "SELECT data FROM part_column WHERE part = ? AND path = ?",
                 (part - self.offset, path),
             ).fetchone()
-            return None if row is None else row[0]
+            return None if row is None else row[0] or b""
 
         return self.read(ask, None)
 

@@ -68,13 +68,15 @@ class StoredTable(Table):
         """
         return self.known(path).error
 
-    def zone(self, path: str) -> Zone:
-        """Returns what is known of a column without unpacking it; `path` as in `error`.
+    def zone(self, path: str) -> Zone | None:
+        """Returns what is known of a column without unpacking it; None where there is no such one.
 
-        Raises:
-            KeyError: there is no such column.
+        `path` is as in `error`.
         """
-        return self.known(path).zone
+        try:
+            return self.known(path).zone
+        except KeyError:
+            return None
 
 
 def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:

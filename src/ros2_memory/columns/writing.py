@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.parts import pack_rows
+from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -173,11 +173,17 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
     )
 
 
-def _storable(bound: int | float | None) -> int | float | None:  # noqa: PYI041 - unlike
-    """Returns the bound of a zone as SQLite can store it: a uint64 may be too large."""
-    if isinstance(bound, int) and bound > _MOST_INTEGER:
-        return math.nextafter(float(bound), math.inf)
-    return bound
+def _storable(bound: int | float | None) -> float | str | None:  # noqa: PYI041 - unlike
+    """Returns the bound of a zone as SQLite can store it: of a uint64 above its integers a text."""
+    return str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
+
+
+def zone_of(
+    least: float | str | None, greatest: float | str | None, nulls: int, words: str | None
+) -> Zone:
+    """Returns the zone that was stored so."""
+    low, high = (int(bound) if isinstance(bound, str) else bound for bound in (least, greatest))
+    return Zone(low, high, nulls, words)
 
 
 def topic_of(connection: sqlite3.Connection, table: Table) -> tuple[int, Layout]:

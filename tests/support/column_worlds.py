@@ -1,0 +1,163 @@
+"""Memories with a store of columns, and what they scan beside what plain reading finds."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.layout import OWN_FOLDER
+from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.columns.stored import StoredTable
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.history.scan import scan
+from ros2_memory.history.view import View
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.leaves import Comparison
+from tests.support.memories import memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.columns.table import Table
+    from ros2_memory.core.timebase import Clock
+    from ros2_memory.history.context import Memory
+
+EVERYTHING = TimeWindow.everything()
+
+
+def store_file(bag_dir: Path) -> Path:
+    return bag_dir / OWN_FOLDER / FILE
+
+
+@dataclass(frozen=True)
+class World:
+    """A bag directory, a memory of it with a store, and what fills that."""
+
+    bag_dir: Path
+    memory: Memory
+    filling: Filling
+
+    @classmethod
+    def of(
+        cls,
+        bag_dir: Path,
+        *,
+        limits: StoreLimits | None = None,
+        file: Path | None = None,
+        clock: Clock | None = None,
+        definitions: str = "",
+    ) -> World:
+        reader = BagDirReader(Rosbag2Reader(), bag_dir)
+        memory = memory_of(bag_dir, clock=clock, reader=reader)
+        paths = [file or store_file(bag_dir)]
+        store = ColumnStore(paths, reader.definition, definitions=definitions)
+        memory = replace(memory, columns=Scanner(store, bag_dir))
+        assert memory.columns is not None
+        filling = Filling(memory.columns, reader, bag_dir, memory.clock, limits or StoreLimits())
+        return cls(bag_dir, memory, filling)
+
+    @property
+    def store(self) -> ColumnStore:
+        return self.filling.store
+
+    def fill(self, *, merge: bool = True) -> int:
+        """Stores all that waits; returns how many bags were stored."""
+        done = 0
+        while True:
+            timeline = self.memory.index.snapshot().timeline
+            stored = sum(self.filling.fill(bag, timeline) for bag in self.filling.waiting(timeline))
+            if merge:
+                self.filling.merge(timeline)
+            self.filling.trim()
+            if not stored:
+                return done
+            done += stored
+
+    def prune(self) -> None:
+        self.filling.prune(self.memory.index.snapshot().timeline)
+
+    def stored(self) -> set[str]:
+        """The paths of the bags that are stored as they are now."""
+        coverage = self.filling._scanner.coverage(self.memory.index.snapshot().timeline)
+        assert coverage is not None
+        missing = {bag.file for bag in coverage.missing}
+        bags = self.memory.index.snapshot().timeline.bags
+        return {str(bag.path.relative_to(self.bag_dir)) for bag in bags if bag.file not in missing}
+
+    def unstored(self) -> World:
+        """The same world without a store: everything is read from bags."""
+        columns = Scanner(None, self.bag_dir)
+        return replace(self, memory=replace(self.memory, columns=columns))
+
+    def topics(self) -> list[str]:
+        timeline = self.memory.index.snapshot().timeline
+        return sorted({topic.topic for bag in timeline.bags for topic in bag.summary.topics})
+
+
+def times(world: World, topic: str, window: TimeWindow = EVERYTHING) -> list[int]:
+    """The log times of what a scan yields, sorted."""
+    view = View(world.memory, Call())
+    return sorted(time for rows in scan(view, topic, window) for time in rows.times.tolist())
+
+
+def check_rows(
+    world: World, topic: str, window: TimeWindow = EVERYTHING, *, newest_first: bool = False
+) -> int:
+    """Compares what a scan yields with the messages of the same window; returns how many.
+
+    Times and types must be the same, and each column that of the decoded message, within the error
+    that the table states.
+    """
+    view = View(world.memory, Call())
+    found: dict[tuple[int, str], list[tuple[Table, int]]] = defaultdict(list)
+    for rows in scan(view, topic, window, newest_first=newest_first):
+        index = np.arange(len(rows)) if rows.index is None else rows.index
+        assert len(rows) == rows.times.size == index.size > 0
+        for time, row in zip(rows.times.tolist(), index.tolist(), strict=True):
+            found[time, rows.table.channel.type].append((rows.table, row))
+    expected: dict[tuple[int, str], list[object]] = defaultdict(list)
+    plain = View(world.memory, Call())
+    for message in plain.stream.messages([topic], window):
+        try:
+            decoded: object = world.memory.reader.decode(message.record)
+        except UndecodableError:
+            decoded = None
+        expected[message.record.log_time, message.record.channel.type].append(decoded)
+    for key in found.keys() | expected.keys():
+        _check_one_time(f"{topic} at {key}", found[key], expected[key])
+    return sum(map(len, found.values()))
+
+
+def _check_one_time(where: str, rows: list[tuple[Table, int]], messages: list[object]) -> None:
+    """Compares the rows of one log time and type, of which each has one message."""
+    left = [message for message in messages if message is not None]
+    for table, row in rows:
+        if "" in table.left_out:  # no definition, or not CDR
+            messages = messages[1:]
+            left = left[1:]
+            continue
+        error = table.error if isinstance(table, StoredTable) else lambda _: 0.0
+        wrong: list[str] = []
+        for nth, message in enumerate(left):
+            comparison = Comparison(error)
+            comparison.table(table.rows(np.array([row])), [message])
+            if not comparison.wrong:
+                del left[nth]
+                break
+            wrong += comparison.wrong
+        else:
+            raise AssertionError(f"{where}: no message is like row {row}: {wrong}")
+    assert left == [], f"{where}: {len(left)} messages have no row"
+
+
+def check_all(world: World, window: TimeWindow = EVERYTHING) -> int:
+    """As `check_rows`, of every topic."""
+    return sum(check_rows(world, topic, window) for topic in world.topics())

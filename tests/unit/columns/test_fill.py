@@ -1,0 +1,356 @@
+"""Which bags are stored, when, and for how long; nothing that is in doubt is."""
+
+from __future__ import annotations
+
+import os
+import random
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.layout import ERASING_FILE
+from ros2_memory.columns import fill
+from ros2_memory.columns.decode import decoded, never
+from ros2_memory.columns.fill import StoreLimits
+from ros2_memory.columns.forget import forget
+from ros2_memory.columns.stored import StoredTable
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.history.scan import scan
+from ros2_memory.history.view import View
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.column_worlds import EVERYTHING, World, check_all, store_file, times
+from tests.support.mcap_surgery import raw_mcap
+from tests.support.screened_bags import ScreenedBags, mode, words
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from mcap.writer import Writer
+
+    from ros2_memory.columns.table import Table
+    from ros2_memory.storage.base import BagReader, Channel
+
+S = NS_PER_S
+T0 = 1_700_000_400 * S
+"""The begin of ten minutes."""
+
+
+def write_bag(bag_dir: Path, number: int, *, rows: int = 20, hz: int = 4) -> Path:
+    """A minute of a recording, of which the robot moves without any order."""
+    start, draw = T0 + number * 60 * S, random.Random(number)
+    messages = [
+        odom(start + n * S // hz, draw.uniform(-9, 9), draw.uniform(-9, 9)) for n in range(rows)
+    ]
+    messages.append(text(start + S, f"word {number}"))
+    path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+    os.utime(path, ns=(T0, T0 + number))
+    return path
+
+
+def write_foreign(path: Path) -> None:
+    """A bag with a message whose definition it does not have."""
+
+    def fill_bag(writer: Writer) -> None:
+        schema = writer.register_schema("nobody_msgs/msg/Grip", "", b"")
+        channel = writer.register_channel("/gripper", "cdr", schema)
+        writer.add_message(channel, T0, b"\x00\x01\x00\x00abcd", T0)
+
+    path.parent.mkdir(parents=True)
+    raw_mcap(path, fill_bag, profile="ros2")
+
+
+def count(world: World, table: str, where: str = "1") -> int:
+    path = world.store.path
+    assert path is not None
+    with closing(sqlite3.connect(path)) as base:
+        sql = f"SELECT count(*) FROM {table} WHERE {where}"  # noqa: S608 - constants
+        return int(base.execute(sql).fetchone()[0])
+
+
+def test_the_newest_bag_comes_first_and_parts_are_made_of_ten_minutes(tmp_path: Path) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(13)]
+    world = World.of(tmp_path)
+    timeline = world.memory.index.snapshot().timeline
+    assert [bag.path for bag in world.filling.waiting(timeline)] == paths[::-1]
+    assert world.fill() == 13
+    assert world.filling.waiting(timeline) == []
+    assert (count(world, "split"), count(world, "part")) == (0, 4)
+    assert check_all(world) == 13 * 21
+
+
+def test_a_bag_with_a_message_that_cannot_be_decoded_is_read_each_time(tmp_path: Path) -> None:
+    write_bag(tmp_path, 0)
+    broken = Msg("/chatter", "std_msgs/msg/String", T0 + 9 * S, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + 8 * S, 1.0, 2.0), broken])
+    world = World.of(tmp_path)
+    assert world.fill() == 1
+    assert world.stored() == {"rec/rec_0.mcap"}
+    assert world.filling.waiting(world.memory.index.snapshot().timeline) == []
+    assert check_all(world) == 21 + 1
+
+
+def test_what_other_definitions_may_decode_is_stored_for_these_alone(tmp_path: Path) -> None:
+    write_foreign(tmp_path / "rec" / "rec_0.mcap")
+    write_bag(tmp_path, 1)
+    one = World.of(tmp_path, definitions="one")
+    assert one.fill() == 2
+    assert World.of(tmp_path, definitions="two").stored() == {"rec/rec_1.mcap"}
+    assert World.of(tmp_path, definitions="one").stored() == one.stored()
+
+
+def test_a_bag_that_comes_beside_another_recording_is_stored_again(tmp_path: Path) -> None:
+    write_bag(tmp_path, 0)
+    world = World.of(tmp_path)
+    world.fill()
+    assert count(world, "bag", "hashed") == 0
+    again = [odom(T0 + n * S // 4, n / 7, 0.0, log_time=T0 + n * S // 4 + 99) for n in range(9)]
+    write_mcap(tmp_path / "rec_b" / "rec_b_0.mcap", again)
+    check_all(world)
+    timeline = world.memory.index.snapshot().timeline
+    assert len(world.filling.waiting(timeline)) == 2
+    assert world.fill() == 2
+    assert count(world, "bag", "hashed") == 2
+    check_all(world)
+
+
+def test_columns_beyond_the_share_are_dropped_and_times_and_zones_stay(tmp_path: Path) -> None:
+    for number in range(3):
+        write_bag(tmp_path, number, rows=2000, hz=100)
+    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
+    world.fill()
+    assert count(world, "part_column", "codec = 'dropped' AND path = 'pose.pose.position.x'") == 1
+    assert count(world, "part_column", "codec = 'dropped' AND path GLOB '#*'") == 0
+    assert times(world, "/odom") == times(world.unstored(), "/odom")
+    view = View(world.memory, Call())
+    [rows] = scan(view, "/odom", EVERYTHING)
+    assert "pose.pose.position.x" not in rows.table.columns
+    assert "max_share" in rows.table.left_out["pose.pose.position.x"]
+    assert isinstance(rows.table, StoredTable)
+    greatest = rows.table.zone("pose.pose.position.x").greatest
+    assert greatest is not None
+    assert greatest > 8.9
+    assert len(times(world, "/chatter")) == 3
+
+
+# Erasing, screening
+
+
+def test_nothing_is_stored_while_messages_are_taken_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag(tmp_path, 0)
+    world = World.of(tmp_path)
+    assert world.store.path is not None
+    erasing = tmp_path / ERASING_FILE
+
+    def then_erasing(
+        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
+    ) -> Iterator[list[Table]]:
+        yield from decoded(reader, path, hashed=hashed)
+        erasing.write_text("{}")
+
+    monkeypatch.setattr(fill, "decoded", then_erasing)
+    assert world.fill() == 0
+    assert count(world, "bag") == 0
+    assert world.fill() == 0
+    monkeypatch.setattr(fill, "decoded", decoded)
+    erasing.unlink()
+    assert world.fill() == 1
+
+
+def test_a_split_that_is_not_released_is_not_stored(tmp_path: Path) -> None:
+    screened = ScreenedBags(tmp_path)
+    recording = screened.begin(0)
+    screened.split(recording, [mode(0, False), *words(0, 10)])
+    screened.split(recording, [mode(12, True), *words(10, 20)])
+    screened.split(recording, [mode(22, False), *words(20, 30)])
+    world = World.of(tmp_path)
+    assert world.fill() == 0
+    for _ in range(4):
+        screened.step()
+        world.fill()
+        served = {str(path.relative_to(tmp_path)) for path in screened.served()}
+        assert {*world.store.paths()} <= served
+    screened.end()
+    world.fill()
+    assert world.stored() == {str(path.relative_to(tmp_path)) for path in screened.served()}
+    assert [(time - 1_790_000_000 * S) / S for time in times(world, "/chatter")] == (
+        screened.seconds()
+    )
+    assert 15.5 not in screened.seconds()
+
+
+# Retention
+
+
+def test_rows_of_deleted_bags_do_not_count_and_a_part_goes_with_its_last(tmp_path: Path) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(12)]
+    world = World.of(tmp_path)
+    world.fill()
+    for nth, path in enumerate(paths[:10], start=1):
+        path.unlink()
+        assert len(times(world, "/chatter")) == 12 - nth
+        assert check_all(world) == (12 - nth) * 21
+        world.prune()
+        assert check_all(world) == (12 - nth) * 21
+        assert count(world, "part") == (4 if nth < 10 else 2)
+    assert count(world, "bag") == 2
+
+
+def test_nothing_is_deleted_where_the_bag_directory_is_missing_or_empty(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bag(bag_dir, 0)
+    world = World.of(bag_dir, file=tmp_path / "cache" / "columns.sqlite")
+    world.fill()
+    bag_dir.rename(tmp_path / "away")
+    world.prune()
+    assert count(world, "bag") == 1
+    bag_dir.mkdir()
+    world.prune()
+    assert count(world, "bag") == 1
+
+
+def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    for number in range(60):
+        write_bag(bag_dir, number, rows=300)
+    cache = tmp_path / "cache" / "columns.sqlite"
+    whole = World.of(bag_dir, file=cache)
+    empty = whole.store.used_bytes()
+    whole.fill()
+    limits = StoreLimits(max_bytes=empty + (whole.store.used_bytes() - empty) // 2)
+    whole.store.close()
+    world = World.of(bag_dir, file=cache, limits=limits)
+    world.fill()
+    assert world.store.used_bytes() <= limits.max_bytes
+    kept = sorted(int(path[8:-5]) for path in world.stored())
+    assert kept == [*range(60 - len(kept), 60)]
+    assert 10 <= len(kept) < 60
+    # Another process, which has not seen what was deleted.
+    again = World.of(bag_dir, file=cache, limits=limits)
+    again.fill()
+    before = again.stored()
+    assert again.fill() == 0
+    assert World.of(bag_dir, file=cache, limits=limits).fill() == 0
+    assert again.store.used_bytes() <= limits.max_bytes
+    for number in range(60, 80):
+        write_bag(bag_dir, number, rows=300)
+        again.fill()
+    assert again.store.used_bytes() <= limits.max_bytes
+    assert "rec/rec_79.mcap" in again.stored()
+    assert min(before) not in again.stored()
+    assert check_all(again) == 80 * 301
+
+
+def test_beside_the_bags_the_store_has_no_limit_of_its_own(tmp_path: Path) -> None:
+    for number in range(3):
+        write_bag(tmp_path, number)
+    world = World.of(tmp_path, limits=StoreLimits(max_bytes=1))
+    assert world.fill() == 3
+    assert len(world.stored()) == 3
+
+
+def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bag(bag_dir, 0, rows=900)
+    limits = StoreLimits(max_bytes=20_000)
+    world = World.of(bag_dir, file=tmp_path / "cache" / "columns.sqlite", limits=limits)
+    assert world.fill() == 0
+    assert check_all(world) == 901
+
+
+# Long bags
+
+
+def in_groups(
+    reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool] = never
+) -> Iterator[list[Table]]:
+    """Decodes a bag in five goes, as one of many gigabytes."""
+    summary = reader.summarize(path)
+    step = (summary.end - summary.start) // 5 + 1
+    for start in range(summary.start, summary.end + 1, step):
+        yield from decoded(reader, path, TimeWindow(start, start + step), hashed=hashed)
+
+
+@pytest.fixture
+def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bags are decoded in several goes, however small they are."""
+    monkeypatch.setattr(fill, "decoded", in_groups)
+
+
+def write_long_bag(bag_dir: Path, rows: int = 60) -> Path:
+    messages = [odom(T0 + n * 60 * S, n / 7, 0.0) for n in range(rows)]
+    messages += [text(T0 + n * 60 * S + 5, f"word {n}") for n in range(rows)]
+    messages.sort(key=lambda message: message.log_time)
+    path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=2000))
+    os.utime(path, ns=(T0, T0))
+    return path
+
+
+@pytest.mark.usefixtures("small_groups")
+def test_a_bag_of_several_groups_becomes_parts_at_once(tmp_path: Path) -> None:
+    write_long_bag(tmp_path)
+    world = World.of(tmp_path)
+    assert world.fill() == 1
+    assert count(world, "split") == 0
+    assert count(world, "part") >= 12
+    assert check_all(world) == 120
+    assert check_all(World.of(tmp_path)) == 120
+
+
+@pytest.mark.usefixtures("small_groups")
+def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None:
+    write_bag(tmp_path, 0, rows=2000, hz=100)
+    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
+    assert world.fill() == 1
+    assert count(world, "part_column", "codec = 'dropped'") > 0
+    assert times(world, "/odom") == times(world.unstored(), "/odom")
+
+
+@pytest.mark.parametrize("fault", ["undecodable", "erasing"])
+def test_half_a_bag_is_never_used_and_its_rows_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    write_long_bag(tmp_path)
+    world = World.of(tmp_path)
+    halves: list[int] = []
+
+    def with_fault(
+        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
+    ) -> Iterator[list[Table]]:
+        for nth, group in enumerate(in_groups(reader, path, hashed=hashed)):
+            if nth == 3:
+                halves.append(count(world, "part"))
+                assert world.stored() == set()
+                check_all(world)
+                if fault == "undecodable":
+                    raise ValueError("of a test")
+                (tmp_path / ERASING_FILE).write_text("{}")
+            yield group
+
+    monkeypatch.setattr(fill, "decoded", with_fault)
+    world.fill()
+    assert halves[0] > 0
+    assert (count(world, "part"), count(world, "part_column"), count(world, "bag")) == (0, 0, 0)
+    check_all(world)
+
+
+def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path: Path) -> None:
+    write_long_bag(tmp_path)
+    one = World.of(tmp_path)
+    [bag] = one.memory.index.snapshot().bags
+    groups = in_groups(one.memory.reader, bag.path)
+
+    def deleted_meanwhile() -> Iterator[list[Table]]:
+        yield next(groups)
+        forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
+        yield from groups
+
+    key = one.filling._key(bag)
+    assert not one.store.put_long(key, bag, deleted_meanwhile(), hashed=False, budget=10**6)
+    assert (count(one, "part"), count(one, "bag")) == (0, 0)

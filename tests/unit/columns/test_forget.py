@@ -1,0 +1,149 @@
+"""What is forgotten leaves no byte in the store's files, nor do bags that retention deleted."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.columns import forget as forgetting
+from ros2_memory.columns.forget import forget
+from ros2_memory.columns.pack import decompressed
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import odom, text, write_mcap
+from tests.support.column_worlds import World, check_all, store_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = NS_PER_S
+T0 = 1_700_000_400 * S
+
+
+def write_bag(bag_dir: Path, number: int) -> Path:
+    """A minute, in which thrice something is said that only this minute has."""
+    start = T0 + number * 60 * S
+    messages = [odom(start + n * S, n / 7, 0.3) for n in range(60)]
+    for n in range(60):
+        said = f"secret{number:04d}x{n}" if n % 20 == 0 else "hum"
+        messages.append(text(start + n * S + 5, said))
+    return write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+
+
+def blobs_of(file: Path) -> set[bytes]:
+    """The beginnings of all that is packed."""
+    with closing(sqlite3.connect(file)) as base:
+        splits = base.execute("SELECT tables FROM split").fetchall()
+        columns = base.execute("SELECT data FROM part_column WHERE length(data) > 40").fetchall()
+    return {bytes(blob)[:40] for (blob,) in [*splits, *columns]}
+
+
+def bytes_of(folder: Path) -> bytes:
+    """All files of a folder: those of SQLite, and whatever else lies there."""
+    return b"".join(path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file())
+
+
+def unpacked(file: Path) -> bytes:
+    """All that is packed, unpacked."""
+    with closing(sqlite3.connect(file)) as base:
+        splits = base.execute("SELECT tables FROM split").fetchall()
+        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
+    return b"".join(decompressed(blob) for (blob,) in [*splits, *columns])
+
+
+@pytest.mark.parametrize("merged", [True, False])
+def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> None:
+    for number in range(14):
+        write_bag(tmp_path, number)
+    world = World.of(tmp_path)
+    world.fill(merge=merged)
+    file = store_file(tmp_path)
+    before = blobs_of(file)
+    assert b"secret0003" in (bytes_of(file.parent) if merged else unpacked(file))
+    # The store stays open in a server, so that its log lies beside it.
+    forget(file, tmp_path, ["rec/rec_3.mcap"])
+    left = bytes_of(file.parent)
+    assert b"secret0003" not in left
+    assert b"secret0003" not in unpacked(file)
+    gone = before - blobs_of(file)
+    assert gone
+    assert [blob for blob in gone if blob in left] == []
+    assert "rec/rec_3.mcap" not in world.stored()
+    assert "rec/rec_12.mcap" in world.stored()
+    assert check_all(world) == 14 * 120
+    world.fill()
+    assert len(world.stored()) == 14
+
+
+def test_no_byte_of_a_bag_is_left_that_retention_deleted_before(tmp_path: Path) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(12)]
+    world = World.of(tmp_path)
+    world.fill()
+    for path in paths[:4]:
+        path.unlink()
+    world.prune()
+    paths[4].unlink()  # and nobody has pruned since
+    file = store_file(tmp_path)
+    assert b"secret0002" in bytes_of(file.parent)
+    forget(file, tmp_path, [])
+    for number in range(5):
+        assert f"secret{number:04d}".encode() not in bytes_of(file.parent) + unpacked(file)
+    assert world.stored() == {"rec/rec_10.mcap", "rec/rec_11.mcap"}
+    world.fill()
+    assert check_all(world) == 7 * 120
+    assert len(world.stored()) == 7
+
+
+def test_copies_that_were_set_aside_go_too(tmp_path: Path) -> None:
+    write_bag(tmp_path, 0)
+    World.of(tmp_path).fill()
+    file = store_file(tmp_path)
+    for name in ("columns.sqlite.aside", ".columns.sqlite.77.tmp", ".columns.sqlite.77.tmp-wal"):
+        file.with_name(name).write_bytes(b"secret0000")
+    forget(file, tmp_path, ["rec/rec_0.mcap"])
+    assert b"secret0000" not in bytes_of(file.parent)
+
+
+def test_what_another_program_reads_all_the_time_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bag(tmp_path, 0)
+    world = World.of(tmp_path)
+    world.fill()
+    monkeypatch.setattr(forgetting, "PATIENCE_S", 0.2)
+    file = store_file(tmp_path)
+    with closing(sqlite3.connect(file, isolation_level=None)) as reader:
+        reader.execute("BEGIN")
+        reader.execute("SELECT count(*) FROM bag").fetchone()
+        with pytest.raises(BagError, match=r"may still contain deleted data .*delete the file"):
+            forget(file, tmp_path, ["rec/rec_0.mcap"])
+    assert world.stored() == set()
+    forget(file, tmp_path, [])
+    assert b"secret0000" not in bytes_of(file.parent)
+
+
+def test_a_store_of_another_version_is_named(tmp_path: Path) -> None:
+    file = store_file(tmp_path)
+    file.parent.mkdir()
+    with closing(sqlite3.connect(file)) as base:
+        base.execute("PRAGMA user_version = 99")
+    with pytest.raises(BagError, match="another version"):
+        forget(file, tmp_path, [])
+    forget(file.with_name("none.sqlite"), tmp_path, [])
+    assert not file.with_name("none.sqlite").exists()
+
+
+def test_servers_notice_what_was_forgotten(tmp_path: Path) -> None:
+    for number in range(2):
+        write_bag(tmp_path, number)
+    world = World.of(tmp_path)
+    world.fill()
+    assert check_all(world) == 240
+    state = world.store.state()
+    forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
+    assert world.store.state().deletion > state.deletion
+    assert check_all(world) == 240
+    assert world.stored() == set()
