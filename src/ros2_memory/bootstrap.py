@@ -416,7 +416,17 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
-    return Memory(index, reader, shared.extractor, clock, query_settings_of(settings), recall)
+    from ros2_memory.columns.scan import Scanner
+
+    return Memory(
+        index,
+        reader,
+        shared.extractor,
+        clock,
+        query_settings_of(settings),
+        recall,
+        columns=Scanner(None, index.bag_dir),
+    )
 
 
 def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
