@@ -19,7 +19,7 @@ from ros2_memory.columns.shown import (
     opened,
     placed,
 )
-from ros2_memory.columns.values import Kind, Leaf, Made, Values
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -84,6 +84,36 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     if not known:
         return FieldNumbers(np.empty(0, np.int64), np.empty(0, np.int64), 0.0)
     return known[0] if len(known) == 1 else _joined(known)
+
+
+def extent(table: Table, field: str, extractor: SchemaExtractor) -> tuple[float, float] | None:
+    """Returns the exact least and greatest number of a field, without reading a column.
+
+    None where that is not known, also of a table without such numbers.
+    """
+    if table.definition is None:
+        return None
+    values = Values(table)
+    try:
+        found = Shape(table.definition, table.channel.type, extractor).find(field)
+        spots = [] if found is None else [*opened(Spot(found))]
+        leaves = [leaf for spot in spots for leaf in leaves_below(spot)]
+        is_summary = any(
+            isinstance(spot.node, Message | Group) and _SUMMARY.issuperset(spot.node.names())
+            for spot in spots
+        )
+    except UnknownShapeError:
+        return None
+    if len(leaves) != 1 or is_summary:
+        return None
+    _, leaf, limits = leaves[0]
+    is_plain = leaf.level is ROWS and not limits and leaf.made in {Made.STORED, Made.REAL}
+    if not is_plain or leaf.kind not in {Kind.INTEGER, Kind.REAL}:
+        return None
+    zone = values.zone(leaf)
+    if zone is None or not (math.isfinite(zone.low) and math.isfinite(zone.high)):
+        return None
+    return zone.low, zone.high
 
 
 def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:

@@ -211,6 +211,10 @@ class Rows:
         at = row if self.index is None else int(self.index[row])
         return self._unit.bags()[int(self._unit.bag_numbers()[at])]
 
+    def some(self, positions: IntArray) -> Rows:
+        """Returns some of the rows, by their ascending positions among those that count."""
+        return Rows(self._unit, positions if self.index is None else self.index[positions])
+
     def mask(self) -> NDArray[np.bool_]:
         """Returns for each row of the table whether it counts."""
         if self.index is None:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.numbers import numbers
-from ros2_memory.columns.units import GoneError
+from ros2_memory.columns.numbers import extent, numbers
+from ros2_memory.columns.stored import StoredTable
+from ros2_memory.columns.units import BagUnit, GoneError, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -27,9 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.numbers import FieldNumbers
-    from ros2_memory.columns.units import Rows
     from ros2_memory.core.errors import UndecodableError
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
@@ -93,6 +92,8 @@ class PieceNumbers:
         fields: dot-paths.
         edges: where pieces begin (ns), ascending; what is before the first is piece 0.
         most_read: messages that may be read from bags where columns do not hold a field.
+        only_extremes: whether nothing else is wanted: then `Part.size` and `Part.total` say
+            nothing, and most columns need not be read.
 
     Attributes:
         since: what is before this log time is not among the parts, for lack of time; or None.
@@ -107,6 +108,7 @@ class PieceNumbers:
         edges: IntArray,
         *,
         most_read: int | None = None,
+        only_extremes: bool = False,
     ) -> None:
         self.since: Ns | None = None
         self._view = view
@@ -114,8 +116,9 @@ class PieceNumbers:
         self._fields = tuple(fields)
         self._edges = edges
         self._most_read = most_read
+        self._only_extremes = only_extremes
         self._read = 0
-        self._reader = FieldReader(view, topic, fields)
+        self._reader = FieldReader(view, topic, fields, by_digests=False)
         self._reading = view.call.partial_after(READING_S)
         self._left: Ns = MAX_NS
         self._waiting: list[Rows] = []
@@ -185,13 +188,19 @@ class PieceNumbers:
 
     def _add(self, rows: Rows, since: Ns) -> None:
         """Adds the numbers of a table from a log time on."""
+        pieces = [*self._pieces(rows, since)]
+        if self._only_extremes and self._add_extents(rows, pieces):
+            return
         extractor = self._view.memory.extractor
         found = [numbers(rows.table, field, extractor) for field in self._fields]
         held = [some for some in found if some is not None]
         if len(held) < len(found):
-            self._add_read(rows, since)
+            if isinstance(rows.table, StoredTable):
+                for decoded in _decoded(self._view, rows):
+                    self._add(decoded, since)
+            else:
+                self._add_read(rows, since)
             return
-        pieces = [*self._pieces(rows, since)]
         for field, some in enumerate(held):
             whole = _of_rows(some, rows)
             for piece, start, stop in pieces:
@@ -199,6 +208,22 @@ class PieceNumbers:
                 if begin < end:
                     part = _part(rows, whole, (start, stop), (begin, end))
                     self._parts[field, piece].append(part)
+
+    def _add_extents(self, rows: Rows, pieces: Sequence[tuple[int, int, int]]) -> bool:
+        """Adds the least and the greatest number of a whole table, if no column must be read."""
+        if rows.index is not None or [piece[1:] for piece in pieces] != [(0, len(rows))]:
+            return False
+        extractor = self._view.memory.extractor
+        found = [extent(rows.table, field, extractor) for field in self._fields]
+        known = [some for some in found if some is not None]
+        if len(known) < len(found):
+            return False
+        [(piece, _, _)] = pieces
+        first, last = rows.span
+        for field, (least, greatest) in enumerate(known):
+            ends = [Extreme(number, number, first, last) for number in (least, -greatest)]
+            self._parts[field, piece].append(Part(first, last, 1, math.nan, *ends))
+        return True
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
         """Yields the number of each piece of some rows, with its first row and the one after it."""
@@ -263,44 +288,61 @@ class PieceNumbers:
 
     def _read_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
         """Returns an extreme by the bags that may hold it; None where these cannot be read."""
-        window = TimeWindow(extreme.first, extreme.last + 1)
-        best: tuple[float, Ns] | None = None
-        for bag, times in self._candidates(field, sign, extreme, window):
+        extractor, path = self._view.memory.extractor, self._fields[field]
+        best = (math.inf, MAX_NS)
+        waiting: list[tuple[Ns, int, Rows]] = []
+        for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
+            known = numbers(rows.table, path, extractor)
+            if known is not None and (not known.error or known.exactly is not None):
+                best = min(best, _first_furthest(rows, _of_rows(known, rows), sign))
+                continue
+            for some in _by_bag(rows, _candidates(rows, known, sign, extreme)):
+                waiting.append((int(some.times[0]), len(waiting), some))
+        for first, _, rows in sorted(waiting, key=lambda each: each[:2]):
+            if best[0] <= extreme.low and best[1] <= first:
+                break
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
-            for table in self._view.bags.tables(bag, self._topic, hashed=False):
-                found = numbers(table, self._fields[field], self._view.memory.extractor)
-                if found is None:
-                    continue
-                is_meant = np.isin(table.log_times, times)[found.rows]
-                among = np.flatnonzero(is_meant)
-                if among.size:
-                    number, nth = _furthest(found, among, sign)
-                    best = min(best or (math.inf, 0), (number, int(table.log_times[nth])))
-            if best is not None and best[0] <= extreme.low:
-                break
-        return None if best is None else Extreme(best[0], best[0], best[1], best[1])
+            for decoded in _decoded(self._view, rows):
+                known = numbers(decoded.table, path, extractor)
+                if known is not None:
+                    best = min(best, _first_furthest(decoded, _of_rows(known, decoded), sign))
+        return None if best[1] == MAX_NS else Extreme(best[0], best[0], best[1], best[1])
 
-    def _candidates(
-        self, field: int, sign: int, extreme: Extreme, window: TimeWindow
-    ) -> list[tuple[BagFile, IntArray]]:
-        """Returns the bags that may hold an extreme, with the times of such messages, in order."""
-        found: list[tuple[Ns, BagFile, IntArray]] = []
-        for rows in scan(self._view, self._topic, window):
-            known = numbers(rows.table, self._fields[field], self._view.memory.extractor)
-            if known is None:
-                continue
-            known = _of_rows(known, rows)
-            off = known.error if known.errors is None else known.errors
-            may = np.zeros(len(rows), np.bool_)
-            may[known.rows[sign * known.numbers - off <= extreme.high]] = True
-            times = rows.times
-            for bag, positions in rows.bag_rows():
-                some = times[positions[may[positions]]]
-                if some.size:
-                    found.append((int(some[0]), bag, some))
-        found.sort(key=lambda each: each[:2])
-        return [(bag, times) for _, bag, times in found]
+
+def _decoded(view: View, rows: Rows) -> Iterator[Rows]:
+    """Yields some rows as their bags have them."""
+    for bag, positions in rows.bag_rows():
+        wanted = rows.times[positions]
+        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
+            index = np.flatnonzero(np.isin(table.log_times, wanted))
+            if table.channel.type == rows.table.channel.type and index.size:
+                yield Rows(BagUnit(bag, table, nth), index)
+
+
+def _candidates(rows: Rows, known: FieldNumbers | None, sign: int, extreme: Extreme) -> IntArray:
+    """Returns which of some rows may hold an extreme, ascending."""
+    if known is None:
+        return np.arange(len(rows))
+    known = _of_rows(known, rows)
+    off = known.error if known.errors is None else known.errors
+    return np.unique(known.rows[sign * known.numbers - off <= extreme.high])
+
+
+def _by_bag(rows: Rows, some: IntArray) -> Iterator[Rows]:
+    """Yields some of the rows, those of each bag by themselves."""
+    for _, positions in rows.bag_rows():
+        kept = np.intersect1d(positions, some, assume_unique=True)
+        if kept.size:
+            yield rows.some(kept)
+
+
+def _first_furthest(rows: Rows, found: FieldNumbers, sign: int) -> tuple[float, Ns]:
+    """Returns the least exact number, times the sign, and when it was first."""
+    if not found.rows.size:
+        return math.inf, MAX_NS
+    number, row = _furthest(found, np.arange(found.rows.size), sign)
+    return number, int(rows.times[row])
 
 
 def _of_rows(found: FieldNumbers, rows: Rows) -> FieldNumbers:

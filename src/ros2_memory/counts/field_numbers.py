@@ -93,18 +93,26 @@ class NumberTable(NamedTuple):
 class FieldReader:
     """Reads the numbers of some fields (dot-paths) of a topic.
 
+    Args:
+        view: the call's.
+        topic: its name.
+        fields: dot-paths.
+        by_digests: whether digests are asked, which know a field by its extracted name alone.
+
     Attributes:
         failures: of messages that cannot be decoded.
     """
 
-    def __init__(self, view: View, topic: str, fields: Sequence[str]) -> None:
+    def __init__(
+        self, view: View, topic: str, fields: Sequence[str], *, by_digests: bool = True
+    ) -> None:
         self._view = view
         self._topic = topic
         types = view.snapshot.timeline.types_of(topic)
         own_path = view.memory.extractor.own_path
-        # Digests know a field by its extracted name alone.
         self._fields = tuple(
-            own_path(each, types[0]) if len(types) == 1 else each for each in fields
+            own_path(field, types[0]) if by_digests and len(types) == 1 else field
+            for field in fields
         )
         self._kind = f"numbers {json.dumps(self._fields)}"
         self.failures: list[UndecodableError] = []

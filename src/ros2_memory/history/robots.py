@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""
+_SLOW_NS: Final[Ns] = 600 * NS_PER_S
+"""As far where recordings overlap at that time: some topics have a message in minutes."""
 _TRIED: Final = 3
 """How many messages are looked for in the other recording: a subscriber may miss one."""
 _MAX_PAIRS: Final = 20
@@ -304,7 +306,9 @@ def note_robots_near(view: View, found: StoredMessage) -> None:
     """Does as `note_robots`, around the time of a message; a single recording is of one robot."""
     topic = found.record.channel.topic
     if len(view.snapshot.timeline.recordings(topic)) > 1:
-        note_robots(view, topic, TimeWindow.around(found.time, _NEAR_NS))
+        near = TimeWindow.around(found.time, _NEAR_NS)
+        if any(_overlapping_pairs(view, topic, near)):
+            note_robots(view, topic, TimeWindow.around(found.time, _SLOW_NS))
 
 
 def _overlapping_pairs(

@@ -151,8 +151,9 @@ def between(bags: Sequence[BagFile], rates: Rates) -> Iterator[SuspectedHole]:
     One of these topics must be heard up to the hole, and from it on: a robot on which little is
     published has holes all along.
     """
+    shortest = SHORTEST_BY_STAMPS_NS + min((period for _, period in rates), default=0)
     for before, after in pairwise(bags):
-        if after.start - before.end < SHORTEST_BY_STAMPS_NS:
+        if after.start - before.end < shortest:
             continue
         if _follows(before, after) and _is_cut(before, after, rates):
             yield SuspectedHole(before.end, after.start)

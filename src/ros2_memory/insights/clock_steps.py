@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import replace
+from heapq import nlargest
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -52,6 +53,8 @@ if TYPE_CHECKING:
 _MOST_SUSPECTS: Final = 32
 """The newest suspected holes are looked at; each costs some milliseconds."""
 _MOST_TOPICS: Final = 32
+_MOST_HOLES: Final = 8
+"""The longest holes of a bag are looked at."""
 _MOST_STAMPED: Final = 8
 """Topics of which header stamps are looked at."""
 _STAMP: Final = "header.stamp"
@@ -230,7 +233,8 @@ def _holes_in(view: View, suspect: SuspectedHole) -> list[tuple[Ns, Ns]]:
     if bag is None:
         return [(suspect.first, suspect.last)]
     window = TimeWindow.everything()
-    return holes(at for name in _busiest(bag) for at in view.bags.log_times(bag, name, window))
+    found = holes(at for name in _busiest(bag) for at in view.bags.log_times(bag, name, window))
+    return sorted(nlargest(_MOST_HOLES, found, key=lambda hole: hole[1] - hole[0]))
 
 
 def _busiest(bag: BagFile) -> list[str]:

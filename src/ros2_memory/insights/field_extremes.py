@@ -54,7 +54,8 @@ def extremes_of(
             view.notes.add(TOO_MANY)
             return ()
         return _read_extremes(view, topic, window, names)
-    found = PieceNumbers(view, topic, names, np.empty(0, np.int64), most_read=MAX_MESSAGES)
+    whole = np.empty(0, np.int64)
+    found = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES, only_extremes=True)
     try:
         found.collect(window)
     except TooManyError:

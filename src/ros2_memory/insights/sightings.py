@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
     Ns,
 )
 from ros2_memory.counts.tested import tested
-from ros2_memory.history.coverage import note_unread, unix_text
+from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -134,8 +134,7 @@ def find_matches(
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    earliest, latest = view.snapshot.earliest, view.snapshot.latest
-    now = memory.now(wall, latest)
+    now = memory.now(wall, view.snapshot.latest)
     asked = search_window(span, now)
     require_recorded(view, asked)
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
@@ -196,8 +195,9 @@ def find_matches(
     ):
         view.notes.add(sentence)
     start, end = window.asked()
-    start = start if earliest is None else min(max(start, earliest), end)
-    end = end if latest is None else max(min(end, latest), start)
+    first, last = recorded_reach(view.snapshot, window) or (start, end)
+    start = min(max(start, first), end)
+    end = max(min(end, last), start)
     return Sightings(
         found,
         more=total is None or total > len(found),

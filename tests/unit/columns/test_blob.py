@@ -106,6 +106,7 @@ def check(given: Table, back: StoredTable) -> None:
             continue
         assert differences(column, others[path]) <= back.error(path)
         zone = back.zone(path)
+        assert zone is not None
         if isinstance(column, Texts):
             if zone.words is not None:
                 folded = "\n".join(dict.fromkeys(word.casefold() for word in column.words))
@@ -247,7 +248,9 @@ def test_a_column_that_rounded_to_one_value_is_packed_again_as_that_value() -> N
     again = stored(joined_stored([once, once]))
     assert np.asarray(once.columns["position.x"]).tolist() == [1.0] * 3
     assert np.asarray(again.columns["position.x"]).tolist() == [1.0] * 6
-    assert again.zone("position.x").least == 1.00001
+    zone = again.zone("position.x")
+    assert zone is not None
+    assert zone.least == 1.00001
     assert again.error("position.x") >= 0.00004 - 1e-12
 
 

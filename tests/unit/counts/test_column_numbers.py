@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -16,7 +17,9 @@ from hypothesis import strategies as st
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scan import Scanner
 from ros2_memory.columns.store import ColumnStore
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
+from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, QuerySettings
@@ -90,12 +93,12 @@ def exact(answer: Bins) -> Bins:
     return replace(answer, rows=rows, columns=columns, all=of(tuple(answer.all)))
 
 
-@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(6), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
 def test_extremes_of_bins_are_exact_whatever_is_stored(seed: int, part: float) -> None:
     with TemporaryDirectory() as name:
         folder, draw = Path(name), Random(seed)
-        write(folder, noisy(draw, draw.randint(30, 900)))
+        write(folder, noisy(draw, draw.randint(30, 600)))
         plain = memory_of(folder, limits=LATEST)
         stored = storing(plain, folder, draw, part=part)
         for by in ("hour", "day"):
@@ -187,3 +190,42 @@ def test_the_error_of_a_column_is_that_of_a_mean(tmp_path: Path) -> None:
     ]
     first, again = (cells(answer, "position.x.mean")[-1] for answer in answers)
     assert again == pytest.approx(first, abs=1e-4)
+
+
+class Limited(Deadline):
+    """A deadline that is over after so many looks at it."""
+
+    def __init__(self, looks: int) -> None:
+        super().__init__(600.0, 600.0)
+        object.__setattr__(self, "looks", iter([False] * looks))
+
+    def expired(self) -> bool:
+        return next(self.looks, True)  # type: ignore[attr-defined]
+
+
+def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched(
+    tmp_path: Path,
+) -> None:
+    messages = [battery(BEGIN + n * 10 * S, 0.9 if n % 90 < 5 else 0.1) for n in range(1080)]
+    write(tmp_path, messages, split=60)
+    memory = memory_of(tmp_path, limits=LATEST)
+
+    def count(call: Call) -> Bins:
+        return count_matches(
+            memory, call, "/battery_state", "above", 0.5, by="hour", field="percentage"
+        )
+
+    whole = count(Call())
+    partial = []
+    for looks in range(1, 60):
+        with suppress(QueryTimeoutError):
+            answer = count(Call(deadline=Limited(looks)))
+            if any(note.startswith("only what is after") for note in answer.notes):
+                partial.append(answer)
+    assert partial
+    for answer in partial:
+        names = [name for name, _ in answer.rows]
+        assert names == [name for name, _ in whole.rows][-len(names) :]
+        assert cells(answer, "recorded_s")[-1] <= cells(whole, "recorded_s")[-1]  # type: ignore[operator]
+        assert all(cells(answer, "count"))
+    assert min(len(answer.rows) for answer in partial) < len(whole.rows)

@@ -64,6 +64,11 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
         ("find_things", {}),
         ("find_matches", {}),
         ("find_matches", {"by": "hour"}),
+        ("get_topic_in_range", {}),
+        ("get_topic_in_range", {"fields": ["position.x"]}),
+        ("get_topic_in_range", {"by": "hour", "fields": ["position.x"]}),
+        ("find_last_match", {}),
+        ("get_value_when", {}),
     ],
 )
 def test_answers_from_messages_of_both_robots_say_so(
@@ -71,11 +76,27 @@ def test_answers_from_messages_of_both_robots_say_so(
 ) -> None:
     for number, robot in enumerate(("red", "blue")):
         write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
-    if name == "find_matches":
-        condition = {"topic": "/odom", "condition_type": "above", "field": "position.x"}
-        asks = {**condition, "value": 5, **asks}
+    condition = {"condition_type": "above", "field": "position.x", "value": 5}
+    if name.startswith("find_") and name != "find_things":
+        asks = {"topic": "/odom", **condition, **asks}
+    if name == "get_value_when":
+        asks = {"value_topic": "/odom", "condition_topic": "/odom", **condition}
+    if name == "get_topic_in_range":
+        asks = {"topic": "/odom", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 60, **asks}
     answer = asked(memory_of(tmp_path), tmp_path, name, **asks)
     assert [each for each in answer["notes"] if "as from several robots" in each]
+
+
+def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robots(
+    tmp_path: Path,
+) -> None:
+    for number, robot in enumerate(("red", "blue")):
+        said = [text(T0 + (60 * n + 30 * number) * NS_PER_S, f"{robot} {n}") for n in range(9)]
+        write_mcap(tmp_path / robot / f"{robot}_0.mcap", said)
+    for condition in ("blue 4", "red 5"):
+        asks = {"topic": "/chatter", "condition_type": "equals", "value": condition}
+        answer = asked(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
+        assert [note for note in answer["notes"] if "as from several robots" in note]
 
 
 @pytest.mark.parametrize(

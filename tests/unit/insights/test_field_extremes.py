@@ -76,6 +76,13 @@ def test_a_full_path_in_the_message_has_extremes_as_the_values_own_field_has(
     assert (full.least, full.most) == (own.least, own.most) == (0.0, 2.0)
 
 
+def test_fields_that_only_the_messages_have_have_extremes(tmp_path: Path) -> None:
+    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(3)]
+    second, w = asked(tmp_path, driven, "header.stamp.sec", "pose.pose.orientation.w").extremes
+    assert (second.least, second.most) == (BEGIN // S, BEGIN // S + 2)
+    assert (w.least, w.most, w.most_at) == (1.0, 1.0, BEGIN)
+
+
 def test_a_field_that_leads_into_a_list_means_all_of_it(tmp_path: Path) -> None:
     seen = [detections(BEGIN, ["cup", "fork"]), detections(BEGIN + S, [])]
     [score] = asked(tmp_path, seen, "detections.point.x").extremes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from statistics import median
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.reply import rounded
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
+from ros2_memory.counts.column_numbers import PieceNumbers
 from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
@@ -18,9 +19,9 @@ from ros2_memory.history.view import View
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.field_numbers import FieldNumbers
     from ros2_memory.history.context import Call, Memory
 
 MOST_SIGNALS: Final = 4
@@ -52,7 +53,14 @@ class Signal(NamedTuple):
 class _Part(NamedTuple):
     first: Ns
     last: Ns
-    numbers: FieldNumbers
+    size: int
+    total: float
+    low: float
+    high: float
+
+
+_Found: TypeAlias = "tuple[Sequence[_Part], Ns | None, Sequence[UndecodableError]]"
+"""Numbers in order of time, since when they are known if not all were read, and failures."""
 
 
 def signal_in(
@@ -65,30 +73,58 @@ def signal_in(
     shown: JsonObject = {"topic": signal.topic, "field": signal.field}
     try:
         view = View(memory, call, window.stop)
-        reader = FieldReader(view, resolve_topic(view, signal.topic), (signal.field,))
+        topic = resolve_topic(view, signal.topic)
         width = max((span.stop - span.start) // MOST_BINS, 1)
         # Bins begin at the same times in every answer, so that these can be joined.
         window = TimeWindow(window.start - window.start % width, window.stop)
-        edges = _edges(view, window, width)
-        folded = reader.over(window, edges)
+        found = _by_shares if memory.columns is None else _by_columns
+        parts, since, failures = found(view, topic, signal.field, window, width)
     except EpisodicError as error:
         return {**shown, "error": str(error)}
-    parts = [
-        _Part(first, last, numbers[0])
-        for table in folded.parts
-        for first, last, numbers in zip(*table, strict=True)
-        if numbers[0].size
-    ]
     if not parts:
         why = f"no number under {signal.field} in this time"
-        return {**shown, "error": str(reader.failures[0]) if reader.failures else why}
+        return {**shown, "error": str(failures[0]) if failures else why}
     shown["from"] = round(unix_from_ns(window.start), 3)
     rows = _binned(parts, width)
     for name, column in zip(("t", "low", "mean", "high"), zip(*rows, strict=True), strict=True):
         shown[name] = [*column]
-    if folded.since is not None:
-        shown["since"] = round(unix_from_ns(folded.since), 3)
+    if since is not None:
+        shown["since"] = round(unix_from_ns(since), 3)
     return shown
+
+
+def _by_columns(view: View, topic: str, field: str, window: TimeWindow, width: Ns) -> _Found:
+    """Returns the numbers of a field, of times that no edge of a bin cuts, in order."""
+    inside = [
+        (max(first, window.start), min(last, window.stop - 1))
+        for first, last in view.snapshot.timeline.recordings(topic).values()
+        if window.overlaps(first, last)
+    ]
+    if not inside:
+        return [], None, ()
+    begin, end = min(first for first, _ in inside), max(last for _, last in inside)
+    edges = np.arange(begin - begin % width + width, end + 1, width)
+    numbers = PieceNumbers(view, topic, (field,), edges)
+    numbers.collect(window)
+    parts = [
+        _Part(part.first, part.last, part.size, part.total, part.least.high, -part.greatest.high)
+        for piece in range(len(edges) + 1)
+        for part in sorted(numbers.parts(0, piece))
+    ]
+    return parts, numbers.since, numbers.failures
+
+
+def _by_shares(view: View, topic: str, field: str, window: TimeWindow, width: Ns) -> _Found:
+    """Does as `_by_columns` where there are no columns: in a lake."""
+    reader = FieldReader(view, topic, (field,))
+    folded = reader.over(window, _edges(view, window, width))
+    parts = [
+        _Part(first, last, *(numbers[0].size, numbers[0].total, numbers[0].low, numbers[0].high))
+        for table in folded.parts
+        for first, last, numbers in zip(*table, strict=True)
+        if numbers[0].size
+    ]
+    return parts, folded.since, reader.failures
 
 
 def _edges(view: View, window: TimeWindow, width: Ns) -> Sequence[Ns]:
@@ -105,10 +141,10 @@ def _binned(parts: Sequence[_Part], width: Ns) -> list[tuple[float | None, ...]]
     middles = np.array([(each.first + each.last) // 2 for each in parts], np.int64)
     bins = middles // width
     starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
-    sizes = np.array([each.numbers.size for each in parts], np.float64)
-    totals = np.array([each.numbers.total for each in parts])
-    lows = np.minimum.reduceat(np.array([each.numbers.low for each in parts]), starts)
-    highs = np.maximum.reduceat(np.array([each.numbers.high for each in parts]), starts)
+    sizes = np.array([each.size for each in parts], np.float64)
+    totals = np.array([each.total for each in parts])
+    lows = np.minimum.reduceat(np.array([each.low for each in parts]), starts)
+    highs = np.maximum.reduceat(np.array([each.high for each in parts]), starts)
     means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts)
     times = np.add.reduceat(middles / NS_PER_S * sizes, starts) / np.add.reduceat(sizes, starts)
     columns = (lows, means, highs)

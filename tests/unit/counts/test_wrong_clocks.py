@@ -1,0 +1,78 @@
+"""Bins leave bags out that a wrong clock dated, unless the window has nothing else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.history.context import QuerySettings
+from tests.support.bags import boolean, odom, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.memories import asked, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+TRUE = 1_784_030_400
+UNSET = 86_400
+AHEAD = 2_082_758_400
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Memory:
+    """Six messages of today, two of 1970 and one of 2036."""
+    for name, begin, count in (("unset", UNSET, 2), ("today", TRUE, 6), ("ahead", AHEAD, 1)):
+        messages = [odom((begin + n) * S, n, 0.0) for n in range(count)]
+        messages += [boolean((begin + n) * S + 1, data=n % 2 == 0) for n in range(count)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+    return memory_of(tmp_path, clock=FixedClock((TRUE + 600) * S), limits=QuerySettings())
+
+
+def all_of(reply: Any) -> dict[str, object]:
+    return dict(zip(reply["columns"][1:], reply["all"], strict=True))
+
+
+def whole(begin: int = 0, end: int = AHEAD + 10) -> dict[str, object]:
+    return {"start": begin, "end": end, "by": "hour"}
+
+
+def test_messages_of_a_wrong_clock_do_not_count_in_the_first_or_the_last_bin(
+    memory: Memory, tmp_path: Path
+) -> None:
+    question = {"topic": "/odom", "fields": ["position.x"], **whole()}
+    reply = asked(memory, tmp_path, "get_topic_in_range", **question)
+    assert len(reply["rows"]) == 1
+    found = all_of(reply)
+    assert found["count"] == 6
+    assert (found["first_unix"], found["last_unix"]) == (TRUE, TRUE + 5)
+    assert (found["position.x.max"], found["position.x.mean"]) == (5.0, 2.5)
+    assert any("wrong clock" in note for note in reply["notes"])
+
+
+def test_a_condition_does_not_count_where_a_wrong_clock_dated_it(
+    memory: Memory, tmp_path: Path
+) -> None:
+    condition = {"topic": "/bumper", "condition_type": "equals", "value": False}
+    found = all_of(asked(memory, tmp_path, "find_matches", **condition, **whole()))
+    assert found["count"] == 3
+    assert found["seconds"] == pytest.approx(2, abs=0.1)
+
+
+def test_metres_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) -> None:
+    assert all_of(asked(memory, tmp_path, "trajectory_summary", **whole()))["metres"] == 5.0
+
+
+@pytest.mark.parametrize(("begin", "count"), [(UNSET, 2), (AHEAD, 1)])
+def test_a_window_inside_of_a_bag_of_a_wrong_clock_counts_what_is_there(
+    memory: Memory, tmp_path: Path, begin: int, count: int
+) -> None:
+    window = {"start": begin - 5, "end": begin + 60}
+    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", by="hour", **window)
+    assert all_of(reply)["count"] == count
+    condition = {"topic": "/odom", "condition_type": "above", "field": "position.x", "value": -1}
+    reply = asked(memory, tmp_path, "find_matches", **condition, **window)
+    assert reply["searched_from"] == begin
