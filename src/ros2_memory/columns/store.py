@@ -269,7 +269,7 @@ class ColumnStore(Database):
             self._topics = {**known, **added} if added else known
             return self._topics
 
-        return self.read(ask, {})
+        return self.read(ask, self._topics)
 
     def parts(self, topic: str, after: int = 0) -> list[PartHead]:
         """Returns the parts of a topic, of all its types, in the order of their first messages.
