@@ -73,7 +73,8 @@ def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None
     world.fill(merge=False)
     split = stored_rows(store_file(tmp_path))
     world.fill()
-    assert (FORMAT, split, stored_rows(store_file(tmp_path))) == (1, "", ""), (
+    hashes = split, stored_rows(store_file(tmp_path))
+    assert (FORMAT, *hashes) == (1, "945815a81325f399", "c7cab32eebacdd30"), (
         "the store has other rows of the same bags than before: raise FORMAT in columns/pack.py, "
         "so that stores are filled anew, and pin the new number and hashes here"
     )
