@@ -533,14 +533,16 @@ def _connect_and_check(path: Path, tables: Tables) -> sqlite3.Connection:
         sqlite3.Error: it is busy, or cannot be opened or written.
     """
     for _ in range(2):
-        connection = _connect(str(path), tables)
+        connection = None
         try:
+            connection = _connect(str(path), tables)
             other = _create_or_compare_tables(connection, tables)
             if other is None:
                 return connection
             in_use = _is_used_elsewhere(connection)
         except sqlite3.DatabaseError as error:
-            connection.close()
+            if connection is not None:
+                connection.close()
             # Operational errors are those of the moment or of the disk, not of the content.
             if isinstance(error, sqlite3.OperationalError):
                 raise
@@ -557,8 +559,12 @@ def _connect(target: str, tables: Tables) -> sqlite3.Connection:
     connection = sqlite3.connect(
         target, timeout=BUSY_S, isolation_level=None, check_same_thread=False
     )
-    for pragma in tables.pragmas:
-        connection.execute(f"PRAGMA {pragma}")
+    try:
+        for pragma in tables.pragmas:
+            connection.execute(f"PRAGMA {pragma}")
+    except sqlite3.Error:
+        connection.close()
+        raise
     return connection
 
 

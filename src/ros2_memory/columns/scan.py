@@ -53,6 +53,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
+_ATTEMPTS: Final = 5
+"""How often a scan looks what is stored, while that changes; then it reads the bags."""
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
 
@@ -170,6 +172,7 @@ class Scanner:
         state = coverage.state
         known = self._heads.get(topic)
         if known is None or known.coverage is not coverage:
+            failures = self.store.failures
             heads: list[PartHead] = []
             if known is not None and known.coverage.state.deletion == state.deletion:
                 heads = [*known.heads]
@@ -177,7 +180,8 @@ class Scanner:
                 heads += self.store.parts(topic, max((head.number for head in heads), default=0))
                 heads.sort(key=lambda head: (head.first, head.number))
             known = _Heads.of(heads, coverage)
-            self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
+            if self.store.failures == failures:
+                self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
         yield from known.within(window)
 
     def part(self, head: PartHead, coverage: Coverage) -> PartUnit | None:
@@ -214,9 +218,10 @@ class Scanner:
     def split(self, number: int, topic: str) -> list[Table] | None:
         """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
         assert self.store is not None  # noqa: S101 - there are no splits without one
-        topics = self.store.topics()
+        failures = self.store.failures
         data = self.store.split_data(number)
-        if data is None:
+        topics = self.store.topics()
+        if data is None or self.store.failures != failures:
             return None
         wanted = {key for key, known in topics.items() if known.channel.topic == topic}
         return [*unpack_tables(data, topics, wanted.__contains__)]
@@ -244,7 +249,7 @@ class _Scan:
     def __init__(self, scanner: Scanner, asked: Asked) -> None:
         self._scanner = scanner
         self._asked = asked
-        self._coverage = scanner.coverage(asked.timeline)
+        self._coverage: Coverage | None = None
         self._shared = [
             span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
         ]
@@ -258,7 +263,8 @@ class _Scan:
             reach = TimeWindow.everything()
         elif self._shared:
             reach = reach.widened(2 * COPY_HORIZON_NS)
-        self._sources = sorted(self._found(reach), key=lambda source: (source.first, source.last))
+        found = self._settled(reach)
+        self._sources = sorted(found, key=lambda source: (source.first, source.last))
 
     def rows(self, *, newest_first: bool) -> Iterator[Rows]:
         sources = self._sources
@@ -272,6 +278,28 @@ class _Scan:
                     found = self._counting(unit)
                     if found is not None:
                         yield found
+
+    def _settled(self, reach: TimeWindow) -> list[_Source]:
+        """Returns the sources that may have rows in a window, as the store is at one moment."""
+        store = self._scanner.store
+        for _ in range(_ATTEMPTS if store is not None else 0):
+            assert store is not None  # noqa: S101 - as the range says
+            failures = store.failures
+            self._coverage = self._scanner.coverage(self._asked.timeline)
+            found = [*self._found(reach)]
+            # Meanwhile another process may have made parts of splits, or the file may have failed:
+            # rows would be missing.
+            if self._coverage is None:
+                return found
+            before, now = self._coverage.state, store.state()
+            if (failures, before.part, before.deletion) == (
+                store.failures,
+                now.part,
+                now.deletion,
+            ):
+                return found
+        self._coverage = None
+        return [*self._found(reach)]
 
     def _found(self, reach: TimeWindow) -> Iterator[_Source]:
         """Yields the sources that may have rows in a window."""

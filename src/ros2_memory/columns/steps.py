@@ -51,6 +51,8 @@ METRES: Final = Step(per_unit=10_000)
 """0.1 mm."""
 RADIANS: Final = Step(per_unit=10_000)
 """0.1 mrad."""
+VELOCITY: Final = Step(per_unit=10_000)
+"""0.1 mm/s, or 0.1 mrad/s."""
 QUATERNION: Final = Step(per_unit=20_000)
 """5e-5. A component then changes by at most 2.5e-5, so a unit quaternion by at most 5e-5, and the
 rotation by twice that (its angle is twice that of the quaternion): 0.1 mrad."""
@@ -67,6 +69,7 @@ _JOINTS: Final = {
     "trajectory_msgs/msg/JointTrajectoryPoint": frozenset({"positions"}),
 }
 _ROTATIONS: Final = frozenset({"orientation", "rotation", "quaternion"})
+_VELOCITIES: Final = frozenset({"linear", "angular", "linear_velocity", "angular_velocity"})
 _PLACES: Final = frozenset(
     {"position", "translation", "point", "points", "location", "origin", "center", "centroid"}
 )
@@ -87,8 +90,8 @@ def step_of(path: str, definition: Definition | None = None) -> Step:
     Returns:
         0.1 mm for coordinates of points and for vectors that are named as positions are, 0.1 mrad
         for angles and joints, what keeps rotations within 0.1 mrad for quaternions, 1e-9 degree for
-        latitude and longitude and 0.1 mm for the altitude beside them; otherwise, and so for
-        velocities, a millionth of the value.
+        latitude and longitude and 0.1 mm for the altitude beside them, 0.1 mm/s and 0.1 mrad/s for
+        velocities; otherwise a millionth of the value.
     """
     around, _, name = path.rpartition(".")
     if name.isdigit() or name in _OF_ARRAYS:
@@ -123,7 +126,9 @@ def _axis(name: str, owner: str, field: str) -> Step:
         return QUATERNION
     if owner in _POINTS or (owner in _POSES_2D and name != "z"):
         return METRES
-    return METRES if owner in {_VECTOR, ""} and field in _PLACES else RELATIVE
+    if owner in {_VECTOR, ""} and field in _PLACES:
+        return METRES
+    return VELOCITY if owner == _VECTOR and field in _VELOCITIES else RELATIVE
 
 
 def _is_rotation(owner: str, field: str) -> bool:

@@ -59,7 +59,7 @@ TABLES: Final = Tables(
     version=FORMAT,
     names=("bag", "topic", "definition", "split", "part", "part_column", "deletion"),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
-    pragmas=("page_size = 8192", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
+    pragmas=("page_size = 4096", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
     statements="""
 CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQUE,
   size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
@@ -269,7 +269,7 @@ class ColumnStore(Database):
             self._topics = {**known, **added} if added else known
             return self._topics
 
-        return self.read(ask, {})
+        return self.read(ask, self._topics)
 
     def parts(self, topic: str, after: int = 0) -> list[PartHead]:
         """Returns the parts of a topic, of all its types, in the order of their first messages.

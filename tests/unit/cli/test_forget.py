@@ -17,6 +17,8 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.columns.pack import decompressed
+from ros2_memory.columns.store import FILE as COLUMNS
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
@@ -174,6 +176,42 @@ def test_the_catalogue_forgets_with_them(bag_dir: Path, capsys: Capture) -> None
     asked = json.dumps({"topic": "/chatter", "condition_type": "contains", "value": "secret1"})
     assert cli.main(["ask", "find_last_match", asked, "--json"]) == 0
     assert capsys.readouterr().out.strip().splitlines()[-1] == "null"
+
+
+def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
+    bag_dir: Path, capsys: Capture
+) -> None:
+    assert cli.main(["index"]) == 0
+    store = bag_dir / FOLDER / COLUMNS
+    assert all(f"secret{n}".encode() in unpacked(store) for n in range(4))
+    assert forget(20, 35, "--yes") == 0
+    assert b"secret1" not in unpacked(store) + all_bytes(bag_dir)
+    (bag_dir / "rec_1" / "rec_2.mcap").unlink()
+    assert forget(40, 55, "--yes") == 0
+    assert "nothing to delete" in capsys.readouterr().out
+    assert b"secret2" not in unpacked(store) + all_bytes(bag_dir / FOLDER)
+    assert cli.main(["index"]) == 0
+    assert b"secret3" in unpacked(store)
+
+
+def test_a_dry_run_leaves_the_columns(bag_dir: Path) -> None:
+    assert cli.main(["index"]) == 0
+    store = bag_dir / FOLDER / COLUMNS
+    (bag_dir / "rec_1" / "rec_2.mcap").unlink()
+    forget(40, 55, "--dry-run")
+    assert b"secret2" in unpacked(store)
+
+
+def unpacked(store: Path) -> bytes:
+    """All that is packed in a store of columns."""
+    with closing(sqlite3.connect(store)) as base:
+        splits = base.execute("SELECT tables FROM split").fetchall()
+        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
+    return b"".join(decompressed(blob) for (blob,) in [*splits, *columns])
+
+
+def all_bytes(folder: Path) -> bytes:
+    return b"".join(path.read_bytes() for path in folder.rglob("*") if path.is_file())
 
 
 @pytest.mark.parametrize("deployment", ["query_only", "replay"])

@@ -34,6 +34,8 @@ from ros2_memory.bootstrap import build_memory
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey
 from ros2_memory.cli.maintenance import forget as cli_forget
+from ros2_memory.columns.pack import decompressed
+from ros2_memory.columns.store import FILE as COLUMNS
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.retention import eraser
@@ -158,6 +160,8 @@ def traces(root: Path, needle: str) -> list[str]:
                         parts += [getattr(each, "data", b"") for each in inner]
         if path.name == FILE:
             parts += packed_in(path)
+        if path.name == COLUMNS:
+            parts += columns_in(path)
         if any(needle.encode() in part for part in parts):
             found.append(str(path.relative_to(root)))
     return found
@@ -175,6 +179,14 @@ def packed_in(catalogue: Path) -> Iterator[bytes]:
                     (topic,),
                 )
                 yield from (unpacked(each, model) for (each,) in rows if each)
+
+
+def columns_in(store: Path) -> Iterator[bytes]:
+    """All that a store of columns packs, unpacked."""
+    with closing(sqlite3.connect(store)) as base:
+        splits = base.execute("SELECT tables FROM split").fetchall()
+        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
+    yield from (decompressed(blob) for (blob,) in [*splits, *columns])
 
 
 def indexed() -> None:
@@ -208,11 +220,12 @@ def test_nothing_of_it_is_left_anywhere(
     tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     indexed()
-    assert traces(tmp_path, SAID)
-    catalogue = bag_dir / FOLDER / FILE
-    # A query server has the catalogue open, so that its log lies beside it.
-    with closing(sqlite3.connect(catalogue)) as server:
+    assert f"{FOLDER}/{COLUMNS}" in " ".join(traces(tmp_path, SAID))
+    catalogue, columns = bag_dir / FOLDER / FILE, bag_dir / FOLDER / COLUMNS
+    # A query server has both files open, so that their logs lie beside them.
+    with closing(sqlite3.connect(catalogue)) as server, closing(sqlite3.connect(columns)) as other:
         server.execute("SELECT count(*) FROM bags").fetchone()
+        other.execute("SELECT count(*) FROM bag").fetchone()
         assert forget(0, 100, "--topic", CAMERA) == 0
         assert traces(tmp_path, SAID) == []
     indexed()

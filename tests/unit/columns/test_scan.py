@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import random
+import sqlite3
 import tempfile
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.model import TimeWindow
 from tests.support.bags import odom, text, write_mcap
 from tests.support.column_worlds import World, check_all, check_rows, times
@@ -141,3 +144,52 @@ def test_tables_come_in_the_order_of_time(tmp_path: Path, newest_first: bool) ->
     world = World.of(tmp_path)
     world.fill()
     assert check_rows(world, "/odom", newest_first=newest_first) == 40
+
+
+def test_parts_that_another_process_makes_meanwhile_hide_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut(tmp_path, [10, 30, 31, 60])
+    world, other = World.of(tmp_path), World.of(tmp_path)
+    world.fill(merge=False)
+    assert check_rows(world, "/odom") == 40
+    splits = world.store.splits
+
+    def after_a_merge() -> frozenset[int]:
+        other.filling.merge(other.memory.index.snapshot().timeline)
+        return splits()
+
+    monkeypatch.setattr(world.store, "splits", after_a_merge)
+    assert check_rows(world, "/odom") == 40
+    assert splits() == frozenset()
+
+
+@pytest.mark.parametrize("name", ["parts", "splits", "topics", "split_data", "state", "bags"])
+def test_a_store_that_fails_while_it_is_asked_hides_no_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    cut(tmp_path, [10, 30, 31, 60])
+    World.of(tmp_path).fill(merge=name != "split_data")
+    world = World.of(tmp_path)
+    whole = getattr(world.store, name)
+    read = world.store.read
+    failing = [True]
+
+    def busy(*given: object) -> object:
+        def fail(_: sqlite3.Connection) -> object:
+            error = sqlite3.OperationalError("database is locked")
+            error.sqlite_errorcode = sqlite3.SQLITE_BUSY
+            raise error
+
+        if failing:
+            failing.clear()
+            with monkeypatch.context() as patch:
+                patch.setattr(world.store, "read", lambda _, unknown: read(fail, unknown))
+                return whole(*given)
+        return whole(*given)
+
+    monkeypatch.setattr(world.store, name, busy)
+    with suppress(GoneError):  # then it says so
+        assert check_rows(world, "/odom") == 40
+    assert not failing
+    assert check_rows(world, "/odom") == 40

@@ -1,0 +1,136 @@
+"""Kills, other processes and two servers while columns are stored: the same answers throughout."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import shutil
+import signal
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.columns import database, fill
+from tests.support.column_worlds import World, check_all, store_file
+from tests.support.examples import LONG
+from tests.unit.columns.test_fill import in_groups, write_bag, write_long_bag
+
+if TYPE_CHECKING:
+    from multiprocessing.process import BaseProcess
+    from pathlib import Path
+
+    from ros2_memory.columns.database import Tables
+
+KILLS = 100 if LONG else 5
+ROWS = 12 * 21 + 120
+FORKED = multiprocessing.get_context("fork")
+
+
+def write_bags(bag_dir: Path) -> None:
+    """Twelve minutes of one recording, and a bag of an hour, which is stored in several goes."""
+    for number in range(12):
+        write_bag(bag_dir, number)
+    write_long_bag(bag_dir / "long")
+
+
+class StatementCounter:
+    """Counts the statements of all connections; kills its process at one of them."""
+
+    def __init__(self, kill_at: int = 0) -> None:
+        self.count = 0
+        self._kill_at = kill_at
+        self._connect = database._connect
+
+    def connect(self, target: str, tables: Tables) -> sqlite3.Connection:
+        connection = self._connect(target, tables)
+        connection.set_trace_callback(self._trace)
+        return connection
+
+    def _trace(self, _: str) -> None:
+        self.count += 1
+        if self.count == self._kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fill_up(bag_dir: Path, kill_at: int = 0) -> int:
+    """Stores everything, of long bags group by group; returns how many statements that took."""
+    counter = StatementCounter(kill_at)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(database, "_connect", counter.connect)
+        patch.setattr(fill, "decoded", in_groups)
+        World.of(bag_dir).fill()
+    return counter.count
+
+
+def forked(bag_dir: Path, kill_at: int = 0) -> BaseProcess:
+    process = FORKED.Process(target=fill_up, args=(bag_dir, kill_at), daemon=True)
+    process.start()
+    return process
+
+
+def assert_whole(bag_dir: Path) -> None:
+    """Each bag is stored whole or not at all, and what is stored of it once."""
+    with closing(sqlite3.connect(store_file(bag_dir))) as base:
+        assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        rows = base.execute(
+            "SELECT bag.path, bag.messages, bag.size,"
+            " EXISTS (SELECT 1 FROM split WHERE split.bag = bag.id),"
+            " (SELECT count(*) FROM part, json_each(part.bags) WHERE value = bag.id) FROM bag"
+        ).fetchall()
+    for path, _, size, is_split, parts in rows:
+        assert size < 0 or bool(is_split) != bool(parts), path
+
+
+def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all(tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    write_bags(whole)
+    statements = fill_up(whole)
+    assert check_all(World.of(whole)) == ROWS
+    draw = random.Random()
+    for _ in range(KILLS):
+        kill_at = draw.randint(1, statements)
+        bag_dir = tmp_path / f"killed at {kill_at} of {statements}"
+        write_bags(bag_dir)
+        process = forked(bag_dir, kill_at)
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+        if store_file(bag_dir).exists():
+            assert check_all(World.of(bag_dir)) == ROWS
+            assert_whole(bag_dir)
+        fill_up(bag_dir)
+        world = World.of(bag_dir)
+        assert len(world.stored()) == 13
+        assert_whole(bag_dir)
+        assert check_all(world) == ROWS
+        shutil.rmtree(bag_dir)
+
+
+def test_another_process_has_the_same_answers_while_one_fills(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    asking = World.of(tmp_path)
+    assert check_all(asking) == ROWS
+    process = forked(tmp_path)
+    while process.is_alive():
+        assert check_all(asking) == ROWS
+    process.join()
+    assert process.exitcode == 0
+    assert check_all(asking) == ROWS
+    assert len(asking.stored()) == 13
+
+
+def test_two_servers_that_fill_at_once_store_each_bag_once(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    processes = [forked(tmp_path) for _ in range(2)]
+    for process in processes:
+        process.join()
+        assert process.exitcode == 0
+    world = World.of(tmp_path)
+    world.fill()
+    assert len(world.stored()) == 13
+    assert_whole(tmp_path)
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        assert base.execute("SELECT sum(messages) FROM part").fetchone() == (ROWS,)
+    assert check_all(world) == ROWS

@@ -1,0 +1,101 @@
+"""The queries that docs/reference/files.md shows answer what it says that they do."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import sqlite3
+from contextlib import closing
+from functools import cache
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.columns.fill import StoreLimits
+from ros2_memory.columns.store import TABLES
+from tests.support.bags import battery, odom, write_mcap
+from tests.support.column_worlds import World, store_file
+from tests.support.memories import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_700_000_400 * S  # 2023-11-14, 22:20 UTC
+
+
+@cache
+def section() -> str:
+    text = (ROOT / "docs/reference/files.md").read_text(encoding="utf-8")
+    return text.partition("## The store of columns")[2]
+
+
+def query(question: str) -> str:
+    match = re.search(re.escape(question) + r"\n\n```sql\n(.+?);\n```", section(), re.DOTALL)
+    assert match is not None
+    return match[1]
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bag_dir = tmp_path_factory.mktemp("bags")
+    draw = random.Random(3)
+    for number in range(3):
+        start = T0 + number * 3000 * S
+        messages = [battery(start + n * S, 0.9 - number / 10 - n / 1000) for n in range(5)]
+        messages += [odom(start + n * S // 100, draw.random(), 0.5) for n in range(2000)]
+        path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+        os.utime(path, ns=(T0, T0))
+    World.of(bag_dir, limits=StoreLimits(max_share=0.0)).fill()
+    return store_file(bag_dir)
+
+
+def answer(file: Path, question: str) -> list[tuple[object, ...]]:
+    with closing(sqlite3.connect(file)) as base:
+        return base.execute(query(question)).fetchall()
+
+
+def test_bags_that_are_stored(file: Path) -> None:
+    assert answer(file, "Which bags are stored?") == [
+        ("rec/rec_0.mcap", 2005, "2023-11-14 22:20:00"),
+        ("rec/rec_1.mcap", 2005, "2023-11-14 23:10:00"),
+        ("rec/rec_2.mcap", 2005, "2023-11-15 00:00:00"),
+    ]
+
+
+def test_messages_of_a_day(file: Path) -> None:
+    assert answer(file, "How many messages has each topic on each day (UTC)?") == [
+        ("2023-11-14", "/battery_state", 10),
+        ("2023-11-14", "/odom", 4000),
+        ("2023-11-15", "/battery_state", 5),
+        ("2023-11-15", "/odom", 2000),
+    ]
+
+
+def test_least_charge_of_an_hour(file: Path) -> None:
+    found = answer(file, "What was the least charge of each hour?")
+    assert [hour for hour, _ in found] == ["2023-11-14 22 h", "2023-11-14 23 h", "2023-11-15 00 h"]
+    assert [charge for _, charge in found] == pytest.approx([0.896, 0.796, 0.696])
+
+
+def test_columns_that_are_dropped(file: Path) -> None:
+    assert answer(file, "Of which topics are columns dropped, and since when?") == [
+        ("/odom", "2023-11-14 22:20:00", 3)
+    ]
+
+
+def test_bytes_of_a_topic(file: Path) -> None:
+    assert {topic for topic, _ in answer(file, "How many bytes does each topic take?")} == {
+        "/battery_state",
+        "/odom",
+    }
+
+
+def test_all_tables_and_their_columns_are_described(file: Path) -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", section(), re.MULTILINE))
+    assert {*rows} == {*TABLES.names}
+    with closing(sqlite3.connect(file)) as base:
+        for table, described in rows.items():
+            names = {row[1] for row in base.execute(f"PRAGMA table_info({table})")} - {"id", "part"}
+            assert {name for name in names if f"`{name}`" not in described} == set(), table

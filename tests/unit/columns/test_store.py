@@ -1,0 +1,239 @@
+"""The file of the store may be anything at any time, and what its rows mean is pinned."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from ros2_memory.columns.pack import FORMAT, decompressed
+from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.store import ColumnStore
+from ros2_memory.columns.table import Table
+from ros2_memory.storage.base import Channel, Schema
+from tests.support.bags import battery, detections, odom, text, write_mcap
+from tests.support.column_worlds import World, check_all, store_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.columns.table import Column
+
+S = 10**9
+T0 = 1_700_000_400 * S
+ZSTD = b"\x28\xb5\x2f\xfd"
+
+
+def write_bags(bag_dir: Path, count: int = 4) -> list[Path]:
+    paths = []
+    for number in range(count):
+        start = T0 + number * 10 * S
+        messages = [odom(start + n * S // 2, n / 7, number / 3) for n in range(20)]
+        messages += [detections(start + S, ["cup", f"thing {number}"]), battery(start + 2 * S, 0.7)]
+        messages += [text(start + 3 * S, ""), text(start + 4 * S, "Straße")]
+        path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
+        os.utime(path, ns=(T0, T0))
+        paths.append(path)
+    return paths
+
+
+def stored_rows(file: Path) -> str:
+    """A hash of all that is in a store, but for how it is compressed and what files looked like."""
+    digest = hashlib.sha256()
+    with closing(sqlite3.connect(file)) as base:
+        tables = {
+            "bag": "id, path, first_ns, last_ns, messages, hashed, definitions",
+            "topic": "*",
+            "definition": "*",
+            "split": "*",
+            "part": "*",
+            "part_column": "*",
+        }
+        for table, columns in tables.items():
+            for row in base.execute(f"SELECT {columns} FROM {table} ORDER BY 1, 2"):  # noqa: S608
+                values = [
+                    decompressed(value)
+                    if isinstance(value, bytes) and value.startswith(ZSTD)
+                    else value
+                    for value in row
+                ]
+                digest.update(repr((table, values)).encode())
+    return digest.hexdigest()[:16]
+
+
+def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill(merge=False)
+    split = stored_rows(store_file(tmp_path))
+    world.fill()
+    hashes = split, stored_rows(store_file(tmp_path))
+    assert (FORMAT, *hashes) == (1, "945815a81325f399", "c7cab32eebacdd30"), (
+        "the store has other rows of the same bags than before: raise FORMAT in columns/pack.py, "
+        "so that stores are filled anew, and pin the new number and hashes here"
+    )
+
+
+@pytest.mark.parametrize("merged", [True, False])
+def test_columns_of_every_kind_come_back(tmp_path: Path, merged: bool) -> None:
+    """Numbers that SQLite has no type for, constants, one text, no element at all."""
+    [path] = write_bags(tmp_path, 1)
+    world = World.of(tmp_path)
+    [bag] = world.memory.index.snapshot().bags
+    numbers: dict[str, Column] = {
+        "huge": np.full(3, 2**64 - 1, np.uint64),
+        "hugest": np.array([2**63, 2**64 - 1, 5], np.uint64),
+        "zero": np.full(3, 0.0),
+        "nan": np.full(3, np.nan),
+        "infinite": np.array([np.inf, -np.inf, 0.0]),
+        "low": np.full(3, -(2**63), np.int64),
+        "yes": np.full(3, True),
+    }
+    times = bag.start + np.arange(3)
+    channel = Channel("/kinds", "cdr", Schema("a_msgs/msg/Kinds"))
+    table = Table(channel, times, times, np.arange(3), numbers)
+    key = world.filling._key(bag)
+    assert world.store.put(key, bag, [table], hashed=False)
+    if merged:
+        [number] = world.store.splits()
+        assert world.store.merge([number], 10**6)
+    timeline = world.memory.index.snapshot().timeline
+    scanner = Scanner(world.store, tmp_path)
+    coverage = scanner.coverage(timeline)
+    assert coverage is not None
+    if merged:
+        [head] = world.store.parts("/kinds")
+        unit = scanner.part(head, coverage)
+        assert unit is not None
+        back: Table = unit.table
+    else:
+        [number] = world.store.splits()
+        tables = scanner.split(number, "/kinds")
+        assert tables is not None
+        [back] = tables
+    for name, column in numbers.items():
+        found = np.asarray(back.columns[name])
+        assert found.dtype == np.asarray(column).dtype
+        assert repr(found.tolist()) == repr(np.asarray(column).tolist()), name
+    assert path.exists()
+
+
+def write_noise(file: Path) -> None:
+    file.write_bytes(random.Random(3).randbytes(20_000))
+
+
+def spoil_pages(file: Path) -> None:
+    with file.open("r+b") as stream:
+        stream.seek(8192)
+        stream.write(random.Random(3).randbytes(file.stat().st_size - 8192))
+
+
+def raise_version(file: Path) -> None:
+    with closing(sqlite3.connect(file)) as base:
+        base.execute("PRAGMA user_version = 99")
+
+
+def lower_version(file: Path) -> None:
+    with closing(sqlite3.connect(file)) as base:
+        base.execute("PRAGMA user_version = 0")
+
+
+def add_table(file: Path) -> None:
+    with closing(sqlite3.connect(file)) as base:
+        base.execute("CREATE TABLE later (id INTEGER)")
+
+
+@pytest.mark.parametrize(
+    "spoil", [write_noise, spoil_pages, raise_version, lower_version, add_table]
+)
+def test_a_file_that_is_damaged_or_of_another_version_is_set_aside_and_made_anew(
+    tmp_path: Path, spoil: object
+) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    world.store.close()
+    assert callable(spoil)
+    spoil(store_file(tmp_path))
+    again = World.of(tmp_path)
+    assert check_all(again) == 4 * 24
+    assert again.fill() == 4
+    assert check_all(again) == 4 * 24
+    assert store_file(tmp_path).with_name("columns.sqlite.aside").exists()
+
+
+def test_a_file_that_is_lost_while_it_is_used_is_made_anew(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    assert check_all(world) == 4 * 24
+    store_file(tmp_path).unlink()
+    world.store.look_after()
+    assert check_all(world) == 4 * 24
+    assert world.fill() == 4
+    assert check_all(world) == 4 * 24
+
+
+def test_a_file_that_turns_out_damaged_while_it_is_asked_costs_no_answer(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        base.execute("UPDATE part SET bags = 'none'")
+        base.commit()
+    assert check_all(World.of(tmp_path)) == 4 * 24
+
+
+def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir)
+    (tmp_path / "file").write_text("no folder")
+    refused = tmp_path / "file" / "columns.sqlite"
+    cache = tmp_path / "cache" / "columns.sqlite"
+    world = World.of(bag_dir)
+    scanner = Scanner(ColumnStore([refused, cache], world.memory.reader.definition), world.bag_dir)
+    assert scanner.store is not None
+    assert scanner.store.path == cache
+    in_memory = World.of(bag_dir, file=refused)
+    assert in_memory.store.path is None
+    assert in_memory.fill() == 4
+    assert check_all(in_memory) == 4 * 24
+    assert len(in_memory.stored()) == 4
+
+
+def test_a_full_disk_loses_nothing_and_is_filled_when_there_is_room(tmp_path: Path) -> None:
+    draw = random.Random(3)
+    write_bags(tmp_path, 2)
+    world = World.of(tmp_path)
+    world.fill()
+    for number in range(2, 40):
+        messages = [odom(T0 + (number * 1000 + n) * S, draw.random(), 0.3) for n in range(300)]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    opened = world.store._opened
+    assert opened is not None
+    [pages] = opened.connection.execute("PRAGMA page_count").fetchone()
+    opened.connection.execute(f"PRAGMA max_page_count = {pages}")
+    stored = world.fill()
+    assert stored < 38
+    assert world.store.is_failing
+    assert check_all(world) == 2 * 24 + 38 * 300
+    opened.connection.execute("PRAGMA max_page_count = 1000000")
+    world.fill()
+    assert len(world.stored()) == 40
+    assert check_all(world) == 2 * 24 + 38 * 300
+
+
+def test_a_file_that_another_program_has_locked_costs_no_answer(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    with closing(sqlite3.connect(store_file(tmp_path), isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        assert check_all(World.of(tmp_path)) == 4 * 24
+        assert check_all(world) == 4 * 24
