@@ -134,6 +134,15 @@ class _Heads:
             yield self.heads[nth]
 
 
+@dataclass(frozen=True, slots=True)
+class Census:
+    """Log times of the earliest and latest message (inclusive), and how many there are."""
+
+    first: Ns
+    last: Ns
+    count: int
+
+
 class Scanner:
     """Scans topics of one bag directory. Thread-safe.
 
@@ -141,6 +150,9 @@ class Scanner:
         store: the store; None where nothing is stored.
         bag_dir: the bag directory.
         cache_mb: memory that unpacked columns may take between calls, in MiB.
+
+    Attributes:
+        censuses: by topic, span and bags, what is stored of each type and what of it counts.
     """
 
     def __init__(self, store: ColumnStore | None, bag_dir: Path, cache_mb: int = 48) -> None:
@@ -149,6 +161,7 @@ class Scanner:
         self._columns: ByteLru[Column] = ByteLru(cache_mb << 20)
         self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
+        self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of a topic in a window.

@@ -10,7 +10,7 @@ from ros2_memory.columns.scan import Asked, Scanner
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
@@ -29,6 +29,7 @@ def scan(
     newest_first: bool = False,
     columns: bool = True,
     copies: bool = False,
+    shared: Sequence[tuple[Ns, Ns]] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `Scanner.rows`.
@@ -36,7 +37,8 @@ def scan(
     What cannot be read is noted. `reached` is called before each table with a log time that what
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
-    a message counts in each recording that holds it.
+    a message counts in each recording that holds it. `shared` are the spans in which recordings
+    may hold copies, where the caller knows them.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -50,12 +52,14 @@ def scan(
         reached(at)
         view.bags.check_deadline()
 
+    if shared is None:
+        shared = () if copies else view.stream.duplicate_spans(topic, window)
     asked = Asked(
         topic,
         window,
         view.snapshot.timeline,
         decode,
-        shared=() if copies else view.stream.duplicate_spans(topic, window),
+        shared=shared,
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )

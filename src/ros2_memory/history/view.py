@@ -17,6 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from ros2_memory.columns.scan import Census
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
@@ -39,7 +40,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.bag_groups import Group
@@ -50,15 +51,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 
-@dataclass(frozen=True, slots=True)
-class Census:
-    """Log times of the earliest and latest message (inclusive), and how many there are."""
-
-    first: Ns
-    last: Ns
-    count: int
-
-
+_CENSUS_BYTES: Final = 1_000
+"""About how much memory the census of a shared span takes."""
 _CENSUSES: Final[WeakKeyDictionary[Timeline, dict[str, dict[str, Census]]]] = WeakKeyDictionary()
 
 
@@ -218,18 +212,25 @@ class View:
                 counted[type_name] = Census(known.first, last, count)
         return counted
 
-    def _overlap_census(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
+    def _overlap_census(
+        self, topic: str, window: TimeWindow
+    ) -> Mapping[str, tuple[Census, Census]]:
         """Returns, by type, the messages stored in overlapping bags, and those that count."""
-        if self.memory.columns is not None:
-            once = _tallied_rows(scan(self, topic, window, columns=False))
-            stored = _tallied_rows(scan(self, topic, window, columns=False, copies=True))
-            return {type_name: (stored[type_name], once[type_name]) for type_name in once}
         bags = self.stream.overlapping_bags([topic], window)
-        question = f"overlap {topic} {window.start:x} {window.stop - window.start:x}"
-        known = self.bags.cached_answer(question, bags, partial(_decode_overlap, window.start))
-        if known is not None:
+        scanner = self.memory.columns
+        if scanner is not None:
+            key = (topic, window, *((each.bag.file, each.bag.mtime_ns) for each in bags))
+            known = scanner.censuses.get(key)
+            if known is None:
+                known = self._census_of_rows(topic, window)
+                if self.notes.complete and not self.call.used_active:
+                    scanner.censuses.put(key, known, _CENSUS_BYTES + 200 * len(bags))
             return known
-        stored = {}
+        question = f"overlap {topic} {window.start:x} {window.stop - window.start:x}"
+        answered = self.bags.cached_answer(question, bags, partial(_decode_overlap, window.start))
+        if answered is not None:
+            return answered
+        stored: dict[str, Census] = {}
         everywhere = [(window.start, window.stop)]
         with self.notes.isolated():
             merged = self.stream.merged(bags, [topic], window, newest_first=False)
@@ -245,6 +246,13 @@ class View:
             }
             self.bags.cache_answer(question, bags, json.dumps(answer))
         return counted
+
+    def _census_of_rows(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
+        """Returns the same by the rows of a shared span."""
+        span = [(window.start, window.stop)]
+        once = _tallied_rows(scan(self, topic, window, columns=False, shared=span))
+        stored = _tallied_rows(scan(self, topic, window, columns=False, copies=True))
+        return {type_name: (stored[type_name], once[type_name]) for type_name in once}
 
 
 def _stated(topic: str, bags: Sequence[BagSpan]) -> int:

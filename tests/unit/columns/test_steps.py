@@ -14,6 +14,7 @@ from ros2_memory.columns.steps import (
     QUATERNION,
     RADIANS,
     RELATIVE,
+    VELOCITY,
     Step,
     step_of,
 )
@@ -52,7 +53,7 @@ ROBOT = Definition(
     [
         ("corner.x", METRES),
         ("translation.z", METRES),
-        ("linear.x", RELATIVE),
+        ("linear.x", VELOCITY),
         ("facing.w", QUATERNION),
         ("facing.x", QUATERNION),
         ("fix.latitude", DEGREES),
