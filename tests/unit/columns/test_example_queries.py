@@ -44,7 +44,10 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number in range(3):
         start = T0 + number * 3000 * S
         messages = [battery(start + n * S, 0.9 - number / 10 - n / 1000) for n in range(5)]
-        messages += [odom(start + n * S // 100, draw.random(), 0.5) for n in range(2000)]
+        messages += [
+            odom(start + n * S // 100, draw.uniform(-9, 9), draw.uniform(-9, 9))
+            for n in range(2000)
+        ]
         path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
         os.utime(path, ns=(T0, T0))
     World.of(bag_dir, limits=StoreLimits(max_share=0.0)).fill()

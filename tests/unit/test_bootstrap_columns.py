@@ -1,0 +1,77 @@
+"""Where the store of columns lies, and what the configuration says of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory.bootstrap import (
+    build_backfill,
+    build_filling,
+    build_memory,
+    catalogue_paths,
+    column_paths,
+)
+from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.columns.store import FILE
+from ros2_memory.config import load_settings
+from tests.support.bags import odom, write_mcap
+from tests.support.housekeepers import recorded_before
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+T0 = 1_700_000_000 * 10**9
+
+
+def test_columns_lie_beside_the_catalogue_also_where_one_recording_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    recorded_before(tmp_path)
+    given = {"MEMORY_BAG_DIR": str(tmp_path), "MEMORY_DEPLOYMENT": "robot"}
+    paths = column_paths(load_settings([], given))
+    assert paths[0] == tmp_path / ".episodic" / FILE
+    assert [path.parent for path in paths] == [
+        path.parent for path in catalogue_paths(load_settings([], given))
+    ]
+    assert column_paths(load_settings(["data.recording=rec"], given)) == paths
+
+
+def test_a_memory_stores_columns_unless_it_is_told_not_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    bag_dir = tmp_path / "bags"
+    write_mcap(bag_dir / "rec" / "rec_0.mcap", [odom(T0, 1.0, 2.0)])
+    given = {"MEMORY_BAG_DIR": str(bag_dir), "MEMORY_DEPLOYMENT": "query_only"}
+    without = load_settings(["store.enabled=false"], given)
+    memory = build_memory(without)
+    assert memory.columns is not None
+    assert memory.columns.store is None
+    assert build_filling(without, memory) is None
+    settings = load_settings([], given)
+    memory = build_memory(settings)
+    assert memory.columns is not None
+    assert memory.columns.store is not None
+    assert memory.columns.store.path is not None
+    assert memory.columns.store.path.is_relative_to(tmp_path / "cache")
+
+
+def test_index_stores_the_columns_of_every_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(3):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(T0 + number, 1.0, 2.0)])
+    recorded_before(tmp_path)
+    given = {"MEMORY_BAG_DIR": str(tmp_path), "MEMORY_DEPLOYMENT": "robot"}
+    settings = load_settings([], given)
+    memory = build_memory(settings)
+    backfill = build_backfill(settings, memory)
+    monkeypatch.setattr("ros2_memory.index.scan.YOUNG_NS", 0)
+    fill_catalogue(backfill)
+    assert backfill.not_stored() == []
+    assert memory.columns is not None
+    assert memory.columns.store is not None
+    assert len(memory.columns.store.paths()) == 3
