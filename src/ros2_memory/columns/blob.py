@@ -34,6 +34,7 @@ later: the middleware delays every message by a little, and publishers keep time
 from __future__ import annotations
 
 import struct
+from functools import cache
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
@@ -305,6 +306,7 @@ def _table(
     if len(topic.layout.slots) != first + head.packs - begin:
         raise ValueError(f"a blob has other columns of {topic.channel.topic} than its layout")
 
+    @cache
     def packed(path: str) -> Packed:
         slot = topic.layout.slots[path]
         count = counts[slot.sequence - 1] if slot.sequence else head.rows

@@ -29,6 +29,7 @@ from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
+    Layouts,
     LongBag,
     delete_bags,
     insert_bag,
@@ -169,6 +170,7 @@ class ColumnStore(Database):
         self._definition_of = definition_of
         self._definitions = definitions
         self._topics: dict[int, Topic] = {}
+        self._layouts = Layouts()
 
     # Reading
 
@@ -369,7 +371,9 @@ class ColumnStore(Database):
             delete_bags(connection, [key.path])
             definitions = self._definitions if lacks_definitions(tables) else ""
             number = insert_bag(connection, key, bag, definitions, hashed=hashed)
-            entries = [Entry(*topic_of(connection, table), table) for table in tables]
+            entries = [
+                Entry(*topic_of(connection, table, self._layouts), table) for table in tables
+            ]
             connection.execute(
                 "INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries, places=False))
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 from ros2_memory.columns.pack import Known, folded
@@ -86,6 +87,7 @@ def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:
     """
     whole = joined(tables)
 
+    @cache
     def known(path: str) -> Known:
         parts = [table.known(path) for table in tables]
         return Known(max(part.error for part in parts), _joined_zone([part.zone for part in parts]))

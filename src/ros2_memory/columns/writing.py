@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from ros2_memory.columns.store import BagKey
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
+    from ros2_memory.storage.base import Schema
 
 PART_NS: Final[Ns] = 600 * NS_PER_S
 """Bags of one recording that begin in the same ten minutes become one part for each topic."""
 _MOST_INTEGER: Final = 2**63 - 1
+_MOST_LAYOUTS: Final = 4_096
 
 
 class LongBag:
@@ -57,6 +59,7 @@ class LongBag:
         self._share = budget / max(_messages_of(bag), 1)
         self._lacks_definitions = False
         self._number = 0
+        self._layouts = Layouts()
 
     def begin(self, connection: sqlite3.Connection, *, hashed: bool) -> None:
         """Inserts the bag with a key that none has, in place of what its path was stored with."""
@@ -73,7 +76,7 @@ class LongBag:
         self._lacks_definitions |= lacks_definitions(tables)
         packed: dict[int, list[PackedPart]] = defaultdict(list)
         for table in tables:
-            topic, layout = topic_of(connection, table)
+            topic, layout = topic_of(connection, table, self._layouts)
             for rows in _in_parts(table) if len(table) else ():
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
@@ -186,9 +189,27 @@ def zone_of(
     return Zone(low, high, nulls, words)
 
 
-def topic_of(connection: sqlite3.Connection, table: Table) -> tuple[int, Layout]:
+class Layouts:
+    """Remembers the layouts of tables: those of one schema that leave out the same are the same."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Schema, tuple[tuple[str, str], ...]], tuple[Layout, str]] = {}
+
+    def of(self, table: Table) -> tuple[Layout, str]:
+        """Returns the layout of a table, and its JSON."""
+        key = (table.channel.schema, tuple(sorted(table.left_out.items())))
+        known = self._known.get(key)
+        if known is None or not known[0].fits(table):
+            layout = Layout.of(table, table.definition)
+            known = self._known[key] = (layout, layout.to_json())
+            if len(self._known) > _MOST_LAYOUTS:
+                del self._known[next(iter(self._known))]
+        return known
+
+
+def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:
     """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
-    channel, layout = table.channel, Layout.of(table, table.definition)
+    channel, (layout, described) = table.channel, layouts.of(table)
     schema = channel.schema
     definition = _number_of(
         connection,
@@ -203,7 +224,7 @@ def topic_of(connection: sqlite3.Connection, table: Table) -> tuple[int, Layout]
             "encoding": channel.encoding,
             "latched": channel.latched,
             "definition": definition,
-            "layout": layout.to_json(),
+            "layout": described,
         },
     )
     return topic, layout
