@@ -79,10 +79,14 @@ class Coverage:
         at = np.minimum(np.searchsorted(self._numbers, numbers), self._numbers.size - 1)
         return np.where(self._numbers[at] == numbers, at, -1)
 
+    def among(self, numbers: IntArray) -> IntArray:
+        """Returns those of some numbers whose bags are bags of the timeline."""
+        return numbers[self.positions(numbers) >= 0]
+
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
-        [at] = self.positions(np.array([number])).tolist()
-        if at < 0:
+        at = int(self._numbers.searchsorted(number))
+        if at == self._numbers.size or self._numbers[at] != number:
             return None
         nth = int(self._order[at])
         segment = int(np.searchsorted(self._begins, nth, side="right")) - 1

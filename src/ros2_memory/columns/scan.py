@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -70,6 +71,8 @@ class Asked:
         decode: decodes a topic of a bag that is not stored.
         shared: the half-open spans in which different recordings may hold copies, in order.
         relatches: whether recordings may have received a message again, as of a latched topic.
+        may_be_empty: whether rows are yielded also where none of them counts. Which do is then
+            found out only where that is asked.
         check: is called before each table with a log time that what is left does not lie behind
             (with `newest_first`: is not later than); raises where the call's time is over.
     """
@@ -80,6 +83,7 @@ class Asked:
     decode: Decode
     shared: Sequence[tuple[Ns, Ns]] = ()
     relatches: bool = False
+    may_be_empty: bool = False
     check: Callable[[Ns], None] = lambda _: None
 
 
@@ -205,13 +209,12 @@ class Scanner:
         """
         assert self.store is not None  # noqa: S101 - there are no parts without one
         offset = self.store.offset
-        found = {int(number): coverage.bag(int(number)) for number in head.bags}
-        bags = {number - offset: bag for number, bag in found.items() if bag is not None}
+        counting = coverage.among(head.bags)
         columns = self._known.get(head.number)
         if columns is None:
             columns = self.store.part_columns(head.number)
             self._known.put(head.number, columns, _COLUMN_BYTES * len(columns))
-        if not bags:
+        if not counting.size:
             return None
         topic = self.store.topics().get(head.topic)
         if not columns or topic is None:
@@ -225,8 +228,15 @@ class Scanner:
             column = load(path) if path in known else None
             return None if column is None else np.asarray(column, np.int64)
 
+        def bag_of(number: int) -> BagFile:
+            bag = coverage.bag(number + offset)
+            if bag is None:
+                raise GoneError
+            return bag
+
         times = np.broadcast_to(np.int64(0), (known[LOG_TIME].count,))
-        return PartUnit(head, part_table(head.topic, topic, known, load, times), integers, bags)
+        table = part_table(head.topic, topic, known, load, times)
+        return PartUnit(head, table, integers, counting - offset, bag_of)
 
     def split(self, number: int, topic: str) -> list[Table] | None:
         """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
@@ -266,6 +276,7 @@ class _Scan:
         self._shared = [
             span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
         ]
+        self._ends = [stop for _, stop in self._shared]
         self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
@@ -288,9 +299,9 @@ class _Scan:
             if window.overlaps(source.first, source.last):
                 self._asked.check(source.last if newest_first else source.first)
                 for unit in self._units(source):
-                    found = self._counting(unit)
-                    if found is not None:
-                        yield found
+                    rows = Rows(unit, partial(self._counting, unit))
+                    if self._asked.may_be_empty or len(rows):
+                        yield rows
 
     def _settled(self, reach: TimeWindow) -> list[_Source]:
         """Returns the sources that may have rows in a window, as the store is at one moment."""
@@ -357,8 +368,8 @@ class _Scan:
                 self._decoded.popitem(last=False)
         return known
 
-    def _counting(self, unit: Unit) -> Rows | None:
-        """Returns the rows of a unit that count in the window; None if there are none."""
+    def _counting(self, unit: Unit) -> IntArray | None:
+        """Returns the rows of a unit that count in the window; None: all do."""
         window = self._asked.window
         counting = unit.counting()
         if not window.covers(unit.first, unit.last):
@@ -369,22 +380,20 @@ class _Scan:
         if repeated.size:
             counting = np.ones(len(unit.table), np.bool_) if counting is None else counting
             counting[repeated] = False
-        if counting is None or counting.all():
-            return Rows(unit, None) if len(unit.table) else None
-        index = np.flatnonzero(counting)
-        return Rows(unit, index) if index.size else None
+        return None if counting is None or counting.all() else np.flatnonzero(counting)
 
     # Copies
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
-        for start, stop in self._shared:
-            if start <= unit.last and unit.first < stop:
-                for begin in range(start, stop, _SLICE_NS):
-                    end = min(begin + _SLICE_NS, stop)
-                    if begin <= unit.last and unit.first < end and begin not in self._compared:
-                        self._compared.add(begin)
-                        self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
+        for start, stop in self._shared[bisect_right(self._ends, unit.first) :]:
+            if start > unit.last:
+                break
+            for begin in range(start, stop, _SLICE_NS):
+                end = min(begin + _SLICE_NS, stop)
+                if begin <= unit.last and unit.first < end and begin not in self._compared:
+                    self._compared.add(begin)
+                    self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
         found = self._copies.get(unit.key, [])
         if self._asked.relatches:
             found = [*found, self._received_again(unit)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -103,7 +104,8 @@ class PartUnit(Unit):
         head: what is known of it.
         table: its rows.
         load: returns one of the columns that every part may have; None where it has none.
-        bags: its bags of which rows count, by the numbers that the part has for them; at least one.
+        counting: the numbers, as the part has them, of its bags of which rows count; at least one.
+        bag_of: returns the bag of such a number.
     """
 
     def __init__(
@@ -111,15 +113,17 @@ class PartUnit(Unit):
         head: PartHead,
         table: Table,
         load: Callable[[str], IntArray | None],
-        bags: Mapping[int, BagFile],
+        counting: IntArray,
+        bag_of: Callable[[int], BagFile],
     ) -> None:
         self.key = head.number
         self.table = table
         self.first, self.last = head.first, head.last
-        self.recording = next(iter(bags.values())).recording
+        self.recording = bag_of(int(counting[0])).recording
         self._load = load
-        self._bags = bags
-        self._all_count = len(bags) == head.bags.size
+        self._counting = counting
+        self._bag_of = bag_of
+        self._all_count = counting.size == head.bags.size
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -132,7 +136,7 @@ class PartUnit(Unit):
 
     def bags(self) -> Mapping[int, BagFile]:
         """Returns the bags of which rows count, by their numbers in the store."""
-        return self._bags
+        return {number: self._bag_of(number) for number in self._counting.tolist()}
 
     def bag_numbers(self) -> IntArray:
         """Returns for each row the number of its bag."""
@@ -142,7 +146,7 @@ class PartUnit(Unit):
         """Returns which rows are of bags that count; None: all are."""
         if self._all_count:
             return None
-        return np.isin(self.bag_numbers(), [*self._bags])
+        return np.isin(self.bag_numbers(), self._counting)
 
     def _column(self, path: str) -> IntArray:
         column = self._load(path)
@@ -156,13 +160,22 @@ class Rows:
 
     Attributes:
         table: the table; not all of its rows need count.
-        index: which of its rows count, ascending; None: all.
     """
 
-    def __init__(self, unit: Unit, index: IntArray | None) -> None:
+    def __init__(self, unit: Unit, find: Callable[[], IntArray | None]) -> None:
         self._unit = unit
         self.table = unit.table
-        self.index = index
+        self._find = find
+
+    @classmethod
+    def of(cls, unit: Unit, index: IntArray) -> Rows:
+        """Returns some rows of a unit."""
+        return cls(unit, lambda: index)
+
+    @cached_property
+    def index(self) -> IntArray | None:
+        """Which of the table's rows count, ascending; None: all."""
+        return self._find()
 
     def __len__(self) -> int:
         """Returns how many rows count."""
@@ -213,7 +226,8 @@ class Rows:
 
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""
-        return Rows(self._unit, positions if self.index is None else self.index[positions])
+        index = positions if self.index is None else self.index[positions]
+        return Rows.of(self._unit, index)
 
     def mask(self) -> NDArray[np.bool_]:
         """Returns for each row of the table whether it counts."""

@@ -317,7 +317,8 @@ def _decoded(view: View, rows: Rows) -> Iterator[Rows]:
         for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
             index = np.flatnonzero(np.isin(table.log_times, wanted))
             if table.channel.type == rows.table.channel.type and index.size:
-                yield Rows(BagUnit(bag, table, nth), index)
+                unit = BagUnit(bag, table, nth)
+                yield Rows.of(unit, index)
 
 
 def _candidates(rows: Rows, known: FieldNumbers | None, sign: int, extreme: Extreme) -> IntArray:

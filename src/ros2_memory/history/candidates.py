@@ -104,7 +104,9 @@ class CandidateRows:
         def reached(last: Ns) -> None:
             self._left[topic] = min(last + 1, self._until)
 
-        for rows in scan(self._view, topic, window, newest_first=True, reached=reached):
+        for rows in scan(
+            self._view, topic, window, newest_first=True, may_be_empty=True, reached=reached
+        ):
             yield rows.last, self._candidates(rows)
         self._left[topic] = MIN_NS
 

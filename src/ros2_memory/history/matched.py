@@ -86,7 +86,7 @@ class Matching:
         """
         waiting: Block | None = None
         try:
-            for rows in scan(self._view, topic, window, newest_first=True):
+            for rows in scan(self._view, topic, window, newest_first=True, may_be_empty=True):
                 block = self._block(topic, rows, window)
                 if waiting is None or block.last < waiting.first:
                     if waiting is not None:
@@ -148,6 +148,9 @@ def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
 
     And all others: what comes later in a scan is no newer than the last of `other`.
     """
+    for empty, rest in ((one, other), (other, one)):
+        if not empty.tested().times.size:
+            return None, rest
     joined = _joined([one.tested(), other.tested()])
     cut = int(np.searchsorted(joined.times, other.last, side="right"))
     older = _of(one.topic, Tested(joined.times[:cut], joined.met[:cut]))

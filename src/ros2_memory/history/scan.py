@@ -30,6 +30,7 @@ def scan(
     columns: bool = True,
     copies: bool = False,
     shared: Sequence[tuple[Ns, Ns]] | None = None,
+    may_be_empty: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `Scanner.rows`.
@@ -38,7 +39,7 @@ def scan(
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them.
+    may hold copies, where the caller knows them. `may_be_empty` is as in `Asked`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -60,6 +61,7 @@ def scan(
         view.snapshot.timeline,
         decode,
         shared=shared,
+        may_be_empty=may_be_empty,
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )

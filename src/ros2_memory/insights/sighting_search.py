@@ -78,6 +78,8 @@ class _OfTopic:
         if not block.has_match and not self._is_open:
             return
         tested = block.tested()
+        if not tested.times.size:
+            return
         runs = runs_of(tested, SILENCE_NS, apart=self._apart)
         is_near = self._begins - int(tested.times[-1]) <= SILENCE_NS
         self._begins = int(tested.times[0])
