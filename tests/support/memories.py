@@ -10,6 +10,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import pytest
 import yaml
 
 from ros2_memory.catalogue.detector_sights import DetectorSights
@@ -139,6 +140,33 @@ def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scann
 def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:
     """The JSON of the reply, be it an error."""
     return json.loads(replied(memory, bag_dir, name, given).text)
+
+
+def assert_same_counts(reply: Any, expected: Any) -> None:
+    """Both replies are the same; means are, to what columns round numbers to."""
+    assert _without_means(reply) == _without_means(expected)
+    for row, other in zip(_means(reply), _means(expected), strict=True):
+        assert row == pytest.approx(other, abs=1e-3)
+
+
+def _of_means(reply: Any) -> list[int]:
+    columns = reply.get("columns", ()) if isinstance(reply, dict) else ()
+    return [nth for nth, name in enumerate(columns) if name.endswith(".mean")]
+
+
+def _means(reply: Any) -> list[list[Any]]:
+    # The first column of a row is its name, which the row of all has not.
+    rows = [*reply["rows"], [None, *reply["all"]]] if _of_means(reply) else []
+    return [[row[nth] for nth in _of_means(reply)] for row in rows]
+
+
+def _without_means(reply: Any) -> Any:
+    left_out = _of_means(reply)
+    if not left_out:
+        return reply
+    rows = [[each for nth, each in enumerate(row) if nth not in left_out] for row in reply["rows"]]
+    whole = [each for nth, each in enumerate(reply["all"], 1) if nth not in left_out]
+    return {**reply, "rows": rows, "all": whole}
 
 
 def replied(

@@ -14,22 +14,20 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.storage.base import RELATCHED_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
-
-COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,28 +64,6 @@ def joined_identities(parts: Sequence[Identities]) -> Identities:
         np.concatenate([part.hashes for part in parts]),
         np.concatenate([part.recordings for part in parts]),
     )
-
-
-def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
-    """Returns the half-open spans in which different recordings can hold copies.
-
-    That is the time that both hold, widened by the horizon at both ends; spans that touch are
-    merged.
-
-    Args:
-        held: first and last log times (inclusive) of files or recordings, and their recording.
-    """
-    spans: list[tuple[Ns, Ns]] = []
-    open_ones: list[tuple[Ns, object]] = []
-    for first, last, recording in sorted(held, key=lambda span: span[0]):
-        open_ones = [one for one in open_ones if one[0] + COPY_HORIZON_NS >= first]
-        spans.extend(
-            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
-            for other, folder in open_ones
-            if folder != recording
-        )
-        open_ones.append((last, recording))
-    return united(spans)
 
 
 def copies_among(messages: Identities) -> NDArray[np.bool_]:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.copies import overlap_spans
 from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.spans import overlap_spans
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

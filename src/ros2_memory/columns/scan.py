@@ -15,19 +15,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.columns.blob import unpack_tables
-from ros2_memory.columns.copies import (
-    COPY_HORIZON_NS,
-    Identities,
-    copies_among,
-    joined_identities,
-    relatched_among,
-)
+from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
 from ros2_memory.columns.coverage import Covering
 from ros2_memory.columns.pack import decompressed, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.storage.base import RELATCHED_NS
 from ros2_memory.storage.cache import ByteLru

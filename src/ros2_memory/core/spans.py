@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
+"""How far apart the log times of one message in two recordings are at most."""
 Spans: TypeAlias = list[tuple[Ns, Ns]]
 """Sorted and apart, where functions return them."""
 
@@ -45,3 +47,25 @@ def lies_inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
     """Returns whether a moment lies in one of spans that are sorted and apart."""
     index = bisect_right(spans, (moment, MAX_NS)) - 1
     return index >= 0 and moment < spans[index][1]
+
+
+def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
+    """Returns the half-open spans in which different recordings can hold copies.
+
+    That is the time that both hold, widened by the horizon at both ends; spans that touch are
+    merged.
+
+    Args:
+        held: first and last log times (inclusive) of files or recordings, and their recording.
+    """
+    spans: list[tuple[Ns, Ns]] = []
+    open_ones: list[tuple[Ns, object]] = []
+    for first, last, recording in sorted(held, key=lambda span: span[0]):
+        open_ones = [one for one in open_ones if one[0] + COPY_HORIZON_NS >= first]
+        spans.extend(
+            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
+            for other, folder in open_ones
+            if folder != recording
+        )
+        open_ones.append((last, recording))
+    return united(spans)

@@ -19,9 +19,9 @@ import numpy as np
 from ros2_memory.analysis.bulk_decode import BulkDecoder
 from ros2_memory.analysis.conditions import leaves
 from ros2_memory.analysis.payload_templates import template_for
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.counts.segment_fold import SegmentFold
 from ros2_memory.history.bag_groups import DigestKind

@@ -14,8 +14,8 @@ from itertools import count, groupby
 from typing import TYPE_CHECKING, Final, Generic, TypeAlias, TypeVar
 from weakref import WeakKeyDictionary, ref
 
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.bag_groups import DigestKind, Group, Span, StoredDigests, groups_of
 

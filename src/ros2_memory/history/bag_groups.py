@@ -16,8 +16,8 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar, cast
 from weakref import WeakKeyDictionary
 
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.columns.copies import COPY_HORIZON_NS, overlap_spans
-from ros2_memory.core.spans import lies_inside
+from ros2_memory.core.spans import COPY_HORIZON_NS, lies_inside, overlap_spans
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:

@@ -14,9 +14,8 @@ from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
-from ros2_memory.columns.copies import COPY_HORIZON_NS, overlap_spans
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
     BagSpan,

@@ -24,7 +24,6 @@ from ros2_memory.analysis.conditions import (
 )
 from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import (
     BagError,
     InvalidArgumentsError,
@@ -32,6 +31,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.candidates import CandidateRows

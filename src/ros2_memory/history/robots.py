@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
 from ros2_memory.history.duplicates import copy_key

@@ -135,7 +135,7 @@ def find_runs(
     try:
         for block in _blocks(matching, topics, window):
             topics[block.topic].add(block)
-            reached = block.last
+            reached = block.first if len(topics) == 1 else block.last
             if enough is not None and _has_enough(topics, enough, reached):
                 search.note_undecodable(_newest_first(topics)[enough - 1].first)
                 return Found(_newest_first(topics), reached)

@@ -228,8 +228,10 @@ def read_sightings(
     if view.memory.columns is not None and not scope.is_bounded:
         search = ReverseSearch(view, pattern, condition)
         runs = find_runs(view, search, scope.window, is_log, enough=None)
+        if runs.is_over:
+            view.bags.finish_within(_LEFT_TO_SAY_S)
         spans = [(run.first, run.last) for run in reversed(runs.runs)]
-        return spans, runs.searched_to
+        return spans, spans[0][0] if runs.is_over else None
     found = _Sightings(MAX_COUNTED, is_log, oldest_first=True)
     _collect(view, ReverseSearch(view, pattern, condition), scope, found)
     if found.count > MAX_COUNTED:

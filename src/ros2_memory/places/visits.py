@@ -18,7 +18,6 @@ from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.dwell import FLICKER_NS, Approach, DwellBuilder, Unread
 from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -27,6 +26,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.bag_groups import StoredDigests, groups_of
 from ros2_memory.history.coverage import note_unread, unix_text

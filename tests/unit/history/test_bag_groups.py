@@ -11,8 +11,8 @@ from typing import NamedTuple
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View

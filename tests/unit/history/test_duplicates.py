@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ros2_memory.columns.copies import COPY_HORIZON_NS
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
     StoredMessage,

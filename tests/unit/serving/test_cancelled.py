@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.storage.base import Record
+    from ros2_memory.storage.base import Batch, Record
 
 S: Final = 10**9
 BEGIN_S: Final = 1_700_000_000
@@ -72,6 +72,11 @@ class Watched(BagDirReader):
         for record in super().records(*args, **named):
             self.read += 1
             yield record
+
+    def batches(self, *args: Any, **named: Any) -> Iterator[Batch]:
+        for batch in super().batches(*args, **named):
+            self.read += batch.log_times.size
+            yield batch
 
 
 @pytest.fixture(scope="module")
