@@ -49,7 +49,8 @@ def test_a_catalogue_that_cannot_be_written_costs_no_answer_and_is_filled_later(
         assert filler.progress().waiting == 3
         assert told(memory, count=6) == right
     events = [each["event"] for each in logs if each["event"].startswith("catalogue")]
-    assert events == ["catalogue_failed"]
+    # Once each: the file of digests, and that of columns.
+    assert events == ["catalogue_failed"] * 2
     filler.look_after(thorough=True)
     fill_up(filler)
     assert (trouble_of(filler), filler.progress().waiting) == (None, 0)
