@@ -452,7 +452,7 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
 def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
     """Returns the store of columns; None where the configuration wants none.
 
-    `reader` applies what the bag directory says of its bags.
+    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore

@@ -17,11 +17,11 @@ from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
-from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scan import Scanner
 from ros2_memory.columns.store import FILE as COLUMNS
-from ros2_memory.columns.store import ColumnStore
+from ros2_memory.columns.store import BagKey, ColumnStore
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor

@@ -46,7 +46,7 @@ Int64: TypeAlias = Annotated[int, Field(strict=True, ge=MIN_NS, le=MAX_NS)]
 """An integer of 64 bits, and no boolean."""
 Count: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=MAX_NS)]
 READABLE: Final = 0o644
-"""The permissions of what the other program reads: the two may run as different users."""
+"""Permissions of a file that the other program reads; it may run as another user."""
 
 _MOST_BYTES: Final = 64 << 20
 _FORMAT: Final = 1  # of each document

@@ -575,7 +575,7 @@ class RuleRecord:
     Attributes:
         fired: how often it fired.
         moments: how many moments that made.
-        refused: how often nothing was kept of it.
+        refused: how often it fired and no bag was kept.
         last_fired: log time at which it fired last.
         problem: why it may have missed something, or keeps nothing; None where nothing is wrong.
         always_since: since when it has matched without an end, where that is long; else None.

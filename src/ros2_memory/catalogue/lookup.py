@@ -19,7 +19,7 @@ import numpy as np
 
 from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Boxes, united
 from ros2_memory.catalogue.codec import decode_zone_map, encode_zone_map
-from ros2_memory.catalogue.store import BagKey
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.model import BagState
 
 if TYPE_CHECKING:

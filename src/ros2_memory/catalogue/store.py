@@ -14,7 +14,7 @@ import os
 import time
 from functools import partial
 from hashlib import sha256
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.codec import (
@@ -62,6 +62,7 @@ from ros2_memory.catalogue.sql import (
 )
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.columns.database import Database
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.storage.base import Channel, Record, Schema
@@ -92,20 +93,6 @@ _BATCH: Final = 4096
 """Rows that are held at a time while known files are made of them."""
 
 T = TypeVar("T")
-
-
-class BagKey(NamedTuple):
-    """Identifies the bytes of an entry: a file below the bag directory, as `stat` showed it."""
-
-    path: str
-    size: int
-    mtime_ns: Ns
-    sidecar_ns: Ns
-
-    @classmethod
-    def of(cls, bag: BagFile, bag_dir: Path) -> BagKey:
-        """Returns the key of a bag of the index."""
-        return cls(relative(bag.file, str(bag_dir)), bag.size, bag.mtime_ns, bag.sidecar_ns)
 
 
 class Catalogue(Database):
@@ -621,13 +608,3 @@ def _time_spans(
     if not counts.size:
         return [0] * len(counts), [0] * len(counts)
     return counts[:, :, 1].min(axis=1).tolist(), counts[:, :, 2].max(axis=1).tolist()
-
-
-def relative(path: str, bag_dir: str) -> str:
-    """Returns a file's path as entries name it, so that the bag directory can be moved.
-
-    Takes strings, since `pathlib` is slow for the 60,000 files of a week.
-    """
-    inner = path.removeprefix(f"{bag_dir.rstrip(os.sep)}{os.sep}")
-    # SQLite stores text as UTF-8, which the bytes of a file name need not be.
-    return inner if inner.isascii() else inner.encode("utf-8", "backslashreplace").decode()

@@ -17,8 +17,8 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.state_files import is_shipped, read_receipts
 from ros2_memory.bootstrap_lake import lake_location
-from ros2_memory.catalogue.store import relative
 from ros2_memory.cli.findings import Finding, error, in_order, warning
+from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import ConfigError, LakeError
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted

@@ -250,7 +250,7 @@ def unpack_tables(
 
 
 class _Head(NamedTuple):
-    """What a blob says of a table as a whole."""
+    """The head of a table in a blob."""
 
     topic: int
     flags: int

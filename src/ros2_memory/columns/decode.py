@@ -1,7 +1,7 @@
 """Decodes a bag as tables, all messages of a topic at once.
 
 What the walk over bytes (`walk.py`) does not read, for whatever reason, goes through the reader's
-decoder message by message (`objects.py`), into the same columns; never as a part of what is there.
+decoder message by message (`objects.py`), into the same columns. No message is decoded in part.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fills the store: decodes every closed bag that is not in it, and makes parts of what is."""
+"""Fills the store: decodes each closed bag that is missing, and merges splits into parts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LEAST_BYTES_PER_S: Final = 200
 IN_MEMORY_BYTES: Final = 64 << 20
 """What the store may take where no file can be written."""
 _TRIMMED_TO: Final = 0.9
-"""To which part of what it may take the store is trimmed."""
+"""A store above its limit is trimmed to this share of it."""
 _MOST_REFUSED: Final = 10_000
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
 
 _SUMMARY: Final = frozenset({"bytes", "numbers"})
-"""The keys of what is shown in place of an array."""
+"""Keys of the summary that an answer has in place of an array."""
 _LARGEST_INT64: Final = 2**63 - 1
 
 

@@ -68,7 +68,7 @@ Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Values = TypeVar("Values", "IntArray", "Floats")
 
 FORMAT: Final = 1
-"""What bytes mean: to be raised with every change of what this module or `blob` writes."""
+"""Version of the bytes. Raise it with every change of what this module or `blob` writes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4
 """Of zstd. A blob of 10 s takes 83 us; level 3 takes 78 us and 1 % more bytes, level 12 eight times
@@ -591,7 +591,10 @@ def _pack_texts(column: Texts) -> Packed | _Whole:
 
 
 def _in_use(column: Texts) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
-    """The column without words that no row has: whoever forgot the rows forgot their words."""
+    """Returns the codes and words of a column without the words that no row has.
+
+    Words of deleted rows must not stay in the file.
+    """
     if len(column.words) <= 1 and len(column.codes):
         return column.codes, column.words
     used = np.bincount(column.codes, minlength=len(column.words)) > 0

@@ -112,7 +112,7 @@ class NumberSequence(NamedTuple):
 
 
 class Sequence(NamedTuple):
-    """A sequence, or an array of fixed `length`, of what `plan` reads."""
+    """A sequence, or an array of fixed `length`. `plan` reads one element."""
 
     align: int
     skip: int
@@ -190,7 +190,7 @@ class _Planner:
     least: int = 0
 
     def finished(self) -> Plan:
-        """Returns the plan of what was added."""
+        """Returns the plan of the fields that were added."""
         self._flush()
         layout = self.layout or ()
         unit = max((align for align, _ in layout), default=1)

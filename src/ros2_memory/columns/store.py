@@ -100,9 +100,14 @@ class BagKey(NamedTuple):
         return cls(relative(bag.file, str(bag_dir)), bag.size, bag.mtime_ns, bag.sidecar_ns)
 
 
-def relative(file: str, bag_dir: str) -> str:
-    """Returns the path of a bag below the bag directory; itself where it lies elsewhere."""
-    return file.removeprefix(f"{bag_dir}{os.sep}")
+def relative(path: str, bag_dir: str) -> str:
+    """Returns a file's path below the bag directory, so that this can be moved.
+
+    A file elsewhere keeps its whole path. Takes strings: `pathlib` is slow for 60,000 files.
+    """
+    inner = path.removeprefix(f"{bag_dir.rstrip(os.sep)}{os.sep}")
+    # SQLite stores text as UTF-8, which the bytes of a file name need not be.
+    return inner if inner.isascii() else inner.encode("utf-8", "backslashreplace").decode()
 
 
 class State(NamedTuple):

@@ -22,7 +22,7 @@ from ros2_memory.catalogue.codec import encode_poses, encode_standstills, encode
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.map_digest import encode_map_track
-from ros2_memory.catalogue.store import BagKey, relative
+from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns

@@ -27,7 +27,7 @@ from ros2_memory.bag_dir.state_files import (
     read_forgettings,
     read_receipts,
 )
-from ros2_memory.catalogue.store import relative
+from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState

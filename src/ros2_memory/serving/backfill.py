@@ -21,7 +21,8 @@ import anyio.to_thread
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
-from ros2_memory.catalogue.store import MOST_JOINED, BagKey
+from ros2_memory.catalogue.store import MOST_JOINED
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow

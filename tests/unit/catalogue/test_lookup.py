@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.store import FILE, FOLDER, BagKey
+from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.columns.store import BagKey
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.index import timeline

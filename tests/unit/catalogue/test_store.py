@@ -16,8 +16,9 @@ import structlog
 from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
-from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue, relative
+from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.columns.database import RETRY_S
+from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.model import BagFile, BagState
 from tests.support.bags import boolean, detections, odom, tf, transform
 from tests.support.fakes import FakeReader

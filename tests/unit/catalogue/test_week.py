@@ -12,7 +12,8 @@ from ros2_memory import queries
 from ros2_memory.catalogue.digest import Digest, Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.store import BagKey, Catalogue
+from ros2_memory.catalogue.store import Catalogue
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import NS_PER_S

@@ -32,10 +32,11 @@ from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.catalogue.packing import unpacked
-from ros2_memory.catalogue.store import FILE, FOLDER, BagKey
+from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.cli.maintenance import forget as cli_forget
 from ros2_memory.columns.pack import decompressed
 from ros2_memory.columns.store import FILE as COLUMNS
+from ros2_memory.columns.store import BagKey
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.retention import eraser

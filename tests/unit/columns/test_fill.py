@@ -83,6 +83,16 @@ def test_the_newest_bag_comes_first_and_parts_are_made_of_ten_minutes(tmp_path: 
     assert check_all(world) == 13 * 21
 
 
+def test_a_bag_whose_name_is_no_text_is_stored(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, 0)
+    path.rename(path.with_name("rec\udcff_0.mcap"))
+    world = World.of(tmp_path)
+    assert world.fill() == 1
+    assert count(world, "bag") == 1
+    assert world.fill() == 0
+    assert check_all(world) == 21
+
+
 def test_a_topic_with_a_message_that_cannot_be_decoded_has_no_columns(tmp_path: Path) -> None:
     write_bag(tmp_path, 0)
     broken = Msg("/chatter", "std_msgs/msg/String", T0 + 9 * S, b"\x00\x01\x00\x00\xff\xff\xff\x7f")

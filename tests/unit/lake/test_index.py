@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from ros2_memory.catalogue.store import BagKey
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S

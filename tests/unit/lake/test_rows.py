@@ -11,7 +11,7 @@ import pytest
 
 from ros2_memory.analysis.motion.odometry import PoseDigest
 from ros2_memory.catalogue.codec import decode_poses, decode_standstills, decode_topic_events
-from ros2_memory.catalogue.store import BagKey
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory

@@ -24,10 +24,11 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
-from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli import main
 from ros2_memory.cli.doctor import check_catalogue
 from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S

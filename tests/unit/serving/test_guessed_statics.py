@@ -20,8 +20,9 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.map_digest import encode_map_track
-from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.columns.store import BagKey
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.places.map_digests import map_settings
 from ros2_memory.serving import backfill as serving_backfill

@@ -12,7 +12,7 @@ from ros2_memory.catalogue.codec import decode_poses, decode_standstills, decode
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.map_digest import NO_STATICS, decode_map_tracks
-from ros2_memory.catalogue.store import BagKey, Catalogue
+from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.lake.partitions import locations
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.catalogue.map_digest import MapDigest
+    from ros2_memory.columns.store import BagKey
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeIndex
     from ros2_memory.lake.partitions import Days
