@@ -458,8 +458,9 @@ class _Scan:
         numbers: dict[Path, int] = {}
         parts: list[Identities] = []
         for unit, some in zip(units, rows, strict=True):
-            published, hashes = unit.identities() or self._hashed_again(unit)
             recording = numbers.setdefault(unit.recording, len(numbers))
+            # Below 0, and another for each recording: what has no hash is no copy.
+            published, hashes = unit.identities() or self._hashed_again(unit, -1 - recording)
             parts.append(
                 Identities(
                     unit.times()[some],
@@ -470,10 +471,13 @@ class _Scan:
             )
         return joined_identities(parts)
 
-    def _hashed_again(self, unit: Unit) -> tuple[IntArray, IntArray]:
-        """Reads the bags of a unit that was stored before another recording came beside it."""
+    def _hashed_again(self, unit: Unit, unknown: int) -> tuple[IntArray, IntArray]:
+        """Reads the bags of a unit that was stored before another recording came beside it.
+
+        Rows of a bag that has changed meanwhile have their log times, and the hash `unknown`.
+        """
         published = unit.times().copy()
-        hashes = np.full(published.size, -1, np.int64)
+        hashes = np.full(published.size, unknown)
         numbers = unit.bag_numbers()
         for number, bag in unit.bags().items():
             rows = np.flatnonzero(numbers == number)

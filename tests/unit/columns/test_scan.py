@@ -17,8 +17,11 @@ from hypothesis import strategies as st
 
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.history.scan import scan
+from ros2_memory.history.view import View
 from tests.support.bags import odom, text, write_mcap
-from tests.support.column_worlds import World, check_all, check_rows, times
+from tests.support.column_worlds import EVERYTHING, World, check_all, check_rows, times
 from tests.support.examples import examples
 from tests.support.random_histories import write_history
 
@@ -134,6 +137,7 @@ def test_one_history_has_the_same_rows_wherever_it_is_cut(cuts: list[int], seed:
         assert times(world, "/odom") == expected
         assert check_all(world) == 80
         world.fill()
+        assert len(world.stored()) == len(world.memory.index.snapshot().bags)
         assert times(world, "/odom") == expected
         assert check_all(world) == 80
 
@@ -143,6 +147,11 @@ def test_tables_come_in_the_order_of_time(tmp_path: Path, newest_first: bool) ->
     cut(tmp_path, [10, 30, 31, 60])
     world = World.of(tmp_path)
     world.fill()
+    view = View(world.memory, Call())
+    found = scan(view, "/odom", EVERYTHING, newest_first=newest_first)
+    firsts = [int(rows.times[0]) for rows in found]
+    assert len(firsts) > 1
+    assert firsts == sorted(firsts, reverse=newest_first)
     assert check_rows(world, "/odom", newest_first=newest_first) == 40
 
 

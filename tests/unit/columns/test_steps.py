@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from ros2_memory.columns.pack import pack, unpack
+from ros2_memory.columns.pack import FORMAT, pack, unpack
 from ros2_memory.columns.steps import (
     DEGREES,
     METRES,
+    MOST_RELATIVE,
     QUATERNION,
     RADIANS,
     RELATIVE,
@@ -18,6 +19,7 @@ from ros2_memory.columns.steps import (
     Step,
     step_of,
 )
+from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES
 from ros2_memory.storage.base import SEQUENCE, Definition, Field
 
 
@@ -105,3 +107,13 @@ def test_steps_read_what_they_write() -> None:
         assert Step.parse(str(step)) == step
     with pytest.raises(ValueError, match="no step"):
         Step.parse("coarse")
+
+
+def test_what_a_number_means_changes_with_the_format_alone() -> None:
+    steps = [step.per_unit for step in (METRES, RADIANS, VELOCITY, QUATERNION, DEGREES)]
+    limits = (MOST_RELATIVE, MAX_NUMBERS, MAX_RANGED_BYTES)
+    assert (FORMAT, steps, limits) == (
+        1,
+        [10_000, 10_000, 10_000, 20_000, 1_000_000_000],
+        (1e-6, 9, 4096),
+    )

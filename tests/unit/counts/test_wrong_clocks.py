@@ -36,14 +36,15 @@ def all_of(reply: Any) -> dict[str, object]:
     return dict(zip(reply["columns"][1:], reply["all"], strict=True))
 
 
-def whole(begin: int = 0, end: int = AHEAD + 10) -> dict[str, object]:
-    return {"start": begin, "end": end, "by": "hour"}
+def whole(by: str = "hour") -> dict[str, object]:
+    return {"start": 0, "end": AHEAD + 10, "by": by}
 
 
+@pytest.mark.parametrize("by", ["hour", "day"])
 def test_messages_of_a_wrong_clock_do_not_count_in_the_first_or_the_last_bin(
-    memory: Memory, tmp_path: Path
+    memory: Memory, tmp_path: Path, by: str
 ) -> None:
-    question = {"topic": "/odom", "fields": ["position.x"], **whole()}
+    question = {"topic": "/odom", "fields": ["position.x"], **whole(by)}
     reply = asked(memory, tmp_path, "get_topic_in_range", **question)
     assert len(reply["rows"]) == 1
     found = all_of(reply)
