@@ -226,7 +226,7 @@ class Filling:
 
     def _is_over(self, begin: Ns, timeline: Timeline) -> bool:
         """Returns whether no bag that belongs to ten minutes is to be expected."""
-        newest = max(segment.latest for segment in timeline.segments[-1:])
+        newest = timeline.segments[-1].latest
         return max(newest, self._clock.now()) >= begin + PART_NS
 
     def _slot(self, bag: BagFile) -> tuple[str, Ns]:

@@ -13,6 +13,7 @@ import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.columns.database import is_busy
 from ros2_memory.columns.store import TABLES
 from ros2_memory.columns.writing import delete_bags
 from ros2_memory.core.errors import BagError
@@ -109,7 +110,7 @@ def _done(base: sqlite3.Connection, statement: str) -> bool:
     try:
         row = base.execute(statement).fetchone()
     except sqlite3.OperationalError as error:
-        if (error.sqlite_errorcode & 0xFF) not in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+        if not is_busy(error):
             raise
         return False
     return row is None or not row[0]

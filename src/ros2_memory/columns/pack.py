@@ -239,9 +239,9 @@ def number_of(data: bytes, dtype: str) -> float:
     return int.from_bytes(data, "little", signed=not dtype.startswith("u"))
 
 
-def compressed(data: bytes, level: int = LEVEL) -> bytes:
+def compressed(data: bytes) -> bytes:
     """Returns the bytes as a zstd frame that states its size."""
-    return zstandard.ZstdCompressor(level=level).compress(data)
+    return zstandard.ZstdCompressor(level=LEVEL).compress(data)
 
 
 def decompressed(data: bytes) -> bytes:

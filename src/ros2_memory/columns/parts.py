@@ -112,22 +112,23 @@ def part_table(
     topic: Topic,
     columns: Mapping[str, Packed],
     load: Callable[[str], Column],
-    times: IntArray,
 ) -> StoredTable:
     """Returns a part as a table whose columns are loaded when they are first asked for.
+
+    Its times are all 0: `PartUnit` loads the true ones.
 
     Args:
         number: of the topic.
         topic: of the part.
         columns: what is known of each column; their data is not needed.
         load: returns a column by its path.
-        times: the log times of its rows.
     """
 
     def known(path: str) -> Known:
         return Known(columns[path].error, columns[path].zone)
 
-    kept = Times(times, times, np.broadcast_to(np.int64(0), times.shape))
+    none = np.broadcast_to(np.int64(0), (columns[LOG_TIME].count,))
+    kept = Times(none, none, none)
     table = lazy_table(number, topic, kept, known, load)
     dropped = {path for path, packed in columns.items() if packed.codec == DROPPED}
     if not dropped:

@@ -18,7 +18,7 @@ from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
 from ros2_memory.columns.coverage import Covering
 from ros2_memory.columns.pack import decompressed, unpack
-from ros2_memory.columns.parts import LOG_TIME, part_table
+from ros2_memory.columns.parts import part_table
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
 from ros2_memory.core.model import TimeWindow
@@ -148,16 +148,15 @@ class Scanner:
     Args:
         store: the store; None where nothing is stored.
         bag_dir: the bag directory.
-        cache_mb: memory that unpacked columns may take between calls, in MiB.
 
     Attributes:
         censuses: by topic, span and bags, what is stored of each type and what of it counts.
     """
 
-    def __init__(self, store: ColumnStore | None, bag_dir: Path, cache_mb: int = 48) -> None:
+    def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
         self.store = store
         self._covering = None if store is None else Covering(store, bag_dir)
-        self._columns: ByteLru[Column] = ByteLru(cache_mb << 20)
+        self._columns: ByteLru[Column] = ByteLru(48 << 20)
         self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
@@ -229,8 +228,7 @@ class Scanner:
                 raise GoneError
             return bag
 
-        times = np.broadcast_to(np.int64(0), (known[LOG_TIME].count,))
-        table = part_table(head.topic, topic, known, load, times)
+        table = part_table(head.topic, topic, known, load)
         return PartUnit(head, table, integers, counting - offset, bag_of)
 
     def split(self, number: int, topic: str) -> list[Table] | None:
@@ -301,8 +299,9 @@ class _Scan:
     def _settled(self, reach: TimeWindow) -> list[_Source]:
         """Returns the sources that may have rows in a window, as the store is at one moment."""
         store = self._scanner.store
-        for _ in range(_ATTEMPTS if store is not None else 0):
-            assert store is not None  # noqa: S101 - as the range says
+        for _ in range(_ATTEMPTS):
+            if store is None:
+                break
             failures = store.failures
             self._coverage = self._scanner.coverage(self._asked.timeline)
             found = [*self._found(reach)]

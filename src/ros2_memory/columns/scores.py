@@ -9,7 +9,7 @@ and more would have to be looked at then, the limits say that they do not know.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
 import numpy as np
 
@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 Object: TypeAlias = Message | Group
 
-_NO_ERROR: Final = 0.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scored:
@@ -65,7 +63,7 @@ class _Scored:
         size = values.size(self.level)
         if size is None:
             return None
-        score, error = np.full(size, np.nan), _NO_ERROR
+        score, error = np.full(size, np.nan), 0.0
         for leaf in self.scores:
             found = values.numbers(leaf)
             if found is None or not isinstance(found.error, float):

@@ -479,20 +479,13 @@ def opened(spot: Spot) -> Iterator[Spot]:
         yield spot
 
 
-def leaves_below(
-    root: Spot, *, in_objects: bool = True, name: str = ""
-) -> Iterator[tuple[str, Leaf, Limits]]:
+def leaves_below(root: Spot) -> Iterator[tuple[str, Leaf, Limits]]:
     """Yields the leaves at or below a spot, with their dot-paths in the value.
-
-    Args:
-        root: the spot.
-        in_objects: whether to go into objects, or into lists alone.
-        name: the dot-path of the spot itself.
 
     Raises:
         UnknownShapeError: there are more than `MAX_LEAVES`, or it depends on the message.
     """
-    waiting = [(name, root)]
+    waiting = [("", root)]
     count = 0
     while waiting:
         path, spot = waiting.pop()
@@ -506,7 +499,7 @@ def leaves_below(
                 waiting.append((path, Spot(node.element, limits)))
             elif isinstance(node, Items):
                 waiting.extend((path, Spot(item, limits)) for item in reversed(node.items))
-            elif in_objects and isinstance(node, Message | Group):
+            elif isinstance(node, Message | Group):
                 waiting.extend(
                     (f"{path}.{key}" if path else key, Spot(child, limits))
                     for key, child in reversed(children(node))

@@ -135,7 +135,6 @@ class PartHead:
         topic: of its topic.
         first: the earliest log time (ns), inclusive.
         last: the latest, inclusive.
-        messages: how many rows.
         bags: the numbers of the bags that its rows are of, ascending.
     """
 
@@ -143,7 +142,6 @@ class PartHead:
     topic: int
     first: Ns
     last: Ns
-    messages: int
     bags: IntArray
 
 
@@ -288,7 +286,7 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT id, topic, first_ns, last_ns, messages, bags FROM part"
+                "SELECT id, topic, first_ns, last_ns, bags FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?) AND id > ?"
                 " ORDER BY first_ns, id",
                 (topic, max(after - self.offset, 0)),
@@ -299,10 +297,9 @@ class ColumnStore(Database):
                     of_topic,
                     first,
                     last,
-                    messages,
                     np.array(json.loads(bags), np.int64) + self.offset,
                 )
-                for number, of_topic, first, last, messages, bags in rows
+                for number, of_topic, first, last, bags in rows
             ]
 
         return self.read(ask, [])

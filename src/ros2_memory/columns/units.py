@@ -219,11 +219,6 @@ class Rows:
         for number in np.unique(numbers).tolist():
             yield bags[number], np.flatnonzero(numbers == number)
 
-    def bag(self, row: int) -> BagFile:
-        """Returns the bag of one of the rows that count."""
-        at = row if self.index is None else int(self.index[row])
-        return self._unit.bags()[int(self._unit.bag_numbers()[at])]
-
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""
         index = positions if self.index is None else self.index[positions]

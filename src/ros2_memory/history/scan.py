@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from ros2_memory.columns.scan import Asked, Scanner
 from ros2_memory.core.model import TimeWindow
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
 
 
 def scan(
@@ -74,13 +72,8 @@ def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
     for bag, positions in rows.bag_rows():
         wanted = times[positions]
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
-        left = dict(zip(*_counted(wanted), strict=True))
+        left = Counter(wanted.tolist())
         for found in view.bags.read(bag, [channel.topic], window):
-            if left.get(found.time, 0) and found.record.channel.type == channel.type:
+            if left[found.time] and found.record.channel.type == channel.type:
                 left[found.time] -= 1
                 yield found
-
-
-def _counted(times: IntArray) -> tuple[list[Ns], list[int]]:
-    values, counts = np.unique(times, return_counts=True)
-    return values.tolist(), counts.tolist()
