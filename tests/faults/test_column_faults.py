@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.columns import database, fill
+from ros2_memory.columns.writing import LongBag
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
 from tests.unit.columns.test_fill import in_groups, write_bag, write_long_bag
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 
 KILLS = 100 if LONG else 5
 ROWS = 12 * 21 + 120
-FORKED = multiprocessing.get_context("fork")
+# Not forked: SQLite must not have a file open across that.
+SPAWNED = multiprocessing.get_context("spawn")
 
 
 def write_bags(bag_dir: Path) -> None:
@@ -65,8 +67,8 @@ def fill_up(bag_dir: Path, kill_at: int = 0) -> int:
     return counter.count
 
 
-def forked(bag_dir: Path, kill_at: int = 0) -> BaseProcess:
-    process = FORKED.Process(target=fill_up, args=(bag_dir, kill_at), daemon=True)
+def started(bag_dir: Path, kill_at: int = 0) -> BaseProcess:
+    process = SPAWNED.Process(target=fill_up, args=(bag_dir, kill_at), daemon=True)
     process.start()
     return process
 
@@ -94,7 +96,7 @@ def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all(tmp_path: Path)
         kill_at = draw.randint(1, statements)
         bag_dir = tmp_path / f"killed at {kill_at} of {statements}"
         write_bags(bag_dir)
-        process = forked(bag_dir, kill_at)
+        process = started(bag_dir, kill_at)
         process.join()
         assert process.exitcode == -signal.SIGKILL
         if store_file(bag_dir).exists():
@@ -112,7 +114,7 @@ def test_another_process_has_the_same_answers_while_one_fills(tmp_path: Path) ->
     write_bags(tmp_path)
     asking = World.of(tmp_path)
     assert check_all(asking) == ROWS
-    process = forked(tmp_path)
+    process = started(tmp_path)
     while process.is_alive():
         assert check_all(asking) == ROWS
     process.join()
@@ -121,9 +123,29 @@ def test_another_process_has_the_same_answers_while_one_fills(tmp_path: Path) ->
     assert len(asking.stored()) == 13
 
 
+def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path) -> None:
+    """Its last rows are there before it is whole, and what is known then must not stay."""
+    write_long_bag(tmp_path)
+    asking, filling = World.of(tmp_path), World.of(tmp_path)
+    assert asking.stored() == set()
+    found: list[set[str]] = []
+
+    def end(self: LongBag, connection: sqlite3.Connection) -> None:
+        found.append(asking.stored())
+        whole(self, connection)
+
+    with pytest.MonkeyPatch.context() as patch:
+        whole = LongBag.end
+        patch.setattr(LongBag, "end", end)
+        patch.setattr(fill, "decoded", in_groups)
+        assert filling.fill(merge=False) == 1
+    assert found == [set()]
+    assert asking.stored() == filling.stored() != set()
+
+
 def test_two_servers_that_fill_at_once_store_each_bag_once(tmp_path: Path) -> None:
     write_bags(tmp_path)
-    processes = [forked(tmp_path) for _ in range(2)]
+    processes = [started(tmp_path) for _ in range(2)]
     for process in processes:
         process.join()
         assert process.exitcode == 0

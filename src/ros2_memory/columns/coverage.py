@@ -118,7 +118,7 @@ class Covering:
 
     def of(self, timeline: Timeline) -> Coverage:
         """Returns the coverage of a timeline, as the store is now."""
-        state = self.store.state()
+        failures, state = self.store.failures, self.store.state()
         with self._lock:
             if self._of is not None:
                 known, coverage = self._of
@@ -127,13 +127,16 @@ class Covering:
                 if coverage.state.deletion != state.deletion:
                     self._known = {}
             segments = self._covered(timeline, state)
+            coverage = Coverage(state, segments)
+            if self.store.failures != failures:
+                return coverage
             # By identity: a segment is immutable, and lives as long as its entry here.
             self._known = {id(each.segment): each for each in segments}
-            self._of = timeline, Coverage(state, segments)
-            return self._of[1]
+            self._of = timeline, coverage
+            return coverage
 
     def _covered(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
-        grown = self._of is None or self._of[1].state.bag != state.bag
+        grown = self._of is None or self._of[1].state != state
         known = {
             nth: each
             for nth, segment in enumerate(timeline.segments)

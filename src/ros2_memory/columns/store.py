@@ -111,11 +111,17 @@ def relative(path: str, bag_dir: str) -> str:
 
 
 class State(NamedTuple):
-    """What changes with every change of the store: the newest of what it ever had."""
+    """What changes with every change of the store.
 
-    bag: int
+    Attributes:
+        part: the newest part: while it is the same, splits became no parts.
+        deletion: the newest deletion: while it is the same, what was stored is stored.
+        change: the newest change, of another connection or of this one.
+    """
+
     part: int
     deletion: int
+    change: tuple[int, int]
 
 
 class StoredBag(NamedTuple):
@@ -181,13 +187,14 @@ class ColumnStore(Database):
         """Returns what tells whether anything has changed."""
 
         def ask(connection: sqlite3.Connection) -> State:
-            row = connection.execute(
-                "SELECT (SELECT max(id) FROM bag), (SELECT max(id) FROM part),"
-                " (SELECT max(id) FROM deletion)"
+            newest = connection.execute(
+                "SELECT (SELECT max(id) FROM part), (SELECT max(id) FROM deletion)"
             ).fetchone()
-            return State(*(self.offset + int(number or 0) for number in row))
+            part, deletion = (self.offset + int(number or 0) for number in newest)
+            [others] = connection.execute("PRAGMA data_version").fetchone()
+            return State(part, deletion, (others, connection.total_changes))
 
-        return self.read(ask, State(-1, -1, -1))
+        return self.read(ask, State(-1, -1, (-1, -1)))
 
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
