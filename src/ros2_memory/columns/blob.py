@@ -1,34 +1,19 @@
-"""All tables of a bag in one blob, and tables that unpack a column when it is asked for.
+"""All tables of a bag in one blob: every value exactly as it was decoded.
 
-The columns of a topic are the same from bag to bag, so a blob holds none of their names: a
-`Layout` does, which its caller keeps under a number. What the blob is, once decompressed (numbers
-are little-endian; `k` values of 8 bytes lie in planes, the lowest byte of each first, as they then
-compress best)::
+A bag lies here until its ten minutes are over, so this is made to be written and read quickly. The
+columns of a topic are the same from bag to bag, so a blob holds none of their names: a `Layout`
+does, which its caller keeps under a number. What the blob is, once decompressed (numbers are
+little-endian and lie in planes, the lowest byte of each first, as they then compress best)::
 
     1       format (`pack.FORMAT`)
-    2       t, the number of tables
-    t times:
-      4     number of the topic, as the caller has it
-      1     which of these it has: 1 publish times, 2 places (else all are 0), 4 hashes of payloads
-      2     p, the number of its packed columns
-      2     s, the number of its sequences, also of those within sequences
-      4     rows
-      4 s   elements of each sequence, in order
-    4       k, the number of packed columns: of each table in turn the log times, those of 1, 2
-            and 4 that it has, and then, of its layout, the columns; of each sequence the owners,
-            its columns and its sequences in turn
-    2       length of the codecs
-    ...     codecs without their type, separated by newlines
-    2 k     which codec
-    4 k     bytes of the column's data
-    4 k     greatest error, as a float32 that is not less
-    4 k     nulls
-    8 k     least: an int64, uint64 or float64; 0 of texts and where there is none
-    8 k     greatest, but for the bits that it has in common with the least (exclusive or)
-    ...     the data, one column after the other
-
-Publish times are packed in place of log times where both are there, and log times as what they are
-later: the middleware delays every message by a little, and publishers keep time.
+    4       t, the number of tables
+    5 t     number of the topic, as the caller has it (4), and whether payloads are hashed (1)
+    4 n     how many values each column has: of each table in turn the log times, publish times and
+            hashes if payloads are hashed, and then the columns in the order of `Layout.slots`
+    ...     the values, those of one kind together (`KINDS`); of texts the codes
+    4 m     how many words each column of texts has
+    4 w     length of each word in characters
+    ...     the words in UTF-8, surrogates pass
 """
 
 from __future__ import annotations
@@ -39,34 +24,23 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
-from ros2_memory.columns.pack import (
-    FORMAT,
-    Known,
-    Packed,
-    carried,
-    compressed,
-    decompressed,
-    eight_bytes,
-    number_of,
-    pack_columns,
-    unpack,
-    zone_of_texts,
-)
-from ros2_memory.columns.steps import EXACT, Step
-from ros2_memory.columns.stored import StoredTable, Times, Topic, lazy_table
-from ros2_memory.columns.table import Column, Elements, Numbers, Table, Zone
+from ros2_memory.columns.layout import KINDS, TEXT
+from ros2_memory.columns.pack import FORMAT, compressed, decompressed
+from ros2_memory.columns.stored import lazy_columns
+from ros2_memory.columns.table import Column, Numbers, Table, Texts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.columns.layout import Layout
+    from ros2_memory.columns.stored import Topic
     from ros2_memory.storage.base import IntArray
 
-_PUBLISHED: Final = 1
-_PLACES: Final = 2
-_HASHES: Final = 4
+_BEGIN: Final = struct.Struct("<BI")
+_HEAD: Final = np.dtype([("topic", "<u4"), ("hashed", "?")])
+_INT64: Final = KINDS.index("int64")
+_HASHED: Final = 3
+"""Log times, publish times and hashes; without hashes log times alone."""
 
 
 class Entry(NamedTuple):
@@ -77,256 +51,171 @@ class Entry(NamedTuple):
     table: Table
 
 
-def pack_tables(entries: Sequence[Entry], *, places: bool = False) -> bytes:
+def pack_tables(entries: Sequence[Entry]) -> bytes:
     """Returns the tables as one compressed blob.
 
     Publish times are packed where there are hashes, with which they tell copies of a message.
     Elsewhere they come back as log times.
 
-    Args:
-        entries: the tables, in any order.
-        places: whether places are packed. Without them messages still have an order: they come back
-            as 0, 1, 2 among the messages of all these tables that have one log time.
-
     Raises:
         ValueError: a table has other columns than its layout.
     """
-    heads: list[bytes] = []
-    columns: list[_Source] = []
-    tables = [entry.table for entry in entries]
-    orders = [table.places for table in tables] if places else _order_of_ties(tables)
-    for (topic, layout, table), order in zip(entries, orders, strict=True):
-        if not layout.fits(table):
-            raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
-        published = table.payload_hashes is not None
-        flags, first = 0, [table.log_times]
-        if published:
-            flags |= _PUBLISHED
-            first = [table.log_times - table.publish_times, table.publish_times]
-        if order is not None:
-            flags |= _PLACES
-            first.append(order)
+    heads = np.array(
+        [(entry.topic, entry.table.payload_hashes is not None) for entry in entries], _HEAD
+    )
+    counts: list[int] = []
+    values: list[list[Numbers]] = [[] for _ in KINDS]
+    words: list[tuple[str, ...]] = []
+    for _, layout, table in entries:
+        times = [table.log_times]
         if table.payload_hashes is not None:
-            flags |= _HASHES
-            first.append(table.payload_hashes)
-        sources = [*(_Source(times) for times in first), *_sources(layout, table)]
-        counts = [len(one.column) for one in sources[len(first) :] if one.are_owners]
-        sizes = (len(sources), len(counts), len(table), *counts)
-        heads.append(struct.pack(f"<IBHHI{len(counts)}I", topic, flags, *sizes))
-        columns += sources
-    packs = _packed(columns)
-    head = struct.pack("<BH", FORMAT, len(heads)) + b"".join(heads)
-    return compressed(head + _directory(packs) + b"".join(packed.data for packed in packs))
-
-
-def _order_of_ties(tables: Sequence[Table]) -> list[IntArray | None]:
-    """For each table the places of its messages among those of one log time; None if all are 0."""
-    if not tables:
-        return []
-    log_times = np.concatenate([table.log_times for table in tables])
-    places = np.concatenate([table.places for table in tables])
-    order = np.lexsort((places, log_times))
-    first = np.ones(len(order), np.bool_)
-    first[1:] = np.diff(log_times[order]) != 0
-    if first.all():
-        return [None] * len(tables)
-    nth = np.arange(len(order))
-    ranks = np.empty_like(nth)
-    ranks[order] = nth - np.maximum.accumulate(np.where(first, nth, 0))
-    parts = np.split(ranks, np.cumsum([len(table) for table in tables])[:-1])
-    return [part if part.any() else None for part in parts]
-
-
-def pack_table(layout: Layout, table: Table) -> dict[str, Packed]:
-    """Returns the columns of one table, each on its own, by the paths of `Layout.slots`.
-
-    Times, places and hashes are not among them.
-
-    Raises:
-        ValueError: the table has other columns than the layout.
-    """
-    if not layout.fits(table):
-        raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
-    return dict(zip(layout.slots, _packed(list(_sources(layout, table))), strict=True))
-
-
-class _Source(NamedTuple):
-    """A column to be packed, and what is known of it if it was packed before."""
-
-    column: Column
-    step: Step = EXACT
-    known: Known | None = None
-    are_owners: bool = False
-
-
-def _packed(sources: Sequence[_Source]) -> list[Packed]:
-    packs = pack_columns([(source.column, source.step) for source in sources])
-    return [
-        packed if source.known is None else carried(packed, source.known)
-        for packed, source in zip(packs, sources, strict=True)
-    ]
-
-
-def _sources(
-    layout: Layout, table: Table, rows: Elements | None = None, around: str = ""
-) -> Iterator[_Source]:
-    """The columns of a table, or of elements of it, in the order of `Layout.slots`."""
-    some = table if rows is None else rows
-    for path, kind in layout.columns.items():
-        whole = f"{around}{path}"
-        zone = table.zone(whole)
-        known = None if zone is None else Known(table.error(whole), zone)
-        yield _Source(some.columns[path], kind.step, known)
-    for path, inner in layout.sequences.items():
-        elements = some.elements[path]
-        yield _Source(elements.owners, are_owners=True)
-        yield from _sources(inner, table, elements, f"{around}{path}.")
-
-
-def _directory(packs: list[Packed]) -> bytes:
-    """What is known of the columns, as the module's docstring shows it."""
-    codecs: dict[str, int] = {}
-    which = [codecs.setdefault(packed.codec.partition(" ")[2], len(codecs)) for packed in packs]
-    errors = np.array([packed.error for packed in packs])
-    with np.errstate(over="ignore"):
-        stated = errors.astype("<f4")
-    stated = np.where(stated < errors, np.nextafter(stated, np.float32(np.inf)), stated)
-    sizes = np.array([len(packed.data) for packed in packs], "<u4")
-    nulls = np.array([packed.zone.nulls for packed in packs], "<u4")
-    leasts = [eight_bytes(packed.zone.least or 0) for packed in packs]
-    greatests = [eight_bytes(packed.zone.greatest or 0) for packed in packs]
-    least, greatest = (np.frombuffer(b"".join(some), "<u8") for some in (leasts, greatests))
-    names = "\n".join(codecs).encode()
-    return b"".join(
-        (
-            struct.pack("<IH", len(packs), len(names)),
-            names,
-            _in_planes(np.array(which, "<u2")),
-            _in_planes(sizes),
-            _in_planes(stated),
-            _in_planes(nulls),
-            _in_planes(least),
-            _in_planes(greatest ^ least),
+            times += [table.publish_times, table.payload_hashes]
+        columns = layout.columns_of(table)
+        counts += map(len, (*times, *columns))
+        values[_INT64] += times
+        for kind, column in zip(layout.kinds.tolist(), columns, strict=True):
+            if isinstance(column, Texts):
+                words.append(column.words)
+                values[kind].append(column.codes)
+            else:
+                values[kind].append(column)
+    planes = [_planes(np.concatenate(some)) for some in values if some]
+    return compressed(
+        b"".join(
+            (
+                _BEGIN.pack(FORMAT, len(heads)),
+                heads.tobytes(),
+                _planes(np.array(counts, "<u4")),
+                *planes,
+                *_packed_words(words),
+            )
         )
     )
 
 
-def _in_planes(numbers: Numbers) -> bytes:
-    return numbers.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes()
-
-
-def unpack_tables(
-    blob: bytes, topics: Mapping[int, Topic], wanted: Callable[[int], bool] | None = None
-) -> list[StoredTable]:
-    """Returns the tables of a blob, in the order in which they were packed.
+def unpack_tables(blob: bytes, topics: Mapping[int, Topic]) -> Iterator[tuple[int, Table]]:
+    """Yields the tables of a blob, each with its number, in the order in which they were packed.
 
     Args:
         blob: what `pack_tables` returned.
         topics: the topics of the tables, by the number under which they were packed.
-        wanted: of which numbers tables are returned; of all by default. Others cost nothing, and
-            `topics` need not know them.
 
     Raises:
         ValueError: the blob is damaged, of another format, or not of these layouts.
     """
     data = decompressed(blob)
-    form, count = struct.unpack_from("<BH", data)
+    form, tables = _BEGIN.unpack_from(data)
     if form != FORMAT:
         raise ValueError(f"the blob of columns is of format {form}, this program reads {FORMAT}")
-    at = 3
-    heads: list[tuple[_Head, tuple[int, ...]]] = []
-    for _ in range(count):
-        head = _Head(*struct.unpack_from("<IBHHI", data, at))
-        heads.append((head, struct.unpack_from(f"<{head.sequences}I", data, at + 13)))
-        at += 13 + 4 * head.sequences
-    packs = _Packs(data, at)
-    first = 0
-    tables: list[StoredTable] = []
-    for head, counts in heads:
-        if wanted is None or wanted(head.topic):
-            tables.append(_table(packs, first, head, counts, topics[head.topic]))
-        first += head.packs
-    return tables
-
-
-class _Head(NamedTuple):
-    """The head of a table in a blob."""
-
-    topic: int
-    flags: int
-    packs: int
-    sequences: int
-    rows: int
-
-
-class _Packs:
-    """The packed columns of a blob, by their number."""
-
-    def __init__(self, data: bytes, at: int) -> None:
-        count, length = struct.unpack_from("<IH", data, at)
-        at += 6
-        self._data = data
-        self._codecs = data[at : at + length].decode().split("\n")
-        planes = np.frombuffer(data, np.uint8, 30 * count, at + length).reshape(30, count)
-        self._which = _from_planes(planes[:2], "<u2").astype(np.int64)
-        self._starts = np.zeros(count + 1, np.int64)
-        np.cumsum(_from_planes(planes[2:6], "<u4"), out=self._starts[1:])
-        self._starts += at + length + 30 * count
-        self._facts = np.ascontiguousarray(planes[6:].T)
-
-    def packed(self, nth: int, dtype: str, count: int) -> Packed:
-        """Returns one of them; `count` values of this type are in it."""
-        codec = f"{dtype} {self._codecs[self._which[nth]]}"
-        data = self._data[self._starts[nth] : self._starts[nth + 1]]
-        if dtype == "text":
-            return Packed(codec, count, 0.0, zone_of_texts(data), data)
-        error, nulls, least, difference = struct.unpack("<fIQQ", self._facts[nth])
-        zone = Zone(nulls=nulls)
-        if nulls < count:
-            least, greatest = (struct.pack("<Q", bits) for bits in (least, least ^ difference))
-            zone = Zone(number_of(least, dtype), number_of(greatest, dtype), nulls)
-        return Packed(codec, count, error, zone, data)
-
-
-def unpacked(packed: Packed) -> Column:
-    """Returns the values of a packed column."""
-    return unpack(packed.codec, packed.count, packed.zone.least, packed.data)
-
-
-def _from_planes(planes: NDArray[np.uint8], dtype: str) -> Numbers:
-    return np.ascontiguousarray(planes.T).view(dtype).ravel()
-
-
-def _table(
-    packs: _Packs, first: int, head: _Head, counts: tuple[int, ...], topic: Topic
-) -> StoredTable:
-    """The table whose packed columns begin with number `first`."""
-    has = [flag for flag in (_PUBLISHED, _PLACES, _HASHES) if head.flags & flag]
-    begin = first + 1 + len(has)
-    if len(topic.layout.slots) != first + head.packs - begin:
-        raise ValueError(f"a blob has other columns of {topic.channel.topic} than its layout")
-
-    @cache
-    def packed(path: str) -> Packed:
-        slot = topic.layout.slots[path]
-        count = counts[slot.sequence - 1] if slot.sequence else head.rows
-        return packs.packed(begin + slot.nth, slot.dtype, count)
-
-    def known(path: str) -> Known:
-        found = packed(path)
-        return Known(found.error, found.zone)
-
-    times = [
-        cast("IntArray", unpacked(packs.packed(nth, "int64", head.rows)))
-        for nth in range(first, begin)
-    ]
-    log_times, others = times[0], dict(zip(has, times[1:], strict=True))
-    if _PUBLISHED in others:
-        log_times = log_times + others[_PUBLISHED]
-    kept = Times(
-        log_times,
-        others.get(_PUBLISHED, log_times),
-        others.get(_PLACES, np.zeros(head.rows, np.int64)),
-        others.get(_HASHES),
+    heads = np.frombuffer(data, _HEAD, tables, _BEGIN.size)
+    found = [topics[number] for number in heads["topic"].tolist()]
+    times = np.where(heads["hashed"], _HASHED, 1)
+    kinds = np.concatenate(
+        [
+            np.empty(0, np.int64),
+            *(
+                each
+                for topic, count in zip(found, times.tolist(), strict=True)
+                for each in (np.full(count, _INT64), topic.layout.kinds)
+            ),
+        ]
     )
-    return lazy_table(head.topic, topic, kept, known, lambda path: unpacked(packed(path)))
+    values = _Values(data, _BEGIN.size + heads.nbytes, kinds)
+    first = 0
+    for number, topic, count in zip(heads["topic"].tolist(), found, times.tolist(), strict=True):
+        yield number, _table(values, first, topic, count)
+        first += count + len(topic.layout.slots)
+
+
+class _Values:
+    """The columns of a blob, by their numbers.
+
+    Args:
+        data: the blob, decompressed.
+        at: where the counts begin.
+        kinds: of each column.
+    """
+
+    def __init__(self, data: bytes, at: int, kinds: IntArray) -> None:
+        self._data = data
+        self._kinds = kinds
+        self._counts = _from_planes(data, at, len(kinds), "<u4").astype(np.int64)
+        self._starts = np.zeros_like(self._counts)
+        self._texts = np.cumsum(kinds == TEXT) - 1
+        self._places: dict[int, tuple[int, int]] = {}
+        at += 4 * len(kinds)
+        for kind in range(len(KINDS)):
+            those = kinds == kind
+            stops = np.cumsum(self._counts[those])
+            self._starts[those] = stops - self._counts[those]
+            length = int(stops[-1]) if stops.size else 0
+            self._places[kind] = at, length
+            at += length * _dtype(kind).itemsize
+        self._words_at = at
+        self._all = cache(self._of_kind)
+        self._words = cache(self._unpacked_words)
+
+    def column(self, nth: int) -> Column:
+        """Returns a column."""
+        kind, start = int(self._kinds[nth]), int(self._starts[nth])
+        values = self._all(kind)[start : start + int(self._counts[nth])]
+        if kind != TEXT:
+            return values
+        return Texts(values.astype(np.uint32, copy=False), self._words()[int(self._texts[nth])])
+
+    def _of_kind(self, kind: int) -> Numbers:
+        at, count = self._places[kind]
+        return _from_planes(self._data, at, count, _dtype(kind))
+
+    def _unpacked_words(self) -> list[tuple[str, ...]]:
+        counts = _from_planes(self._data, self._words_at, int((self._kinds == TEXT).sum()), "<u4")
+        stops = np.cumsum(counts, dtype=np.int64).tolist()
+        at = self._words_at + counts.nbytes
+        lengths = _from_planes(self._data, at, stops[-1] if stops else 0, "<u4")
+        ends = np.cumsum(lengths, dtype=np.int64).tolist()
+        text = self._data[at + lengths.nbytes :].decode("utf-8", "surrogatepass")
+        words = [text[start:stop] for start, stop in zip([0, *ends], ends, strict=False)]
+        return [tuple(words[start:stop]) for start, stop in zip([0, *stops], stops, strict=False)]
+
+
+def _table(values: _Values, first: int, topic: Topic, count: int) -> Table:
+    """The table whose columns begin with number `first`, after `count` for its times."""
+    slots = topic.layout.slots
+    times = [cast("IntArray", values.column(first + nth)) for nth in range(count)]
+    columns, elements = lazy_columns(
+        topic.layout, lambda path: values.column(first + count + slots[path].nth)
+    )
+    return Table(
+        topic.channel,
+        times[0],
+        times[1] if count == _HASHED else times[0],
+        np.arange(len(times[0])),
+        columns,
+        elements,
+        topic.layout.left_out,
+        times[2] if count == _HASHED else None,
+        definition=topic.definition,
+    )
+
+
+def _packed_words(texts: Sequence[tuple[str, ...]]) -> Iterator[bytes]:
+    words = [word for some in texts for word in some]
+    yield _planes(np.array([len(some) for some in texts], "<u4"))
+    yield _planes(np.array([len(word) for word in words], "<u4"))
+    yield "".join(words).encode("utf-8", "surrogatepass")
+
+
+def _dtype(kind: int) -> np.dtype[np.generic[object]]:
+    return np.dtype("uint32" if kind == TEXT else KINDS[kind])
+
+
+def _planes(numbers: Numbers) -> bytes:
+    return numbers.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes()
+
+
+def _from_planes(
+    data: bytes, at: int, count: int, dtype: str | np.dtype[np.generic[object]]
+) -> Numbers:
+    whole = np.dtype(dtype)
+    planes = np.frombuffer(data, np.uint8, count * whole.itemsize, at)
+    return np.ascontiguousarray(planes.reshape(whole.itemsize, count).T).view(whole).ravel()

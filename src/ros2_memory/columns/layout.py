@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, NotRequired, TypedDict, cast
+
+import numpy as np
 
 from ros2_memory.columns.steps import EXACT, Step, step_of
 from ros2_memory.columns.table import Column, Elements, Table, Texts
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
-    from ros2_memory.storage.base import Definition
+    from ros2_memory.storage.base import Definition, IntArray
+
+_INTEGERS: Final = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+KINDS: Final = ("bool", *_INTEGERS, "float32", "float64", "text")
+TEXT: Final = KINDS.index("text")
 
 
 class _Described(TypedDict):
@@ -30,18 +36,19 @@ class Kind(NamedTuple):
     step: Step = EXACT
 
 
+_OWNERS: Final = Kind("int64")
+
+
 class Slot(NamedTuple):
     """Where a column lies among the packed ones of its table, in the order of `Layout`.
 
     Attributes:
         nth: its place.
-        dtype: as in `Kind`.
-        sequence: the number of the sequence that it is of, counted like the places; 0: none.
+        kind: what it is.
     """
 
     nth: int
-    dtype: str
-    sequence: int
+    kind: Kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,28 +61,25 @@ class Layout:
         left_out: what is no column, and why.
         slots: where a column lies among the packed ones of its table, by its path from there
             (`detections.label`), and where owners lie, by the path of the sequence and `#`.
+        kinds: of each slot the index of its type among `KINDS`.
     """
 
     columns: Mapping[str, Kind]
     sequences: Mapping[str, Layout] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     slots: Mapping[str, Slot] = field(init=False, compare=False, repr=False)
+    kinds: IntArray = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        slots = {
-            path: Slot(nth, kind.dtype, 0) for nth, (path, kind) in enumerate(self.columns.items())
-        }
-        sequences = 0
+        slots = {path: Slot(nth, kind) for nth, (path, kind) in enumerate(self.columns.items())}
         for path, inner in self.sequences.items():
-            own = sequences + 1
-            sequences = own
-            slots[f"{path}#"] = Slot(len(slots), "int64", own)
+            slots[f"{path}#"] = Slot(len(slots), _OWNERS)
             begin = len(slots)
             for name, slot in inner.slots.items():
-                whole = f"{path}.{name}".rstrip(".")
-                sequences = max(sequences, own + slot.sequence)
-                slots[whole] = Slot(begin + slot.nth, slot.dtype, own + slot.sequence)
+                slots[f"{path}.{name}".rstrip(".")] = Slot(begin + slot.nth, slot.kind)
+        kinds = np.array([KINDS.index(slot.kind.dtype) for slot in slots.values()], np.int64)
         object.__setattr__(self, "slots", slots)
+        object.__setattr__(self, "kinds", kinds)
 
     @classmethod
     def of(cls, table: Table, definition: Definition | None) -> Layout:
@@ -110,6 +114,24 @@ class Layout:
             and self.sequences.keys() == rows.elements.keys()
             and all(inner._fits(rows.elements[path]) for path, inner in self.sequences.items())
         )
+
+    def columns_of(self, table: Table) -> list[Column]:
+        """Returns the columns of a table and the owners of its elements, in the order of `slots`.
+
+        Raises:
+            ValueError: the table has other columns.
+        """
+        if not self.fits(table):
+            raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
+        return [*self._columns_in(table)]
+
+    def _columns_in(self, rows: Table | Elements) -> Iterator[Column]:
+        for path in self.columns:
+            yield rows.columns[path]
+        for path, inner in self.sequences.items():
+            elements = rows.elements[path]
+            yield elements.owners
+            yield from inner._columns_in(elements)
 
     def to_json(self) -> str:
         """Returns it as a person can read it; equal layouts give equal texts."""

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.blob import pack_table
-from ros2_memory.columns.pack import Known, Packed, compressed, pack
-from ros2_memory.columns.stored import Lazily, Times, joined_stored, lazy_table
+from ros2_memory.columns.pack import Packed, compressed, pack, pack_columns
+from ros2_memory.columns.stored import Lazily, StoredTable, lazy_columns
+from ros2_memory.columns.table import joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.columns.layout import Layout
-    from ros2_memory.columns.stored import StoredTable, Topic
+    from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
@@ -68,33 +68,37 @@ class PackedPart:
         return replace(self, columns=columns)
 
 
-def packed_part(layout: Layout, tables: Sequence[tuple[int, StoredTable]]) -> PackedPart:
+def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:
     """Returns the rows of some bags as one part.
 
     Args:
         layout: of the topic, type and definition that all these tables are of.
         tables: each with the number of its bag, and at least one row.
     """
-    numbered: list[StoredTable] = []
-    count = 0
-    for _, table in tables:
-        # The place of a row becomes its number among all rows: so its bag is known once sorted.
-        numbered.append(replace(table, places=np.arange(count, count + len(table))))
-        count += len(table)
-    bags = np.repeat(
-        np.array([bag for bag, _ in tables], np.int64), [len(table) for _, table in tables]
-    )
-    whole = joined_stored(numbered)
-    return pack_rows(layout, whole, bags[whole.places])
+    stops = np.cumsum([len(table) for _, table in tables])
+    # The place of a row becomes its number among all rows: so its bag is known once sorted.
+    numbered = [
+        replace(table, places=np.arange(stop - len(table), stop))
+        for (_, table), stop in zip(tables, stops.tolist(), strict=True)
+    ]
+    whole = joined(numbered)
+    bags = np.array([bag for bag, _ in tables], np.int64)
+    return pack_rows(layout, whole, bags[np.searchsorted(stops, whole.places, side="right")])
 
 
 def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
-    """Returns the rows of a table, each with the number of its bag, as a part."""
+    """Returns the rows of a table, each with the number of its bag, as a part.
+
+    Raises:
+        ValueError: the table has other columns than the layout.
+    """
     columns = {LOG_TIME: pack(table.log_times), BAG: pack(bags)}
     if table.payload_hashes is not None:
         columns[PUBLISH_TIME] = pack(table.publish_times)
         columns[PAYLOAD_HASH] = pack(table.payload_hashes)
-    columns.update(pack_table(layout, table))
+    steps = [slot.kind.step for slot in layout.slots.values()]
+    packs = pack_columns([*zip(layout.columns_of(table), steps, strict=True)])
+    columns.update(zip(layout.slots, packs, strict=True))
     return PackedPart(
         int(table.log_times[0]),
         int(table.log_times[-1]),
@@ -108,37 +112,35 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
 
 
 def part_table(
-    number: int,
-    topic: Topic,
-    columns: Mapping[str, Packed],
-    load: Callable[[str], Column],
+    topic: Topic, packed: Mapping[str, Packed], load: Callable[[str], Column]
 ) -> StoredTable:
     """Returns a part as a table whose columns are loaded when they are first asked for.
 
     Its times are all 0: `PartUnit` loads the true ones.
 
     Args:
-        number: of the topic.
         topic: of the part.
-        columns: what is known of each column; their data is not needed.
+        packed: what is known of each column; their data is not needed.
         load: returns a column by its path.
     """
-
-    def known(path: str) -> Known:
-        return Known(columns[path].error, columns[path].zone)
-
-    none = np.broadcast_to(np.int64(0), (columns[LOG_TIME].count,))
-    kept = Times(none, none, none)
-    table = lazy_table(number, topic, kept, known, load)
-    dropped = {path for path, packed in columns.items() if packed.codec == DROPPED}
-    if not dropped:
-        return table
-    reason = "beyond the share of the store (store.max_share)"
-    there = [path for path in table.columns if path not in dropped]
-    sequences = [path for path in table.elements if f"{path}#" not in dropped]
-    return replace(
-        table,
-        columns=Lazily(there, table.columns.__getitem__),
-        elements=Lazily(sequences, table.elements.__getitem__),
-        left_out={**table.left_out, **dict.fromkeys(dropped, reason)},
+    columns, elements = lazy_columns(topic.layout, load)
+    left_out = topic.layout.left_out
+    dropped = {path for path, one in packed.items() if one.codec == DROPPED}
+    if dropped:
+        reason = "beyond the share of the store (store.max_share)"
+        left_out = {**left_out, **dict.fromkeys(dropped, reason)}
+        columns = Lazily([path for path in columns if path not in dropped], columns.__getitem__)
+        there = [path for path in elements if f"{path}#" not in dropped]
+        elements = Lazily(there, elements.__getitem__)
+    none = np.broadcast_to(np.int64(0), (packed[LOG_TIME].count,))
+    return StoredTable(
+        topic.channel,
+        none,
+        none,
+        none,
+        columns,
+        elements,
+        left_out,
+        definition=topic.definition,
+        packed=packed,
     )

@@ -228,7 +228,7 @@ class Scanner:
                 raise GoneError
             return bag
 
-        table = part_table(head.topic, topic, known, load)
+        table = part_table(topic, known, load)
         return PartUnit(head, table, integers, counting - offset, bag_of)
 
     def split(self, number: int, topic: str) -> list[Table] | None:
@@ -239,8 +239,8 @@ class Scanner:
         topics = self.store.topics()
         if data is None or self.store.failures != failures:
             return None
-        wanted = {key for key, known in topics.items() if known.channel.topic == topic}
-        return [*unpack_tables(data, topics, wanted.__contains__)]
+        tables = unpack_tables(data, topics)
+        return [table for number, table in tables if topics[number].channel.topic == topic]
 
     def _column(self, part: int, path: str, packed: Packed) -> Column:
         column = self._columns.get((part, path))

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.stored import StoredTable
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
@@ -383,9 +382,7 @@ class ColumnStore(Database):
             entries = [
                 Entry(*topic_of(connection, table, self._layouts), table) for table in tables
             ]
-            connection.execute(
-                "INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries, places=False))
-            )
+            connection.execute("INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries)))
 
         return self.write(write) and stored
 
@@ -445,11 +442,11 @@ class ColumnStore(Database):
             ).fetchall()
             if len(rows) < len(numbers):
                 return  # another program merges them
-            found: dict[int, list[tuple[int, StoredTable]]] = defaultdict(list)
+            found: dict[int, list[tuple[int, Table]]] = defaultdict(list)
             for bag, blob in rows:
-                for table in unpack_tables(blob, topics):
+                for topic, table in unpack_tables(blob, topics):
                     if len(table):
-                        found[table.number].append((bag, table))
+                        found[topic].append((bag, table))
             packed = {
                 topic: [packed_part(topics[topic].layout, tables)]
                 for topic, tables in found.items()
