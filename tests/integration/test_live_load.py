@@ -101,7 +101,8 @@ def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
 
 
 def test_what_is_lost_under_load_is_counted(site: Machine) -> None:
-    with publishing(site.env, *(f"{topic}:{HZ}:reliable" for topic in LOAD)):
+    """Publishers keep what waits, as what they overwrite is lost before anybody can count it."""
+    with publishing(site.env, *(f"{topic}:{HZ}:reliable:deep" for topic in LOAD)):
         recorder = site.record(
             "load", *(() if LONG else ("recording.split_duration_s=2",)), topics=LOAD
         )
@@ -135,7 +136,9 @@ def test_what_is_lost_under_load_is_counted(site: Machine) -> None:
 
 def test_simulated_time_is_recorded_by_its_clock(site: Machine) -> None:
     """Rotations and losses among it: the wall clock that paces them runs at another speed."""
-    with publishing(site.env, "--speed", f"{SPEED:g}", "/odom:1:reliable", "/rare:0.1:reliable"):
+    with publishing(
+        site.env, "--speed", f"{SPEED:g}", "/odom:1:reliable:deep", "/rare:0.1:reliable:deep"
+    ):
         recorder = site.record(
             "simulated",
             "recording.use_sim_time=true",

@@ -6,6 +6,7 @@ import os
 import signal
 import struct
 import subprocess
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -42,7 +43,9 @@ def publishing(env: Mapping[str, str], *topics: str) -> Iterator[subprocess.Pope
     process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
     try:
         yield process
+        assert process.poll() is None, "the publishers ended"
     finally:
+        sys.stdout.write(f"publishers: {process.poll()} (None: they ran)\n")
         end(process)
 
 

@@ -3,7 +3,8 @@
     python -m tests.support.counting_publishers /odom:100:reliable /scan:50:best_effort:deadline
 
 Each argument is a topic, its messages a second, its reliability, and more of its QoS: `latched`
-(transient local) or `deadline` (of half a second). Messages are geometry_msgs/PointStamped: `x` is
+(transient local), `deadline` (of half a second) or `deep` (what waits is kept, not only the newest
+ten). Messages are geometry_msgs/PointStamped: `x` is
 the number of the message, from 0, and the header's stamp that of its tick. `--first N` begins with
 another number. `--speed N` simulates: `/clock` begins at 0 and runs N times as fast as the wall
 clock, and the topics' rates and stamps are by it. All of it ends with the process: kill it.
@@ -38,7 +39,8 @@ def main(arguments: list[str]) -> None:
     topics = []
     for argument in given.topics:
         topic, hz, reliability, *more = argument.split(":")
-        profile = QoSProfile(depth=10, reliability=ReliabilityPolicy[reliability.upper()])
+        depth = 10_000 if "deep" in more else 10
+        profile = QoSProfile(depth=depth, reliability=ReliabilityPolicy[reliability.upper()])
         if "latched" in more:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
         if "deadline" in more:

@@ -251,6 +251,8 @@ def machine(folder: Path, env: Mapping[str, str]) -> Iterator[Machine]:
     finally:
         for recorder in site.recorders:
             recorder.discard()
+            # Shown where a test failed: the files of a machine that runs tests are soon gone.
+            sys.stdout.write(recorder.log.read_text(errors="replace")[-20_000:])
 
 
 @contextmanager
