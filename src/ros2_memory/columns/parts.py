@@ -132,7 +132,7 @@ def part_table(
         columns = Lazily([path for path in columns if path not in dropped], columns.__getitem__)
         there = [path for path in elements if f"{path}#" not in dropped]
         elements = Lazily(there, elements.__getitem__)
-    none = np.broadcast_to(np.int64(0), (packed[LOG_TIME].count,))
+    none = np.zeros(packed[LOG_TIME].count, np.int64)
     return StoredTable(
         topic.channel,
         none,

@@ -66,6 +66,7 @@ class Asked:
         decode: decodes a topic of a bag that is not stored.
         shared: the half-open spans in which different recordings may hold copies, in order.
         relatches: whether recordings may have received a message again, as of a latched topic.
+        may_match: whether rows of a part may be wanted, told by its zones; others are left out.
         may_be_empty: whether rows are yielded also where none of them counts. Which do is then
             found out only where that is asked.
         check: is called before each table with a log time that what is left does not lie behind
@@ -78,6 +79,7 @@ class Asked:
     decode: Decode
     shared: Sequence[tuple[Ns, Ns]] = ()
     relatches: bool = False
+    may_match: Callable[[Table], bool] = lambda _: True
     may_be_empty: bool = False
     check: Callable[[Ns], None] = lambda _: None
 
@@ -195,31 +197,40 @@ class Scanner:
                 self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
         yield from known.within(window)
 
-    def part(self, head: PartHead, coverage: Coverage) -> PartUnit | None:
-        """Returns a part; None where no row of it counts.
+    def part(
+        self,
+        head: PartHead,
+        coverage: Coverage,
+        may_match: Callable[[Table], bool] = lambda _: True,
+    ) -> PartUnit | None:
+        """Returns a part; None where no row of it counts, or none may match.
 
         Raises:
             GoneError: it was deleted meanwhile.
         """
         assert self.store is not None  # noqa: S101 - there are no parts without one
         offset = self.store.offset
-        counting = coverage.among(head.bags)
-        columns = self._known.get(head.number)
-        if columns is None:
-            columns = self.store.part_columns(head.number)
-            self._known.put(head.number, columns, _COLUMN_BYTES * len(columns))
-        if not counting.size:
-            return None
-        topic = self.store.topics().get(head.topic)
-        if not columns or topic is None:
+        known = self._known.get(head.number)
+        if known is None:
+            known = self.store.part_columns(head.number)
+            self._known.put(head.number, known, _COLUMN_BYTES * len(known))
+        topic = self.store.topic(head.topic)
+        if not known or topic is None:
             raise GoneError
-        known = columns
+        columns = known
 
         def load(path: str) -> Column:
-            return self._column(head.number, path, known[path])
+            return self._column(head.number, path, columns[path])
+
+        table = part_table(topic, columns, load)
+        if not may_match(table):
+            return None
+        counting = coverage.among(head.bags)
+        if not counting.size:
+            return None
 
         def integers(path: str) -> IntArray | None:
-            column = load(path) if path in known else None
+            column = load(path) if path in columns else None
             return None if column is None else np.asarray(column, np.int64)
 
         def bag_of(number: int) -> BagFile:
@@ -228,7 +239,6 @@ class Scanner:
                 raise GoneError
             return bag
 
-        table = part_table(topic, known, load)
         return PartUnit(head, table, integers, counting - offset, bag_of)
 
     def split(self, number: int, topic: str) -> list[Table] | None:
@@ -291,7 +301,7 @@ class _Scan:
         for source in sources:
             if window.overlaps(source.first, source.last):
                 self._asked.check(source.last if newest_first else source.first)
-                for unit in self._units(source):
+                for unit in self._units(source, self._asked.may_match):
                     rows = Rows(unit, partial(self._counting, unit))
                     if self._asked.may_be_empty or len(rows):
                         yield rows
@@ -341,9 +351,11 @@ class _Scan:
             if reach.overlaps(bag.start, bag.end) and bag.summary.of(topic):
                 yield _Source(*bag.summary.span_of([topic]), None, bag)
 
-    def _units(self, source: _Source) -> Iterable[Unit]:
+    def _units(
+        self, source: _Source, may_match: Callable[[Table], bool] = lambda _: True
+    ) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage)
+            unit = self._scanner.part(source.part, self._coverage, may_match)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         known = self._decoded.get(source.bag.file)

@@ -177,7 +177,7 @@ class ColumnStore(Database):
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
         self._definition_of = definition_of
         self._definitions = definitions
-        self._topics: dict[int, Topic] = {}
+        self._topics: tuple[int, dict[int, Topic]] = (0, {})
         self._layouts = Layouts()
 
     # Reading
@@ -265,7 +265,9 @@ class ColumnStore(Database):
         """Returns all topics that were ever stored, by their numbers."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, Topic]:
-            known = self._topics
+            offset, known = self._topics
+            if offset != self.offset:  # those of a file that was lost had other numbers
+                known = {}
             rows = connection.execute(
                 "SELECT topic.id, name, topic.encoding, latched, layout, type,"
                 " definition.encoding, text"
@@ -277,10 +279,16 @@ class ColumnStore(Database):
                 channel = Channel(name, encoding, Schema(*schema), bool(latched))
                 definition = self._definition_of(channel)
                 added[number] = Topic(channel, Layout.from_json(layout), definition)
-            self._topics = {**known, **added} if added else known
-            return self._topics
+            self._topics = self.offset, ({**known, **added} if added else known)
+            return self._topics[1]
 
-        return self.read(ask, self._topics)
+        return self.read(ask, {})
+
+    def topic(self, number: int) -> Topic | None:
+        """Returns a topic by its number; None where there is none."""
+        offset, known = self._topics
+        found = known.get(number) if offset == self.offset else None
+        return found or self.topics().get(number)
 
     def parts(self, topic: str, after: int = 0) -> list[PartHead]:
         """Returns the parts of a topic, of all its types, in the order of their first messages.

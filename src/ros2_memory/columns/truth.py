@@ -106,14 +106,11 @@ class ColumnCondition:
 
     def truth(self, table: Table) -> Truth:
         """Returns which rows of a table meet the condition."""
-        rows, definition = len(table), table.definition
-        plan = None
-        if definition is not None and "" not in table.left_out:
-            plan = self._plan(definition, table.channel.type)
+        rows, plan = len(table), self._plan_of(table)
         if plan is None:
             return _truth(rows, unknown(rows))
         values = Values(table)
-        if rows == 0 or not any(test.may_match(values) for test in plan.whole):
+        if rows == 0 or not plan.may_match(values):
             return Truth(rows)
         if plan.counted is None:
             return _truth(rows, _any_of(plan.whole, values))
@@ -128,7 +125,15 @@ class ColumnCondition:
         surely, perhaps = counted.surely & whole.surely, counted.perhaps & whole.perhaps
         return _truth(rows, Kept(surely, perhaps))
 
-    def _plan(self, definition: Definition, type_name: str) -> _Plan | None:
+    def may_match(self, table: Table) -> bool:
+        """Returns whether a row may meet the condition, as known without reading a column."""
+        plan = self._plan_of(table)
+        return plan is None or plan.may_match(Values(table))
+
+    def _plan_of(self, table: Table) -> _Plan | None:
+        definition, type_name = table.definition, table.channel.type
+        if definition is None or "" in table.left_out:
+            return None
         key = (definition, type_name)
         if key not in self._plans:
             try:
@@ -150,6 +155,9 @@ class _Plan(NamedTuple):
 
     whole: Sequence[_LeafTest | _PlaceTest]
     counted: Sequence[_LeafTest | _PlaceTest] | None
+
+    def may_match(self, values: Values) -> bool:
+        return any(test.may_match(values) for test in self.whole)
 
 
 def _truth(rows: int, kept: Kept) -> Truth:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
@@ -105,10 +106,22 @@ class CandidateRows:
             self._left[topic] = min(last + 1, self._until)
 
         for rows in scan(
-            self._view, topic, window, newest_first=True, may_be_empty=True, reached=reached
+            self._view,
+            topic,
+            window,
+            newest_first=True,
+            may_match=self._may_match,
+            may_be_empty=True,
+            reached=reached,
         ):
             yield rows.last, self._candidates(rows)
         self._left[topic] = MIN_NS
+
+    def _may_match(self, table: Table) -> bool:
+        found = self._test.may_match(table)
+        self.has_looked = True
+        self.ruled_out |= not found
+        return found
 
     def _candidates(self, rows: Rows) -> IntArray:
         self.has_looked = True

@@ -28,6 +28,7 @@ def scan(
     columns: bool = True,
     copies: bool = False,
     shared: Sequence[tuple[Ns, Ns]] | None = None,
+    may_match: Callable[[Table], bool] = lambda _: True,
     may_be_empty: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
@@ -37,7 +38,7 @@ def scan(
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. `may_be_empty` is as in `Asked`.
+    may hold copies, where the caller knows them. `may_match` and `may_be_empty` are as in `Asked`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -59,6 +60,7 @@ def scan(
         view.snapshot.timeline,
         decode,
         shared=shared,
+        may_match=may_match,
         may_be_empty=may_be_empty,
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,

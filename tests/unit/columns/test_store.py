@@ -180,6 +180,24 @@ def test_a_file_that_is_lost_while_it_is_used_is_made_anew(tmp_path: Path) -> No
     assert check_all(world) == 4 * 24
 
 
+def test_topics_of_a_file_that_was_lost_are_not_those_of_the_next(tmp_path: Path) -> None:
+    paths = []
+    for number, message in enumerate((battery(T0, 0.7), text(T0 + 99 * S, "hello"))):
+        paths.append(write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [message]))
+        os.utime(paths[-1], ns=(T0, T0))
+    world = World.of(tmp_path)
+    world.fill()
+    assert check_all(world) == 2
+    store_file(tmp_path).unlink()
+    paths[1].rename(tmp_path / "hello")
+    World.of(tmp_path).fill()
+    (tmp_path / "hello").rename(paths[1])
+    world.store.look_after()
+    assert check_all(world) == 2
+    assert world.fill() == 1
+    assert check_all(world) == 2
+
+
 def test_a_file_that_turns_out_damaged_while_it_is_asked_costs_no_answer(tmp_path: Path) -> None:
     write_bags(tmp_path)
     world = World.of(tmp_path)
