@@ -124,8 +124,14 @@ class Snapshot:
         misdated = self.dating.misdated
         if not misdated:
             return parts
-        dated = ([bag for bag in each.bags if bag.file not in misdated] for each in parts)
-        return [Segment(bags) for bags in dated if bags]
+        found: list[Segment] = []
+        for part in parts:
+            dated = [bag for bag in part.bags if bag.file not in misdated]
+            if len(dated) == len(part.bags):
+                found.append(part)  # what it remembers serves the next snapshot
+            elif dated:
+                found.append(Segment(dated))
+        return found
 
     @cached_property
     def _presences(self) -> dict[str, Presence]:
