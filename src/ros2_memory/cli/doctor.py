@@ -133,6 +133,7 @@ def _examine(
         yield from check_bags(settings, memory)
         yield from check_recordings(memory, snapshot)
         yield from check_catalogue(memory)
+        yield from check_columns(memory)
         recorder = settings.recorder
         if isinstance(recorder, NullRecorderNode):
             yield _ok("recorder", "recorder=none: nothing is recorded here")
@@ -163,6 +164,7 @@ def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
         *check_bags(own, memory),
         *check_recordings(memory, snapshot),
         *check_catalogue(memory),
+        *check_columns(memory),
     ]
     for each in found:
         if each.level is not Level.OK or each.about == "bags":
@@ -392,6 +394,21 @@ def check_catalogue(memory: Memory) -> Iterator[Finding]:
     seen = f"the catalogue did not store {entries} ({catalogue.refused_for}): no answer depends "
     do = "answers are right, and slower; please report this as a defect, with the reason"
     yield _warning("catalogue", f"{seen}on it", do)
+
+
+def check_columns(memory: Memory) -> Iterator[Finding]:
+    """Checks that columns can be stored, and names topics that are beyond their share."""
+    store = None if memory.columns is None else memory.columns.store
+    if store is None:
+        return
+    dropped = store.dropped()
+    if store.trouble is not None:
+        do = "answers are right, and slower; free the disk, or let it be written"
+        yield _warning("columns", f"the store of columns {store.trouble}", do)
+    if dropped:
+        since = iso_local(min(dropped.values()))
+        seen = f"topics beyond store.max_share since {since}, whose bags are read: "
+        yield _ok("columns", f"{seen}{', '.join(dropped)}")
 
 
 def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:

@@ -25,7 +25,7 @@ from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
-from ros2_memory.columns.parts import packed_part
+from ros2_memory.columns.parts import DROPPED, packed_part
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
@@ -232,6 +232,20 @@ class ColumnStore(Database):
             return frozenset(self.offset + row[0] for row in rows)
 
         return self.read(ask, frozenset())
+
+    def dropped(self) -> dict[str, Ns]:
+        """Returns the topics of which columns were dropped, with the log time (ns) of the first."""
+
+        def ask(connection: sqlite3.Connection) -> dict[str, Ns]:
+            rows = connection.execute(
+                "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
+                " WHERE part.id IN (SELECT part FROM part_column WHERE codec = ?)"
+                " GROUP BY name ORDER BY name",
+                (DROPPED,),
+            )
+            return dict(rows.fetchall())
+
+        return self.read(ask, {})
 
     def oldest(self) -> Ns | None:
         """Returns the earliest log time (ns) of any bag; None without one."""

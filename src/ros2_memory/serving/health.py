@@ -190,6 +190,9 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
             problems.append(
                 _short(f"the catalogue {backfill.catalogue.trouble}; no answer depends on it")
             )
+        if backfill.filling is not None and backfill.filling.store.trouble is not None:
+            trouble = backfill.filling.store.trouble
+            problems.append(_short(f"the store of columns {trouble}; no answer depends on it"))
     if heartbeat is not None:
         shown["recorder"] = _recorder(heartbeat, now)
     return _status(version, problems, shown)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import sys
 import threading
 import time
@@ -18,9 +19,11 @@ from mcap.writer import Writer
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts
+from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
+from tests.support.column_worlds import World
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -112,6 +115,31 @@ def test_people_read_a_line_for_each_concern(robot: Path, capsys: Capture) -> No
     output = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
     about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics", "extras"]
     assert output == [["ok", each] for each in [*about, "server"]]
+
+
+def test_topics_of_which_columns_were_dropped_are_named(robot: Path, capsys: Capture) -> None:
+    draw, begin = random.Random(3), time.time_ns() - 3000 * NS_PER_S
+    messages = [
+        odom(begin + n * NS_PER_S // 100, draw.uniform(-9, 9), draw.uniform(-9, 9))
+        for n in range(2000)
+    ]
+    path = write_mcap(robot / "before" / "before_0.mcap", messages)
+    os.utime(path, ns=(begin, begin + 30 * NS_PER_S))
+    World.of(robot, limits=StoreLimits(max_share=0.0)).fill()
+    assert cli.main(["doctor"]) == 0
+    [line] = [each for each in capsys.readouterr().out.splitlines() if " columns " in each]
+    assert "store.max_share" in line
+    assert line.endswith("/odom")
+
+
+def test_a_store_that_cannot_be_written_is_named(
+    robot: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (robot / ".episodic").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(robot / ".episodic"))
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert "is kept in memory" in wrong["columns"][0]["seen"]
 
 
 def test_a_refused_configuration_is_an_error(capsys: Capture) -> None:
