@@ -122,15 +122,12 @@ def _tool(tool: Tool, reply: str) -> str:
     what = tool.description.partition(" Example: ")[0]
     properties: Any = tool.schema["properties"]
     required: Any = tool.schema.get("required", [])
-    rows = [
-        [f"`{name}`", _kind(schema), _need(name, schema, required), schema.get("description", "")]
+    lines = [
+        f"- `{name}`: {_kind(schema)}{_need(name, schema, required)}. "
+        f"{schema.get('description', '')}".rstrip()
         for name, schema in properties.items()
     ]
-    arguments = (
-        table(("argument", "type", "default", "meaning"), rows)
-        if rows
-        else "It takes no arguments."
-    )
+    arguments = "\n".join(lines) or "No arguments."
     call = json.dumps(CALLS[tool.name], ensure_ascii=False)
     return "\n\n".join(
         (
@@ -145,8 +142,8 @@ def _tool(tool: Tool, reply: str) -> str:
 
 def _need(name: str, schema: Mapping[str, Any], required: Iterable[str]) -> str:
     if name in required:
-        return "required"
-    return f"`{json.dumps(schema['default'])}`" if "default" in schema else "none"
+        return ", required"
+    return f", default `{json.dumps(schema['default'])}`" if "default" in schema else ""
 
 
 def _kind(schema: Mapping[str, Any]) -> str:
