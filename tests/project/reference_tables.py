@@ -70,10 +70,11 @@ def with_section(page: str, name: str, text: str) -> str:
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A Markdown table."""
     named = [*columns]
-    lines = [named, ["---"] * len(named), *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    head, *lines = (
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |"
+        for line in (named, *rows)
     )
+    return "\n".join((head, "|---" * len(named) + "|", *lines))
 
 
 def exit_table() -> str:
