@@ -283,15 +283,15 @@ def _is_log(node: ast.AST) -> bool:
     return name in {"log", "_log", "_events"} or is_own_method
 
 
-def event_table(page: str) -> str:
-    """The table of log events; their meaning is what the page says already."""
-    written = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]+) \|$", page, re.MULTILINE))
+def event_list(page: str) -> str:
+    """The log events: levels, fields, and what the page says already that they mean."""
+    written = dict(re.findall(r"^- `(\w+)` \([^)]*\): (.+)$", page, re.MULTILINE))
     every = events()
-    rows = []
+    lines = []
     for name in dict.fromkeys(each.name for each in every):
         same = [each for each in every if each.name == name]
         levels = ", ".join(dict.fromkeys(each.level for each in same))
         named = dict.fromkeys(field for each in same for field in each.fields)
-        fields = ", ".join(f"`{field}`" for field in named)
-        rows.append([f"`{name}`", levels, fields or "none", written.get(name, "?")])
-    return table(("event", "level", "fields", "means"), rows)
+        fields = "".join(f", `{field}`" for field in named)
+        lines.append(f"- `{name}` ({levels}{fields}): {written.get(name, '?')}")
+    return "\n".join(lines)
