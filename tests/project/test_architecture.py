@@ -22,9 +22,8 @@ def test_every_module_that_is_named_exists() -> None:
     assert [each for each in modules if not (SOURCE / each).exists()] == []
 
 
-def test_the_pages_and_the_map_name_every_room() -> None:
+def test_the_table_and_the_map_name_every_room() -> None:
     described = ros2_memory.__doc__ or ""
-    for page in (PAGE, AGENTS):
-        assert [room for room in ROOMS if f"`{room}/`" not in page] == []
+    assert [room for room in ROOMS if f"`{room}/`" not in AGENTS] == []
     mapped = re.findall(r"^    ([a-z_]+) ", described, re.MULTILINE)
     assert sorted({*ROOMS} - {*mapped}) == []
