@@ -70,10 +70,11 @@ def with_section(page: str, name: str, text: str) -> str:
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A Markdown table."""
     named = [*columns]
-    lines = [named, ["---"] * len(named), *rows]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    head, *lines = (
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |"
+        for line in (named, *rows)
     )
+    return "\n".join((head, "|---" * len(named) + "|", *lines))
 
 
 def exit_table() -> str:
@@ -122,15 +123,12 @@ def _tool(tool: Tool, reply: str) -> str:
     what = tool.description.partition(" Example: ")[0]
     properties: Any = tool.schema["properties"]
     required: Any = tool.schema.get("required", [])
-    rows = [
-        [f"`{name}`", _kind(schema), _need(name, schema, required), schema.get("description", "")]
+    lines = [
+        f"- `{name}`: {_kind(schema)}{_need(name, schema, required)}. "
+        f"{schema.get('description', '')}".rstrip()
         for name, schema in properties.items()
     ]
-    arguments = (
-        table(("argument", "type", "default", "meaning"), rows)
-        if rows
-        else "It takes no arguments."
-    )
+    arguments = "\n".join(lines) or "No arguments."
     call = json.dumps(CALLS[tool.name], ensure_ascii=False)
     return "\n\n".join(
         (
@@ -145,8 +143,8 @@ def _tool(tool: Tool, reply: str) -> str:
 
 def _need(name: str, schema: Mapping[str, Any], required: Iterable[str]) -> str:
     if name in required:
-        return "required"
-    return f"`{json.dumps(schema['default'])}`" if "default" in schema else "none"
+        return ", required"
+    return f", default `{json.dumps(schema['default'])}`" if "default" in schema else ""
 
 
 def _kind(schema: Mapping[str, Any]) -> str:
@@ -285,15 +283,15 @@ def _is_log(node: ast.AST) -> bool:
     return name in {"log", "_log", "_events"} or is_own_method
 
 
-def event_table(page: str) -> str:
-    """The table of log events; their meaning is what the page says already."""
-    written = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]+) \|$", page, re.MULTILINE))
+def event_list(page: str) -> str:
+    """The log events: levels, fields, and what the page says already that they mean."""
+    written = dict(re.findall(r"^- `(\w+)` \([^)]*\): (.+)$", page, re.MULTILINE))
     every = events()
-    rows = []
+    lines = []
     for name in dict.fromkeys(each.name for each in every):
         same = [each for each in every if each.name == name]
         levels = ", ".join(dict.fromkeys(each.level for each in same))
         named = dict.fromkeys(field for each in same for field in each.fields)
-        fields = ", ".join(f"`{field}`" for field in named)
-        rows.append([f"`{name}`", levels, fields or "none", written.get(name, "?")])
-    return table(("event", "level", "fields", "means"), rows)
+        fields = "".join(f", `{field}`" for field in named)
+        lines.append(f"- `{name}` ({levels}{fields}): {written.get(name, '?')}")
+    return "\n".join(lines)

@@ -12,7 +12,6 @@ import pytest
 
 from ros2_memory.config import Ros2BagNode, Settings
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.memories import ROOT
 
@@ -37,16 +36,7 @@ def keys(cls: type, prefix: str = "") -> Iterator[str]:
             yield section if is_chosen else name
 
 
-@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
-def test_the_overview_names_every_tool_with_all_its_arguments(tool: Tool) -> None:
-    row = next(line for line in REFERENCE.splitlines() if line.startswith(f"| `{tool.name}` |"))
-    documented = set(re.findall(r"(\w+)[?=,`]", row.split("|")[2]))
-    properties = tool.schema.get("properties")
-    assert isinstance(properties, dict)
-    assert set(properties) - documented == set()
-
-
-def test_the_overview_lists_no_tool_that_does_not_exist() -> None:
+def test_the_overview_lists_the_tools_in_their_order() -> None:
     section = REFERENCE.partition("| tool |")[2].partition("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
     assert rows == [tool.name for tool in TOOLS]
@@ -54,13 +44,6 @@ def test_the_overview_lists_no_tool_that_does_not_exist() -> None:
 
 def test_readme_counts_the_tools() -> None:
     assert f"has {len(TOOLS)} tools" in README
-
-
-def test_readme_is_read_in_a_few_minutes() -> None:
-    assert 900 <= len(README.split()) <= 1200
-    tables = re.findall(r"^\|(?:.+\n\|)+", README, re.MULTILINE)
-    assert tables
-    assert all(len(table.splitlines()) - 2 <= 8 for table in tables)
 
 
 def test_every_key_that_readme_tells_of_exists() -> None:
@@ -71,7 +54,7 @@ def test_every_key_that_readme_tells_of_exists() -> None:
     assert {key for key in documented if key.split(".")[0] in sections} <= known
 
 
-DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "AGENTS.md", *(ROOT / "docs").rglob("*.md")])
 NAMED = sorted(
     {
         (document.name, reference)

@@ -145,12 +145,6 @@ def test_every_block_is_of_a_language_that_is_held_here() -> None:
     assert {block.language for block in BLOCKS if block.holder is None} <= known
 
 
-@pytest.mark.parametrize("start", NOT_RUN)
-def test_no_reason_not_to_run_a_command_has_outlived_it(start: str) -> None:
-    lines = [line for block in BLOCKS if block.language == "sh" for line in block.lines]
-    assert any(re.match(start, line) for line in lines)
-
-
 @pytest.mark.parametrize("block", of("sh"))
 def test_every_command_runs(block: Block, home: Path) -> None:
     script: list[str] = []

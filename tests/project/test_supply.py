@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from email.message import Message
 from importlib.metadata import distribution, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -73,15 +72,6 @@ def refused(names: set[str], allowed: frozenset[str]) -> dict[str, str]:
     return found
 
 
-def saying(**fields: str | list[str]) -> Message:
-    """Metadata of a package: fields as keywords, `License_Expression="MIT"`."""
-    metadata = Message()
-    for name, values in fields.items():
-        for value in [values] if isinstance(values, str) else values:
-            metadata[name.replace("_", "-")] = value
-    return metadata
-
-
 class TestLicences:
     def test_whatever_is_installed_with_this_package_is_permissive(self) -> None:
         assert refused(closure(["ros2-memory"]), PERMISSIVE) == {}
@@ -96,85 +86,6 @@ class TestLicences:
     def test_the_tools_of_development_are_too_or_ask_for_nothing_of_the_product(self) -> None:
         tools = closure(PROJECT["dependency-groups"]["dev"])
         assert refused(tools, TOOLS) == {}
-
-    def test_dependencies_of_dependencies_and_of_their_extras_are_among_them(self) -> None:
-        names = closure(["ros2-memory"])
-        assert {requirement.name for requirement in RUNTIME} <= names
-        assert {"antlr4-python3-runtime", "pydantic-core", "ros2-memory", "ruamel-yaml"} <= names
-        assert "cachecontrol" in closure(["pip-audit"])
-        assert "msgpack" in closure(["CacheControl"])
-        assert "filelock" not in closure(["CacheControl"])
-        assert "filelock" in closure(["CacheControl[filecache]"])
-
-    @pytest.mark.parametrize(
-        "metadata",
-        [
-            saying(License_Expression="GPL-3.0-or-later"),
-            saying(License_Expression="LGPL-2.1-only"),
-            saying(License_Expression="MIT AND AGPL-3.0-only"),
-            saying(License_Expression="GPL-2.0-only WITH Classpath-exception-2.0"),
-            saying(License_Expression="MPL-2.0"),
-            saying(License="GPL-3.0-only", Classifier=["Typing :: Typed"]),
-        ],
-    )
-    def test_what_passes_its_terms_on_is_not_permissive(self, metadata: Message) -> None:
-        assert not permitted(stated(metadata), PERMISSIVE)
-
-    @pytest.mark.parametrize(
-        ("metadata", "words"),
-        [
-            (saying(), "no licence at all"),
-            (saying(License="ask us"), "ask us"),
-            (saying(License_Expression="Mine-1.0"), "Mine-1.0"),
-            (
-                saying(
-                    License="MIT",
-                    Classifier=[
-                        "License :: OSI Approved :: MIT License",
-                        "License :: OSI Approved :: GNU General Public License v3 (GPLv3)",
-                    ],
-                ),
-                "GPLv3",
-            ),
-        ],
-    )
-    def test_what_is_not_known_is_refused_in_its_words(self, metadata: Message, words: str) -> None:
-        with pytest.raises(UnknownLicenceError, match=words):
-            stated(metadata)
-
-    @pytest.mark.parametrize(
-        ("metadata", "expression"),
-        [
-            (saying(License_Expression="mit OR apache-2.0"), "MIT OR Apache-2.0"),
-            (saying(Classifier=["License :: OSI Approved :: MIT License"]), "MIT"),
-            (saying(License="BSD"), "BSD-3-Clause"),
-            (saying(License="Apache-2.0"), "Apache-2.0"),
-        ],
-    )
-    def test_each_way_to_state_one_is_read(self, metadata: Message, expression: str) -> None:
-        assert stated(metadata) == expression
-
-    @pytest.mark.parametrize(
-        ("expression", "is_permitted"),
-        [
-            ("MIT OR GPL-3.0-only", True),
-            ("GPL-3.0-only OR MIT", True),
-            ("MIT AND GPL-3.0-only", False),
-            ("(GPL-3.0-only OR MIT) AND BSD-3-Clause", True),
-            ("(GPL-3.0-only AND MIT) OR LGPL-3.0-only", False),
-            ("GPL-3.0-only OR MIT AND LGPL-3.0-only", False),
-            ("((GPL-3.0-only OR ISC) AND MIT) OR LGPL-3.0-only", True),
-        ],
-    )
-    def test_of_a_choice_one_suffices_of_a_sum_all_are_needed(
-        self, expression: str, is_permitted: bool
-    ) -> None:
-        assert permitted(expression, PERMISSIVE) is is_permitted
-
-    def test_what_was_read_by_hand_still_says_the_same(self) -> None:
-        here = {name for name in READ_BY_HAND if name != "daft" or "ray" in EXTRAS}
-        found = {name: said(distribution(name).metadata, "License") for name in here}
-        assert found.items() <= READ_BY_HAND.items()
 
 
 @pytest.mark.parametrize(
