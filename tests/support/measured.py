@@ -31,6 +31,7 @@ UNMEASURED: Final = (
     "oracle/*.py",
     "soak/*.py",
     "demo/test_robot.py",
+    "test_any_cut.py",
     "test_benchmarks.py",
     "test_bins.py::test_a_boolean_is_counted",
     "test_bins.py::test_all_ways",

@@ -142,11 +142,11 @@ def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:
     return json.loads(replied(memory, bag_dir, name, given).text)
 
 
-def assert_same_counts(reply: Any, expected: Any) -> None:
+def assert_same_counts(reply: Any, expected: Any, *, of_means: float = 1e-3) -> None:
     """Both replies are the same; means are, to what columns round numbers to."""
     assert _without_means(reply) == _without_means(expected)
     for row, other in zip(_means(reply), _means(expected), strict=True):
-        assert row == pytest.approx(other, abs=1e-3)
+        assert row == pytest.approx(other, abs=of_means)
 
 
 def _of_means(reply: Any) -> list[int]:

@@ -218,7 +218,7 @@ def _silences_of(
                 pieces.append((first, last))
                 length += recorded
         if pieces:
-            goes_on = stop == end and not parted
+            goes_on = start == runs[-1][1] and not parted
             yield Silence(topic, pieces[0][0], pieces[-1][1], length, goes_on)
 
 

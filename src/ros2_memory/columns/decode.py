@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.plan import Plan
-    from ros2_memory.storage.base import BagReader, Batch, Channel, Schema
+    from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
 
 T = TypeVar("T")
 
@@ -130,18 +130,23 @@ def with_all_messages(reader: BagReader, path: Path, table: Table, window: TimeW
     """Returns a table in which each message has a row, also one that cannot be decoded.
 
     Where there is such a message no row has columns: the bag has to be asked about each of them.
+    What is lost of a bag has no rows, as in `decoded`, which raises that.
 
     Raises:
-        BagError: as by `BagReader.records`.
+        BagError: none of the rest can be read.
     """
     if not table.undecodable:
         return table
     channel = table.channel
-    records = [
-        record
-        for record in reader.records(path, [channel.topic], window)
-        if record.channel.schema == channel.schema
-    ]
+    records: list[Record] = []
+    found = reader.records(path, [channel.topic], window)
+    while True:
+        try:
+            records.extend(record for record in found if record.channel.schema == channel.schema)
+            break
+        except BagError as error:
+            if error.lost is None:
+                raise
     times = np.array([record.log_time for record in records], np.int64)
     hashes = np.array([zlib.crc32(record.payload) for record in records], np.int64)
     return Table(

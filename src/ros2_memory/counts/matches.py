@@ -256,7 +256,7 @@ def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     """Returns the gaps in the recording, each until the first message of a topic after it."""
     firsts = [each.first for each in binned.view.stream.overlapping_bags([topic], binned.counted)]
     return [
-        (begin, min((each for each in firsts if each >= begin), default=end))
+        (begin, min((each for each in firsts if each >= end), default=end))
         for begin, end in binned.gaps
     ]
 

@@ -41,6 +41,11 @@ def test_a_topic_that_never_returns_is_silent_up_to_the_end() -> None:
     ]
 
 
+def test_a_silence_that_the_newest_message_of_all_ends_does_not_go_on() -> None:
+    seen = heard((0, HOUR), (9 * HOUR, 9 * HOUR))
+    assert found(odom=heard((0, 9 * HOUR)), seen=seen) == [Silence(SEEN, HOUR, 9 * HOUR, 8 * HOUR)]
+
+
 def test_before_its_first_message_a_topic_was_not_there() -> None:
     assert found(odom=heard((0, 9 * HOUR)), seen=heard((HOUR, 9 * HOUR))) == []
 

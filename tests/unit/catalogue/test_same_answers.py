@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.catalogue.lookup import DigestCache
+from ros2_memory.columns.scan import Scanner
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
@@ -22,7 +23,6 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap, recap_or_before
-from ros2_memory.insights.sightings import find_matches
 from ros2_memory.serving.backfill import store_joined
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
@@ -36,52 +36,12 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
 
 Question = tuple[str, "Callable[[Memory, Call], object]"]
 
-TOPICS = (
-    "/odom",
-    "/tf",
-    "/tf_static",
-    "/dock",
-    "/vision/*",
-    "/mixed",
-    "/chatter",
-    "/status",
-    "/foreign",
-    "/bumper",
-    "/*",
-    "/nowhere",
-)
-CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
-    ("contains", "scissors"),
-    ("contains", "person"),
-    ("contains", "-"),
-    ("contains", "never"),
-    ("contains", "docked"),
-    ("contains", 2),
-    ("contains", "1"),
-    ("contains", "true"),
-    ("equals", True),
-    ("equals", 1),
-    ("equals", "0"),
-    ("equals", 0.4),
-    ("equals", "cup"),
-    ("equals", "CUP"),
-    ("equals", 3),
-    ("above", 0.4),
-    ("below", "2.5"),
-    ("near_position", {"x": 0.5, "y": 0.5}),
-    ("near_position", {"x": 500.0, "y": 0.0}),
-    ("near_position", {"x": 80, "y": 0.5, "z": 1.0}),
-)
-
 EXAMPLES = 200 if LONG else 10
-"""Histories for each clock, others in every run; some hundred questions are asked of each."""
-
-FIELDS = ("goal", "detections.label", "position", "value", "data", "nowhere")
+"""Histories for each clock, others in every run; some dozens of questions are asked of each."""
 
 
 def questions(moments: list[int], draw: Random) -> Iterator[Question]:
@@ -105,21 +65,6 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
         at = draw.choice([first, last])
         around = TimeRange(around_s=at / 1e9, before_s=draw.choice([1.0, 10.0, 60.0]))
         yield f"before {around}", partial(_before, around)
-    for topic in TOPICS:
-        for kind, wanted in draw.sample(CONDITIONS, 4):
-            field = draw.choice([None, draw.choice(FIELDS)])
-            before = draw.choice([None, None, draw.choice(moments) / 1e9])
-            yield (
-                f"last {topic} {kind} {wanted} {field} {before}",
-                partial(_match, topic, kind, wanted, field, before),
-            )
-        yield f"all {topic} {kind} {wanted}", partial(_matches, topic, kind, wanted, before)
-    for topic, label in (("/vision/*", "cup"), ("/*", "person")):
-        yield (
-            f"sure {topic} {label}",
-            partial(_matches, topic, "contains", label, None, min_score=0.4),
-        )
-    yield "odom when", partial(_when, "/chatter")
 
 
 def _value(topic: str, moment: AtTime, memory: Memory, call: Call) -> object:
@@ -152,45 +97,6 @@ def _before(span: TimeRange, memory: Memory, call: Call) -> object:
 
 def _way(topic: str, span: TimeRange, memory: Memory, call: Call) -> object:
     return queries.trajectory_summary(memory, call, span, topic=topic)
-
-
-def _match(
-    topic: str,
-    kind: str,
-    wanted: JsonValue,
-    field: str | None,
-    before: float | None,
-    memory: Memory,
-    call: Call,
-) -> object:
-    return queries.find_last_match(
-        memory,
-        call,
-        topic,
-        kind,
-        wanted,
-        field=field,
-        before_s=before,
-    )
-
-
-def _matches(
-    topic: str,
-    kind: str,
-    wanted: JsonValue,
-    end: float | None,
-    memory: Memory,
-    call: Call,
-    *,
-    min_score: float | None = None,
-) -> object:
-    return find_matches(memory, call, topic, kind, wanted, end_s=end, limit=3, min_score=min_score)
-
-
-def _when(topic: str, memory: Memory, call: Call) -> object:
-    return queries.value_when(
-        memory, call, "/odom", topic, condition_type="contains", value="scissors"
-    )
 
 
 def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
@@ -242,12 +148,16 @@ def test_what_is_stored_of_many_bags_changes_no_answer(
         filling = recalling(replace(plain), bag_dir)
         assert filling.recall is not None
         store_joined(filling)
+        assert filling.columns is not None
         # As another process: nothing is in memory.
-        recalled = replace(plain, recall=DigestCache(filling.recall.catalogue, bag_dir))
+        columns = Scanner(filling.columns.store, bag_dir)
+        digests = DigestCache(filling.recall.catalogue, bag_dir)
+        recalled = replace(plain, recall=digests, columns=columns)
         spans = [(min(moments), max(moments)), sorted(draw.sample(moments, 2))]
         for first, last in spans:
             span = TimeRange(start_s=first / 1e9, end_s=last / 1e9)
-            for ask in (partial(_recap, span), partial(_way, "/odom", span)):
+            for what in (_recap, partial(_way, "/odom"), partial(_range, "/odom")):
+                ask = partial(what, span)
                 assert answer(recalled, ask) == answer(plain, ask), (seed, size, span)
 
 

@@ -13,7 +13,7 @@ import pytest
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.columns import decode
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
@@ -384,6 +384,20 @@ def test_what_a_damaged_chunk_loses_is_raised_and_the_rest_follows(tmp_path: Pat
     first, last = caught.value.lost
     assert set(table.log_times.tolist()) == set(range(20)) - set(range(first, last + 1))
     assert list(groups) == []
+
+
+def test_a_message_that_cannot_be_decoded_costs_no_row_of_a_damaged_bag(tmp_path: Path) -> None:
+    broken = Msg("/chatter", "std_msgs/msg/String", 20, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
+    path = write_mcap(tmp_path / "a.mcap", [*chatter(20), broken], SMALL)
+    spoil_chunk(path, 1)
+    groups = decoded(McapReader(), path)
+    with pytest.raises(BagError) as caught:
+        next(groups)
+    assert caught.value.lost is not None
+    [table] = next(groups)
+    whole = with_all_messages(McapReader(), path, table, TimeWindow.everything())
+    first, last = caught.value.lost
+    assert set(whole.log_times.tolist()) == set(range(21)) - set(range(first, last + 1))
 
 
 def test_a_bag_that_is_gone_has_vanished_when_it_is_asked_for(tmp_path: Path) -> None:

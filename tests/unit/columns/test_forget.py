@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
+from random import Random
 from typing import TYPE_CHECKING
 
 import pytest
@@ -26,19 +27,27 @@ T0 = 1_700_000_400 * S
 def write_bag(bag_dir: Path, number: int) -> Path:
     """A minute, in which thrice something is said that only this minute has."""
     start = T0 + number * 60 * S
-    messages = [odom(start + n * S, n / 7, 0.3) for n in range(60)]
+    draw = Random(number)
+    messages = [odom(start + n * S, draw.uniform(-9, 9), draw.random()) for n in range(60)]
     for n in range(60):
         said = f"secret{number:04d}x{n}" if n % 20 == 0 else "hum"
         messages.append(text(start + n * S + 5, said))
     return write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages)
 
 
-def blobs_of(file: Path) -> set[bytes]:
-    """The beginnings of all that is packed."""
+def secrets(number: int) -> list[bytes]:
+    """What one bag alone says: of its messages the texts, and when it begins."""
+    texts = [f"secret{number:04d}", f"{number:04d}x0", f"{number:04d}x20", f"{number:04d}x40"]
+    return [*(each.encode() for each in texts), (T0 + number * 60 * S).to_bytes(8, "big")]
+
+
+def slices_of(file: Path) -> set[bytes]:
+    """All that is packed, in slices of 24 bytes: of some only a later part may be left."""
     with closing(sqlite3.connect(file)) as base:
         splits = base.execute("SELECT tables FROM split").fetchall()
-        columns = base.execute("SELECT data FROM part_column WHERE length(data) > 40").fetchall()
-    return {bytes(blob)[:40] for (blob,) in [*splits, *columns]}
+        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
+    blobs = [bytes(blob) for (blob,) in [*splits, *columns]]
+    return {blob[at : at + 24] for blob in blobs for at in range(0, len(blob) - 23, 24)}
 
 
 def bytes_of(folder: Path) -> bytes:
@@ -61,16 +70,15 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
     world = World.of(tmp_path)
     world.fill(merge=merged)
     file = store_file(tmp_path)
-    before = blobs_of(file)
-    assert b"secret0003" in (bytes_of(file.parent) if merged else unpacked(file))
+    before, there = slices_of(file), bytes_of(file.parent) + unpacked(file)
+    assert [secret for secret in secrets(3) if secret not in there] == []
     # The store stays open in a server, so that its log lies beside it.
     forget(file, tmp_path, ["rec/rec_3.mcap"])
     left = bytes_of(file.parent)
-    assert b"secret0003" not in left
-    assert b"secret0003" not in unpacked(file)
-    gone = before - blobs_of(file)
-    assert gone
-    assert [blob for blob in gone if blob in left] == []
+    gone = before - slices_of(file)
+    assert len(gone) > 20
+    assert [part for part in gone if part in left] == []
+    assert [secret for secret in secrets(3) if secret in left + unpacked(file)] == []
     assert "rec/rec_3.mcap" not in world.stored()
     assert "rec/rec_12.mcap" in world.stored()
     assert check_all(world) == 14 * 120

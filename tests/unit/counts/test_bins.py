@@ -219,7 +219,9 @@ def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> N
         messages = [
             boolean(BEGIN + (begin + at) * S, at >= 50, topic="/is_docked") for at in range(100)
         ]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+        # The last message before the time without any is all that its bag has.
+        for number, split in enumerate((messages[:-1], messages[-1:])):
+            write_mcap(tmp_path / name / f"{name}_{number}.mcap", split)
     memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
     for each in (memory, recalling(memory, tmp_path)):
         docked = count_matches(each, Call(), "/is_docked", "equals", True, by="day")

@@ -1,0 +1,427 @@
+"""One history has one answer: however it is cut into bags, and whatever of it is stored, and when.
+
+Questions go through the tools, and their JSON is compared: of memories whose store was filled in
+some order, while bags came late, changed and went; of the same bags without a store; of the same
+recordings as one bag each; and with what reading all messages with `mcap` and rosbags finds.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+
+from ros2_memory.core.model import TimeWindow
+from tests.support.bags import typestore
+from tests.support.column_worlds import World, check_all, check_rows
+from tests.support.cut_histories import (
+    T0,
+    change_something,
+    cut,
+    date_folders,
+    draw_recordings,
+    fill_some,
+    put_aside,
+    span_of,
+    write,
+)
+from tests.support.examples import LONG, examples
+from tests.support.memories import asked, assert_same_counts, memory_of
+from tests.support.random_histories import S, write_history
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from random import Random
+
+    from tests.support.cut_histories import Splits
+
+Question = tuple[str, dict[str, Any]]
+Ask = Callable[..., Any]
+Spans = list[tuple[int, int]]
+
+
+# Questions
+
+
+def when(kind: str, value: object, **more: object) -> dict[str, Any]:
+    return {"condition_type": kind, "value": value, **more}
+
+
+CONDITIONS: Final = {
+    "/odom": [
+        when("above", 0.3, field="position.x"),
+        when("below", -50, field="position.x"),
+        when("near_position", {"x": 0.5, "y": 0}),
+    ],
+    "/chatter": [when("contains", "STRASSE"), when("contains", "never")],
+    "/vision/a": [
+        when("contains", "cup"),
+        when("equals", "scissors", field="detections.label"),
+        when("above", 0.4, field="detections.score"),
+    ],
+    "/vision/*": [when("contains", "person", min_score=0.5)],
+    "/bumper": [when("equals", True), when("equals", "false")],
+    "/battery_state": [when("below", 0.5, field="percentage"), when("equals", 0.9)],
+    "/dock": [when("contains", "undocked")],
+    "/status": [when("equals", 0.5, field="battery"), when("contains", "cup")],
+    "/mixed": [when("contains", "cup")],
+    "/*": [when("contains", "person")],
+}
+FIELDS: Final = {
+    "/odom": ["position.x", "orientation.yaw_deg"],
+    "/battery_state": ["percentage"],
+    "/vision/a": ["detections.score"],
+}
+
+
+def questions(draw: Random, world: World, moments: Sequence[int], most: int) -> list[Question]:
+    """Some questions to each tool that scans columns, at times when something happened."""
+    topics = world.topics()
+    found: list[Question] = [(name, {}) for name in ("list_recorded_topics", "memory_status")]
+    for topic, conditions in CONDITIONS.items():
+        if topic in topics or "*" in topic:
+            for condition in conditions:
+                found += _matches(draw, {"topic": topic, **condition}, moments)
+    for topic in topics:
+        window = {"topic": topic, **_window(draw, moments)}
+        if topic in FIELDS:
+            window["fields"] = FIELDS[topic]
+        found.append(("get_topic_in_range", {**window, "max_samples": 7}))
+        found.append(("get_topic_in_range", {**window, "by": draw.choice(["hour", "day"])}))
+    some = found if LONG else draw.sample(found, min(most, len(found)))
+    return [("data_time_range", {}), *some]
+
+
+def _matches(draw: Random, condition: dict[str, Any], moments: Sequence[int]) -> Iterator[Question]:
+    """The last match, a value at that time, and all: by the clock, in a place, or at some times."""
+    before = draw.choice([{}, {"before": draw.choice(moments) / S}])
+    yield "find_last_match", condition | before
+    renamed = {("condition_topic" if key == "topic" else key): condition[key] for key in condition}
+    yield "get_value_when", {**renamed, "value_topic": draw.choice(["/odom", "/dock"])}
+    still = {"topic": "/bumper", **when("equals", False)}
+    yield (
+        "find_matches",
+        {
+            **condition,
+            **draw.choice([{}, _window(draw, moments)]),
+            **draw.choice([{"by": "hour"}, {"by": "day"}, {"limit": 2}, {"oldest_first": True}]),
+            **draw.choice([{}, {"where": {"x": 0.2, "y": 0, "radius_m": 0.5}}, {"while": still}]),
+        },
+    )
+
+
+def _window(draw: Random, moments: Sequence[int]) -> dict[str, Any]:
+    start, end = sorted(draw.sample(moments, 2))
+    return {"start": start / S, "end": draw.choice([end, end, max(moments) + 60 * S]) / S}
+
+
+def check_stored(world: World, asking: Sequence[Question]) -> list[Any]:
+    """Checks that replies are the same with the store and without one; returns them."""
+    plain, replies = world.unstored().memory, []
+    for name, given_ in asking:
+        replies.append(asked(world.memory, world.bag_dir, name, **given_))
+        expected = asked(plain, world.bag_dir, name, **given_)
+        assert_same_counts(replies[-1], expected, of_means=0.02)
+    return replies
+
+
+# What plain reading finds
+
+
+class Plain(NamedTuple):
+    """A message as plain reading finds it."""
+
+    at: int
+    body: Any
+
+
+def read(bag_dir: Path) -> dict[str, list[Plain]]:
+    """All messages of each topic by log time: a message of two recordings once, when it came first.
+
+    One topic publishes no two messages at the same time here.
+    """
+    first: dict[tuple[str, int, bytes, str], int] = {}
+    for path in bag_dir.rglob("*.mcap"):
+        with path.open("rb") as stream:
+            for schema, channel, message in make_reader(stream).iter_messages():
+                assert schema is not None
+                key = (channel.topic, message.publish_time, message.data, schema.name)
+                first[key] = min(message.log_time, first.get(key, message.log_time))
+    found = defaultdict(list)
+    for (topic, _, data, kind), at in first.items():
+        found[topic].append(Plain(at, typestore().deserialize_cdr(data, kind)))
+    return {topic: sorted(rows, key=lambda row: row.at) for topic, rows in found.items()}
+
+
+def near(at: float) -> Any:
+    """A time as replies show it."""
+    return pytest.approx(at / S, rel=0.0, abs=2e-6)
+
+
+def yaw_deg(body: Any) -> float:
+    turn = body.pose.pose.orientation
+    return math.degrees(2 * math.atan2(turn.z, turn.w))
+
+
+NUMBERS: Final[Mapping[tuple[str, str], Callable[[Any], float]]] = {
+    ("/odom", "position.x"): lambda body: body.pose.pose.position.x,
+    ("/odom", "orientation.yaw_deg"): yaw_deg,
+    ("/battery_state", "percentage"): lambda body: body.percentage,
+}
+SPAN: Final = {"start": T0 / S, "end": T0 / S + 900}
+"""All but what a clock dated that was not set."""
+
+
+def bin_of(at: int, by: str) -> str:
+    when_ = datetime.fromtimestamp(at // S).astimezone()
+    return when_.date().isoformat() if by == "day" else f"{when_.hour:02d}:00"
+
+
+def table(reply: Any) -> dict[str, dict[str, Any]]:
+    """The rows of a reply `by` something, each by the names of its columns."""
+    _, *names = reply["columns"]
+    return {name: dict(zip(names, values, strict=True)) for name, *values in reply["rows"]}
+
+
+def check_topics(ask: Ask, plain: Mapping[str, list[Plain]]) -> None:
+    rows = ask("list_recorded_topics")
+    assert [[row[key] for key in ("topic", "count", "first_ts", "last_ts")] for row in rows] == [
+        [topic, len(found), near(found[0].at), near(found[-1].at)]
+        for topic, found in sorted(plain.items())
+    ]
+
+
+def check_numbers(ask: Ask, dated: Mapping[str, list[Plain]]) -> None:
+    """Extremes of numbers, and by the clock also their counts, ends and means."""
+    for (topic, field), number in NUMBERS.items():
+        asking = partial(ask, "get_topic_in_range", topic=topic, fields=[field], **SPAN)
+        extremes = asking()["extremes"][field]
+        check_extremes({f"{key}_unix": extremes[key] for key in extremes}, dated[topic], number)
+        for by in ("hour", "day"):
+            bins = table(asking(by=by))
+            parts = defaultdict(list)
+            for row in dated[topic]:
+                parts[bin_of(row.at, by)].append(row)
+            assert {name for name, row in bins.items() if row["count"]} == parts.keys()
+            for name, rows in parts.items():
+                assert bins[name]["count"] == len(rows)
+                ends = bins[name]["first_unix"], bins[name]["last_unix"]
+                assert ends == (near(rows[0].at), near(rows[-1].at))
+                shown = {key.removeprefix(f"{field}."): each for key, each in bins[name].items()}
+                shown |= {f"{key}_unix": shown[key] for key in ("min", "max")}
+                numbers = check_extremes(shown, rows, number)
+                mean = math.fsum(numbers) / len(numbers) if numbers else None
+                assert shown["mean"] == pytest.approx(mean, abs=0.02)
+
+
+def check_extremes(
+    shown: Mapping[str, Any], rows: Sequence[Plain], number: Callable[[Any], float]
+) -> list[float]:
+    """Checks the least and the greatest number and when each was first; returns all numbers."""
+    known = [(number(row.body), row.at) for row in rows if not math.isnan(number(row.body))]
+    for name, best in (("min", min), ("max", max)):
+        value = best((each for each, _ in known), default=None)
+        at = next((at for each, at in known if each == value), None)
+        expected = (None, None) if at is None else (pytest.approx(value, abs=2e-6), near(at))
+        assert (shown[f"{name}_unix"], shown[f"{name}_at_unix"]) == expected
+    return [each for each, _ in known]
+
+
+def runs(rows: Sequence[Plain], holds: Callable[[Any], bool], missed: int) -> list[list[int]]:
+    """The matches of each sighting: within 10 s of each other, or of less with others between."""
+    found: list[list[int]] = []
+    before = False
+    for row in rows:
+        met = holds(row.body)
+        if met and found and row.at - found[-1][-1] <= (10 * S if before else missed):
+            found[-1].append(row.at)
+        elif met:
+            found.append([row.at])
+        before = met
+    return found
+
+
+def check_matches(ask: Ask, dated: Mapping[str, list[Plain]], gaps: Spans) -> None:
+    """Sightings of a number, and by the clock how often it, a label and a boolean began to hold."""
+    above = {"topic": "/odom", **CONDITIONS["/odom"][0], **SPAN}
+    found = runs(dated["/odom"], lambda body: body.pose.pose.position.x > 0.3, missed=-1)
+    sightings = ask("find_matches", **above, limit=100, oldest_first=True)["sightings"]
+    assert [[s["first_seen"], s["last_seen"], s["count"]] for s in sightings] == [
+        [near(run[0]), near(run[-1]), len(run)] for run in found
+    ]
+    check_begins(ask, above, [run[0] for run in found])
+    label = {"topic": "/vision/a", **CONDITIONS["/vision/a"][0], **SPAN}
+    if rows := dated.get("/vision/a"):
+        seen = runs(rows, lambda body: "cup" in [d.label for d in body.detections], missed=3 * S)
+        check_begins(ask, label, [run[0] for run in seen])
+    toggles = [
+        after.at
+        for before, after in pairwise(dated["/bumper"])
+        if after.body.data > before.body.data
+        and not any(before.at <= start and end <= after.at for start, end in gaps)
+    ]
+    check_begins(ask, {"topic": "/bumper", **CONDITIONS["/bumper"][0], **SPAN}, toggles)
+
+
+def check_begins(ask: Ask, condition: Mapping[str, Any], begins: Sequence[int]) -> None:
+    for by in ("hour", "day"):
+        bins = table(ask("find_matches", **condition, by=by))
+        counts = {name: row["count"] for name, row in bins.items() if row["count"]}
+        assert counts == Counter(bin_of(at, by) for at in begins)
+
+
+def gaps_of(splits: Splits) -> Spans:
+    """When nothing was recorded for ten seconds, but for bags that a clock dated not set."""
+    spans = sorted(span for found in splits.values() if (span := span_of(found))[0] >= T0)
+    gaps, end = [], spans[0][1]
+    for start, stop in spans:
+        if start - end > 10 * S:
+            gaps.append((end, start))
+        end = max(end, stop)
+    return gaps
+
+
+def check_silences(known: Any, splits: Splits, plain: Mapping[str, list[Plain]]) -> None:
+    """In a silence a topic has no message, and what is surely one of the detector is listed."""
+    for silence in known:
+        start, end = silence["start"], silence["end"] or math.inf
+        assert end - start >= 30
+        assert not [r for r in plain[silence["topic"]] if start + 0.001 < r.at / S < end - 0.001]
+    bags, length = [], 0
+    for found in splits.values():
+        times = [message.log_time for message in found if message.topic == "/vision/a"]
+        start, stop = span_of(found)
+        if times and start >= T0:
+            bags.append((min(times), max(times), len(times)))
+            length += stop - start
+    periods = [(last - first) / (count - 1) for first, last, count in bags if count > 2]
+    if not periods or 2 * min(periods) * sum(count for *_, count in bags) < length:
+        return  # perhaps it has no usual rate
+    for (_, before, _), (after, *_) in pairwise(sorted(bags)):
+        is_off = any(before < end and start < after for start, end in gaps_of(splits))
+        if after - before > max(30 * S, 20 * max(periods)) and not is_off:
+            # The others may be heard from a little later on, or to a little before.
+            ends = [pytest.approx(at / S, rel=0.0, abs=5.0) for at in (before, after)]
+            assert ends in [[each["start"], each["end"]] for each in known]
+
+
+# However it is cut, whatever is stored
+
+
+UNLIKE: Final = {"bags", "budget", "clock_faults", "silences", "trust"}
+"""How many bags, their bytes, and which no clock dated. Silences lie between bags."""
+
+
+def alike(reply: Any) -> Any:
+    """What must be the same of a reply however a history is cut."""
+    if reply is None:  # never, without a note
+        reply = {"timestamp": None, "value": None}
+    if not isinstance(reply, dict):
+        return reply
+    kept = {key: value for key, value in reply.items() if key not in UNLIKE}
+    kept["notes"] = [
+        note
+        for note in reply.get("notes", ())
+        # These name bags, or silences.
+        if "dated by a wrong clock" not in note and not note.startswith("silent while")
+    ]
+    if "topic_s" in reply.get("columns", ()):  # how long there were bags with the topic
+        at = reply["columns"].index("topic_s")
+        for row in (kept["columns"], *kept["rows"]):
+            del row[at]
+        del kept["all"][at - 1]
+    return kept
+
+
+def arrive(bag_dir: Path, splits: Splits, draw: Random) -> World:
+    """Bags are stored while others come late, grow, or go; in the end these splits are there."""
+    fates = {name: draw.choice(["there", "there", "late", "grows"]) for name in splits}
+    write(bag_dir, {name: splits[name] for name, fate in fates.items() if fate == "there"})
+    halves = {name: messages[: len(messages) // 2 + 1] for name, messages in splits.items()}
+    write(bag_dir, {name: halves[name] for name, fate in fates.items() if fate == "grows"}, 1)
+    fates["copy/copy_0.mcap"], halves["copy/copy_0.mcap"] = "goes", halves["a/a_0.mcap"]
+    write(bag_dir, {"copy/copy_0.mcap": halves["a/a_0.mcap"]})
+    world = World.of(bag_dir)
+    for name in draw.sample([*fates], len(fates)):
+        if fates[name] == "there":
+            continue
+        fill_some(world, draw)
+        if draw.random() < 0.3:
+            moments = [T0, *(message.log_time for message in halves[name])]
+            check_stored(world, questions(draw, world, moments, most=2))
+        if fates[name] == "goes":
+            (bag_dir / name).unlink()
+        else:
+            write(bag_dir, {name: splits[name]})
+        date_folders(bag_dir, draw)
+    fill_some(world, draw)
+    return world
+
+
+@settings(max_examples=examples(24))
+@given(seed=st.integers(0, 2**32), cuts=st.lists(st.floats(0, 1), max_size=4))
+def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[float]) -> None:
+    draw = random.Random(seed)
+    recordings = draw_recordings(draw)
+    splits = cut(recordings, cuts)
+    moments = [message.log_time for messages in splits.values() for message in messages]
+    with tempfile.TemporaryDirectory() as folder:
+        whole, bag_dir = Path(folder, "whole"), Path(folder, "bags")
+        write(whole, cut(recordings, []))
+        uncut, world = memory_of(whole), arrive(bag_dir, splits, draw)
+        check_all(world)
+        asking = questions(draw, world, moments, most=10)
+        for (name, given_), reply in zip(asking, check_stored(world, asking), strict=True):
+            expected = alike(asked(uncut, whole, name, **given_))
+            assert_same_counts(alike(reply), expected, of_means=0.02)
+        ask = partial(asked, world.memory, bag_dir)
+        plain, gaps, memory = read(whole), gaps_of(splits), ask("data_time_range")
+        dated = {topic: [row for row in rows if row.at >= T0] for topic, rows in plain.items()}
+        times = [at for at in moments if at >= T0]
+        assert (memory["earliest"], memory["latest"]) == (near(min(times)), near(max(times)))
+        assert [(gap["start"], gap["end"]) for gap in memory["gaps"]] == [
+            (near(start), near(end)) for start, end in gaps
+        ]
+        check_topics(ask, plain)
+        check_numbers(ask, dated)
+        check_matches(ask, dated, gaps)
+        check_silences(memory["silences"], splits, plain)
+
+
+@settings(max_examples=examples(27))
+@given(seed=st.integers(0, 2**32))
+def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(seed: int) -> None:
+    draw = random.Random(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        bag_dir, aside = Path(folder, "bags"), Path(folder, "aside")
+        bag_dir.mkdir()
+        moments = write_history(bag_dir, draw).moments
+        put_aside(bag_dir, aside, draw)
+        world = World.of(bag_dir)
+        check_all(world.unstored())
+        for _ in range(draw.randint(1, 5)):
+            fill_some(world, draw)
+            check_all(world)
+            check_stored(world, questions(draw, world, moments, most=4))
+            change_something(bag_dir, aside, draw)
+        world.fill()
+        check_all(world)
+        again = World.of(bag_dir)
+        check_all(again)
+        check_stored(again, questions(draw, again, moments, most=10))
+        begin = draw.choice(moments)
+        window = TimeWindow(begin, begin + draw.randrange(1, 40) * S)
+        for topic in again.topics():
+            check_rows(again, topic, window, newest_first=draw.random() < 0.5)
