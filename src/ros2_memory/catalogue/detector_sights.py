@@ -94,7 +94,7 @@ class DetectorSights:
         self._extractor = extractor
         self._topics: dict[str, _Topic | None] = {}
         self._left = _MAX_DETECTIONS
-        self._localised: list[tuple[Ns, str, float]] = []
+        self._localised: dict[str, list[tuple[Ns, str, float]]] = {}
 
     def wants(self, topic: str, type_name: str) -> bool:
         """Returns whether messages of a type may hold detections, or say how exact poses are."""
@@ -141,7 +141,8 @@ class DetectorSights:
 
     def _add_covariance(self, record: Record) -> None:
         """Takes what a localiser says; from one that says it often, now and then."""
-        if self._localised and record.log_time < self._localised[-1][0] + _FIX_NS // 4:
+        said = self._localised.setdefault(record.channel.topic, [])
+        if said and record.log_time < said[-1][0] + _FIX_NS // 4:
             return
         try:
             message = self._reader.decode(record)
@@ -151,7 +152,7 @@ class DetectorSights:
         covariance = getattr(getattr(message, "pose", None), "covariance", None)
         sigma = _sigma_ahead(covariance)
         if sigma is not None:
-            self._localised.append((record.log_time, frame.lstrip("/"), sigma))
+            said.append((record.log_time, frame.lstrip("/"), sigma))
 
     def _read(
         self, record: Record, detections: tuple[Detection, ...] | None, of_topic: _Topic
@@ -181,7 +182,7 @@ class DetectorSights:
             if found is not None and found.is_detector
         }
         every = [time for found in of_detectors.values() for time in found.log_times]
-        at = [time for time, _, _ in self._localised]
+        at = [time for said in self._localised.values() for time, _, _ in said]
         moments = every or [*at, *robot.times[:1].tolist(), *robot.times[-1:].tolist()]
         if not moments:
             return b""
@@ -223,7 +224,12 @@ class DetectorSights:
             qx, qy, qz, qw = found.rotation
             yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
             pose, times = np.stack((x, y, yaw), axis=1)[found.valid], times[found.valid]
-        said = [(at, sigma) for at, frame, sigma in self._localised if frame == target]
+        said = sorted(
+            (at, sigma)
+            for of_topic in self._localised.values()
+            for at, frame, sigma in of_topic
+            if frame == target
+        )
         if not len(times) or (robot.own in {"", target} and not said):
             return
         at = np.array([time for time, _ in said], np.int64)

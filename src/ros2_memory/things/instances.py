@@ -20,7 +20,7 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.labels import moves_by_itself
 from ros2_memory.things.localisation import poorly_localised
 from ros2_memory.things.moves import Sightings, stays_in
-from ros2_memory.things.places import GATE_MM, places_of
+from ros2_memory.things.places import GATE_MM, distinct_rows, places_of
 from ros2_memory.things.presence import (
     Cells,
     Stay,
@@ -394,8 +394,9 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
 
 def _are_several(spots: Ints) -> bool:
     """Whether bags have several spots of a label at one place: things that stand together."""
-    columns = spots[:, [Spot.BAG, Spot.TOPIC, Spot.LABEL]]
-    distinct = len(np.unique(columns, axis=0))
+    distinct = len(
+        distinct_rows([spots[:, each] for each in (Spot.BAG, Spot.TOPIC, Spot.LABEL)])[0]
+    )
     return len(spots) - distinct > _SEVERAL_SHARE * distinct
 
 
