@@ -227,8 +227,8 @@ def estimate(
     epoch = np.zeros(sights.bags, np.int64) if epochs is None else np.array(epochs, np.int64)
     seen = _Seen(sights, epoch, min_score)
     names = _names(sights, labels)
-    own = [labels.key(each) for each in sights.labels]
-    keys = with_synonyms(sights, seen.counts, epoch[sights.spots[:, Spot.BAG]], own, labels)
+    epoch_of = epoch[sights.spots[:, Spot.BAG]]
+    keys = with_synonyms(sights, seen.counts, epoch_of, labels, go_on)
     groups = _groups(seen, epoch, keys)
     _find_places(groups, seen, go_on)
     for group in groups:

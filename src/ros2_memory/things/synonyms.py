@@ -18,7 +18,7 @@ from ros2_memory.things.moves import visits_of
 from ros2_memory.things.places import places_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.things.labels import Labels
@@ -33,13 +33,17 @@ _SCATTERS: Final = 2.0
 
 
 def with_synonyms(
-    sights: Sights, counts: Ints, group: Ints, keys: Sequence[str], labels: Labels
+    sights: Sights,
+    counts: Ints,
+    group: Ints,
+    labels: Labels,
+    go_on: Callable[[], None],
 ) -> list[str]:
-    """Returns the keys of labels, one for all that are names of one thing.
+    """Returns the keys of the labels of sights, one for all that are names of one thing.
 
-    `keys` has the key of each label, `group` the epoch of each spot, and `counts` how many of its
-    detections count.
+    `group` has the epoch of each spot, and `counts` how many of its detections count.
     """
+    keys = [labels.key(each) for each in sights.labels]
     by_word: dict[str, list[str]] = defaultdict(list)
     for key in sorted(set(keys)):
         if not moves_by_itself(key):
@@ -48,6 +52,7 @@ def with_synonyms(
     for one, other in (pair for some in by_word.values() for pair in combinations(some, 2)):
         if labels.are_apart(one, other) or known[one] == known[other]:
             continue
+        go_on()
         of = [np.array([key == each for key in keys]) for each in (one, other)]
         if not _are_beside(sights, *of) and _alternate(sights.spots, counts, group, of):
             gone = known[other]
