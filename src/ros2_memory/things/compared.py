@@ -68,6 +68,9 @@ class ThingsBetween:
         for instance in self.known.estimate.instances:
             before = self._seen(instance, self.earlier, self.later.start)
             after = self._seen(instance, self.later)
+            shared = self._seen(instance, self.earlier)
+            if before is None and after and shared and shared.stay.place != after.stay.place:
+                before = shared  # in bags of both windows, but elsewhere
             if not self._counts(instance, before, after):
                 continue
             if before and after and before.stay.place == after.stay.place:
