@@ -85,7 +85,8 @@ class _Series(NamedTuple):
         squares = seen.n * seen.dev**2 / 2
         usual = (squares.sum() + _USUAL * _LOOK_MM**2) / (seen.n.sum() - len(seen.n) + _USUAL)
         weight = seen.n * (seen.n - 1 + _USUAL) / (squares + _USUAL * usual)
-        rows = np.hstack((np.ones((len(weight), 1)), seen.side, seen.xy)) * weight[:, None]
+        place = seen.xy - seen.xy.mean(axis=0)
+        rows = np.hstack((np.ones((len(weight), 1)), seen.side, place)) * weight[:, None]
         return cls(rows, seen.n, visits_of(seen.first, seen.last))
 
 
