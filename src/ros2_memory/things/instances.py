@@ -74,7 +74,7 @@ class PlacedStay:
         left: the time by which it was seen to be gone; None if it was not.
         spots: rows of `Sights.spots`, in order of time.
         spellings: how often it was seen under each label.
-        place: its number, and `around` that of all places that it was moved between a little.
+        place: its number.
         weak: whether it was seen too rarely to be a thing.
         also: how often it was seen under the labels of other things.
     """
@@ -92,7 +92,6 @@ class PlacedStay:
     spots: Ints
     spellings: Counter[str]
     place: int
-    around: int
     stay: Stay
     weak: bool
     also: Counter[str] = field(default_factory=Counter)
@@ -201,12 +200,12 @@ class Estimate:
 
 @dataclass(slots=True)
 class _Group:
-    """The places of one label in one epoch, each with the number of those around it."""
+    """The places of one label in one epoch, each with its spots."""
 
     key: str
     epoch: int
     rows: Ints
-    places: list[tuple[int, Ints]] = field(default_factory=list)
+    places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
     evidence: list[Evidence] = field(default_factory=list)
 
@@ -371,25 +370,22 @@ def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
 def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None]) -> None:
     """Finds the places of labels, each with one for every time that it was moved a little."""
     spots = seen.sights.spots
-    found: list[tuple[_Group, int, Ints]] = []
+    single: list[tuple[_Group, Ints]] = []
     for group in groups:
         if moves_by_itself(group.key):
             continue
         go_on()
         rows = seen.firm(group.rows)
         place = places_of(spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows])
-        parts = [rows[place == nth] for nth in range(int(place.max(initial=-1)) + 1)]
-        found += [
-            (group, nth, part)
-            for nth, part in enumerate(parts)
-            if seen.counts[part].sum() >= _FEWEST
-        ]
-    single = [nth for nth, each in enumerate(found) if not _are_several(spots[each[2]])]
-    moved = stays_in([seen.sightings(found[nth][2]) for nth in single])
-    steps = dict(zip(single, moved, strict=True))
-    for nth, (group, around, rows) in enumerate(found):
-        step = steps.get(nth, np.zeros(len(rows), np.int64))
-        group.places += [(around, rows[step == each]) for each in range(int(step.max()) + 1)]
+        for nth in range(int(place.max(initial=-1)) + 1):
+            mine = rows[place == nth]
+            if _are_several(spots[mine]):
+                group.places.append(mine)
+            elif seen.counts[mine].sum() >= _FEWEST:
+                single.append((group, mine))
+    steps = stays_in([seen.sightings(rows) for _, rows in single])
+    for (group, rows), step in zip(single, steps, strict=True):
+        group.places += [rows[step == each] for each in range(int(step.max()) + 1)]
 
 
 def _are_several(spots: Ints) -> bool:
@@ -403,7 +399,7 @@ def _are_several(spots: Ints) -> bool:
 def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     """Finds when a label was at its places."""
     every = seen.sights.spots
-    for place, (around, mine) in enumerate(group.places):
+    for place, mine in enumerate(group.places):
         go_on()
         bag, n = every[mine, Spot.BAG], seen.counts[mine]
         x, y = (float(np.average(every[mine, column], weights=n)) for column in (Spot.X, Spot.Y))
@@ -412,10 +408,10 @@ def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
         group.evidence.append(evidence_at(seen.cells, seen.view, x, y, rows))
         for stay in stays_at(seen.cells, group.evidence[-1]):
             inside = mine[(bag >= stay.first_bag) & (bag <= stay.last_bag)]
-            group.stays.append(_placed(seen, (place, around), stay, inside))
+            group.stays.append(_placed(seen, place, stay, inside))
 
 
-def _placed(seen: _Seen, place: tuple[int, int], stay: Stay, rows: Ints) -> PlacedStay:
+def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     spots, n = seen.sights.spots[rows], seen.counts[rows]
     x, y, z = (float(np.average(spots[:, at], weights=n)) for at in (Spot.X, Spot.Y, Spot.Z))
     squares = spots[:, Spot.DEV] ** 2 + (spots[:, Spot.X] - x) ** 2 + (spots[:, Spot.Y] - y) ** 2
@@ -442,8 +438,7 @@ def _placed(seen: _Seen, place: tuple[int, int], stay: Stay, rows: Ints) -> Plac
         count=int(n.sum()),
         spots=rows,
         spellings=spellings,
-        place=place[0],
-        around=place[1],
+        place=place,
         stay=stay,
         weak=stay.hits < max(_FEWEST, _LOWEST_RATE * stay.messages),
     )
@@ -535,7 +530,7 @@ def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instanc
     that is known to be moved, a place that was not looked at may have been left, too.
     """
     instances = _chained(group, group.stays, proven=True)
-    if any(len({stay.around for stay in each.stays}) > 1 for each in instances):
+    if any(_is_far(each.stays[0], stay) for each in instances for stay in each.stays):
         unproven = _chained(group, group.stays, proven=False)
         split = _chained(group, _split(group.stays, seen, go_on), proven=False)
         instances = min(instances, unproven, split, key=len)
@@ -551,7 +546,7 @@ def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> lis
             (last.place == stay.place, is_left, last.last, -nth)
             for nth, each in enumerate(instances)
             for last in (each.stays[-1],)
-            for is_left in (last.left is not None or last.around == stay.around,)
+            for is_left in (last.left is not None or _was_moved_a_little(last, stay),)
             if (is_left or not proven) and last.firm_last <= stay.firm_first
         ]
         if ended:
@@ -559,6 +554,15 @@ def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> lis
         else:
             instances.append(Instance(group.key, group.epoch, [stay]))
     return instances
+
+
+def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
+    return math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
+
+
+def _was_moved_a_little(last: PlacedStay, stay: PlacedStay) -> bool:
+    """Whether one stay follows another so near that two things would have been seen together."""
+    return last.last <= stay.first and not _is_far(last, stay)
 
 
 def _split(stays: Sequence[PlacedStay], seen: _Seen, go_on: Callable[[], None]) -> list[PlacedStay]:
@@ -591,7 +595,7 @@ def _split_at(stay: PlacedStay, others: Sequence[tuple[Ns, Ns]], seen: _Seen) ->
         return [stay]
     whole = stay.stay._replace(firm_first=-1, firm_last=-1)
     parts = np.split(order, sorted(cuts))
-    return [_placed(seen, (stay.place, stay.around), whole, part) for part in parts]
+    return [_placed(seen, stay.place, whole, part) for part in parts]
 
 
 def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
@@ -606,7 +610,7 @@ def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
         if len(rows) == len(stay.spots):
             found.append(stay)
         else:
-            trimmed = _placed(seen, (stay.place, stay.around), stay.stay, rows)
+            trimmed = _placed(seen, stay.place, stay.stay, rows)
             trimmed.also, trimmed.left = stay.also, stay.left
             found.append(trimmed)
     return found
