@@ -205,7 +205,9 @@ class _Loader:
         since = self._since
         if crowded:
             since = max(bags[0].start, MIN_NS if since is None else since)
-        return KnownThings(found, labels, names, since, 0 in epochs, crowded)
+        return KnownThings(
+            found, labels, names, since, bool(sights.topics) and 0 in epochs, crowded
+        )
 
     def _part(self, segment: Segment) -> _Part:
         digests = self._view.bags.digests_of(segment)
