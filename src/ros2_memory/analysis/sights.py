@@ -131,7 +131,23 @@ class Unplaced(IntEnum):
     LAST = 5
 
 
-_TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced)
+class Fix(IntEnum):
+    """Columns of `Sights.fixes`: where odometry was in the map, and how exactly that was known.
+
+    `SIGMA` is what the localiser says, for a point `AHEAD_MM` before the robot; -1 if it does not.
+    """
+
+    BAG = 0
+    TIME = 1
+    X = 2
+    Y = 3
+    YAW = 4
+    SIGMA = 5
+
+
+AHEAD_MM: Final = 2_000
+"""Things are about so far away: so much do errors of heading weigh."""
+_TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 _TIMES: Final = (
     (Spot.FIRST, Spot.LAST),
     (Look.FIRST, Look.LAST),
@@ -139,6 +155,7 @@ _TIMES: Final = (
     (),
     (),
     (Unplaced.FIRST, Unplaced.LAST),
+    (Fix.TIME,),
 )
 
 
@@ -193,6 +210,11 @@ class Sights:
     def unplaced(self) -> Ints:
         """Detections without a place (`Unplaced`)."""
         return self.tables[5]
+
+    @property
+    def fixes(self) -> Ints:
+        """Where odometry was in the map (`Fix`)."""
+        return self.tables[6]
 
     def __eq__(self, other: object) -> bool:
         """Returns whether all tables are equal."""
@@ -396,6 +418,14 @@ class SightsBuilder:
         self._seen: dict[tuple[int, int], _Seen] = {}
         self._looks: dict[tuple[int, int, int, int], list[int]] = {}
         self._look_numbers: dict[tuple[int, int, int, int], int] = {}
+        self._fixes: list[tuple[int, ...]] = []
+
+    def add_fix(self, time: Ns, pose: tuple[float, float, float], sigma_m: float | None) -> None:
+        """Adds where odometry was in the map (m, rad), and the localiser's standard deviation."""
+        x, y, yaw = pose
+        sigma = -1 if sigma_m is None else round(min(sigma_m, _MAX_AWAY_M) * 1000)
+        place = (round(x * 1000), round(y * 1000), round(math.degrees(yaw) * 10))
+        self._fixes.append((0, _rounded(time), *place, sigma))
 
     def add(
         self,
@@ -476,7 +506,7 @@ class SightsBuilder:
             (0, cell[0], x // n, y // n, yaw // n, n, _rounded(first), _rounded(last))
             for cell, (x, y, yaw, n, first, last) in self._looks.items()
         ]
-        rows = (spots, looks, hits, scores, beside, unplaced)
+        rows = (spots, looks, hits, scores, beside, unplaced, self._fixes)
         return Sights(
             tuple(self._topics),
             tuple(self._labels),
@@ -554,7 +584,10 @@ def joined(parts: Iterable[Sights]) -> Sights:
     for part in parts:
         topic = np.array([topics.setdefault(each, len(topics)) for each in part.topics], np.int64)
         label = np.array([labels.setdefault(each, len(labels)) for each in part.labels], np.int64)
-        spot, look, hit, score, beside, unplaced = (each.copy() for each in part.tables)
+        spot, look, hit, score, beside, unplaced, fix = copies = [
+            each.copy() for each in part.tables
+        ]
+        fix[:, 0] += bags
         for table in (spot, look, unplaced):
             table[:, 0] += bags
             table[:, 1] = topic[table[:, 1]]
@@ -565,7 +598,7 @@ def joined(parts: Iterable[Sights]) -> Sights:
         score[:, Score.SPOT] += spots
         beside[:, Beside.SPOT] += spots
         beside[:, Beside.LABEL] = label[beside[:, Beside.LABEL]]
-        for gathered, table in zip(tables, (spot, look, hit, score, beside, unplaced), strict=True):
+        for gathered, table in zip(tables, copies, strict=True):
             gathered.append(table)
         bags, spots, looks = bags + part.bags, spots + len(spot), looks + len(look)
     whole = tuple(
@@ -577,7 +610,7 @@ def joined(parts: Iterable[Sights]) -> Sights:
 
 def encode_sights(sights: Sights) -> bytes:
     """Encodes the sights of one bag; empty if there are none."""
-    if not sights.topics:
+    if not sights.topics and not len(sights.fixes):
         return b""
     base = min(
         (
@@ -642,7 +675,7 @@ def _decoded(packed: Sequence[bytes], which: list[int]) -> tuple[Sights, list[in
 def _slices_of(tables: Sequence[Ints], counts: Ints) -> Ints:
     """Returns how many slices each bag has."""
     last = np.zeros(len(counts), np.int64)
-    for at in (0, 1, 5):
+    for at in (0, 1, 5, 6):
         if tables[at][:, 0].any():
             of = np.repeat(np.arange(len(counts)), counts[:, at])
             np.maximum.at(last, of, tables[at][:, 0])
@@ -669,13 +702,14 @@ def _renumber(
     tables: Sequence[Ints], counts: Ints, slices: Ints, topics: _Names, labels: _Names
 ) -> None:
     """Numbers slices, spots, looks, topics and labels of many bags throughout."""
-    spot, look, hit, score, beside, unplaced = tables
+    spot, look, hit, score, beside, unplaced, fix = tables
 
     def each(at: int, values: Ints) -> Ints:
         return np.repeat(values, counts[:, at])
 
-    for at, table in ((0, spot), (1, look), (5, unplaced)):
+    for at, table in ((0, spot), (1, look), (5, unplaced), (6, fix)):
         table[:, 0] += each(at, np.cumsum(slices) - slices)
+    for at, table in ((0, spot), (1, look), (5, unplaced)):
         table[:, 1] = topics.of[table[:, 1] + each(at, topics.first)]
     for at, table in ((0, spot), (5, unplaced)):
         table[:, Spot.LABEL] = labels.of[table[:, Spot.LABEL] + each(at, labels.first)]

@@ -6,18 +6,22 @@ for them. Other messages of such a topic count as looks that saw nothing.
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import PlacedDetection, SlicedSights, encode_sights
+from ros2_memory.analysis.sights import AHEAD_MM, PlacedDetection, SlicedSights, encode_sights
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import Detection, detections_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from ros2_memory.analysis.bag_frames import BagFrames, Times
     from ros2_memory.catalogue.map_digest import PlacedPoses
     from ros2_memory.core.model import Vector3
@@ -49,6 +53,12 @@ _TEXTS: Final = frozenset({"std_msgs/msg/String"})
 _OF_DETECTORS: Final = ("detection", "recognizedobject")
 _TRIED: Final = 16
 """After so many messages without a detection, a topic of any other type is of no detector."""
+_LOCALISER: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+_FIX_NS: Final = 2_000_000_000
+"""How far apart it is looked where odometry is in the map."""
+_COVARIANCE: Final = 36
+_SAME_M: Final = 0.1
+"""What changes less from one look to the next is left out."""
 _HEADER: Final = struct.Struct("<iII")
 _ENCAPSULATION: Final = 4
 _NS_PER_S: Final = 1_000_000_000
@@ -84,9 +94,12 @@ class DetectorSights:
         self._extractor = extractor
         self._topics: dict[str, _Topic | None] = {}
         self._left = _MAX_DETECTIONS
+        self._localised: dict[str, list[tuple[Ns, str, float]]] = {}
 
     def wants(self, topic: str, type_name: str) -> bool:
-        """Returns whether messages of a type may hold detections."""
+        """Returns whether messages of a type may hold detections, or say how exact poses are."""
+        if type_name == _LOCALISER:
+            return True
         package, _, name = type_name.partition("/")
         if type_name not in _TEXTS and (package in _NO_DETECTIONS or package == "std_msgs"):
             return False
@@ -97,6 +110,9 @@ class DetectorSights:
 
     def add(self, record: Record, detections: tuple[Detection, ...] | None) -> None:
         """Takes the next message of a topic."""
+        if record.channel.type == _LOCALISER:
+            self._add_covariance(record)
+            return
         of_topic = self._topics.get(record.channel.topic)
         if of_topic is None:
             return
@@ -122,6 +138,21 @@ class DetectorSights:
         of_topic.detections.append(found)
         if not of_topic.is_detector and len(of_topic.times) >= _TRIED:
             self._topics[record.channel.topic] = None
+
+    def _add_covariance(self, record: Record) -> None:
+        """Takes what a localiser says; from one that says it often, now and then."""
+        said = self._localised.setdefault(record.channel.topic, [])
+        if said and record.log_time < said[-1][0] + _FIX_NS // 4:
+            return
+        try:
+            message = self._reader.decode(record)
+            frame = self._extractor.frame(message)
+        except UndecodableError:
+            return
+        covariance = getattr(getattr(message, "pose", None), "covariance", None)
+        sigma = _sigma_ahead(covariance)
+        if sigma is not None:
+            said.append((record.log_time, frame.lstrip("/"), sigma))
 
     def _read(
         self, record: Record, detections: tuple[Detection, ...] | None, of_topic: _Topic
@@ -151,9 +182,16 @@ class DetectorSights:
             if found is not None and found.is_detector
         }
         every = [time for found in of_detectors.values() for time in found.log_times]
-        if not every:
+        at = [time for said in self._localised.values() for time, _, _ in said]
+        moments = every or [*at, *robot.times[:1].tolist(), *robot.times[-1:].tolist()]
+        if not moments:
             return b""
-        sliced = SlicedSights((min(every), max(every)))
+        span = min(moments), max(moments)
+        fixes = [*self._fixes(robot, span)]
+        # Where no detector published, only what says more than that odometry went on.
+        if not every and not at and len(fixes) <= 2:
+            return b""
+        sliced = SlicedSights(span)
         for topic, of_topic in of_detectors.items():
             times = np.array(of_topic.times, np.int64)
             places = _places(of_topic, times, robot.frames)
@@ -169,7 +207,51 @@ class DetectorSights:
                 ]
                 pose = (x, y, yaw) if valid else None
                 sliced.at(log_time).add(topic, log_time, pose, seen)
+        for time, pose, sigma in fixes:
+            sliced.at(time).add_fix(time, pose, sigma)
         return encode_sights(sliced.sights(robot.frames.target))
+
+    def _fixes(
+        self, robot: PlacedPoses, span: tuple[Ns, Ns]
+    ) -> Iterator[tuple[Ns, tuple[float, float, float], float | None]]:
+        """Yields where odometry was in the map, where that changes, and how exactly it is known."""
+        times = np.append(np.arange(*span, _FIX_NS), span[1])
+        pose = np.zeros((len(times), 3))
+        target = robot.frames.target
+        found = robot.frames.poses(robot.own, times) if robot.own else None
+        if found is not None:
+            x, y, _ = found.translation
+            qx, qy, qz, qw = found.rotation
+            yaw = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+            pose, times = np.stack((x, y, yaw), axis=1)[found.valid], times[found.valid]
+        said = sorted(
+            (at, sigma)
+            for of_topic in self._localised.values()
+            for at, frame, sigma in of_topic
+            if frame == target
+        )
+        if not len(times) or (robot.own in {"", target} and not said):
+            return
+        at = np.array([time for time, _ in said], np.int64)
+        sigma = np.append([sigma for _, sigma in said], [-1.0])
+        known = sigma[np.searchsorted(at, times, side="right") - 1]
+        changed = np.abs(np.diff(pose, axis=0)).max(axis=1) > _SAME_M
+        changed |= np.abs(np.diff(known)) > _SAME_M
+        kept = np.ones(len(times), np.bool_)
+        kept[1:-1] = changed[1:] | changed[:-1]
+        for time, (px, py, turn), exact in zip(
+            times[kept].tolist(), pose[kept].tolist(), known[kept].tolist(), strict=True
+        ):
+            yield time, (px, py, turn), exact if exact >= 0 else None
+
+
+def _sigma_ahead(covariance: object) -> float | None:
+    """Returns the standard deviation (m) of a point `AHEAD_MM` before a pose; None if unknown."""
+    if not isinstance(covariance, Sequence | np.ndarray) or len(covariance) != _COVARIANCE:
+        return None
+    x, y, yaw = (float(covariance[nth]) for nth in (0, 7, 35))
+    variance = max(x, y) + yaw * (AHEAD_MM / 1000) ** 2
+    return math.sqrt(variance) if variance >= 0 and math.isfinite(variance) else None
 
 
 def _places(of_topic: _Topic, times: Times, frames: BagFrames) -> list[list[Vector3 | None]]:

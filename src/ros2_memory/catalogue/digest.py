@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader
 
-DIGEST_VERSION: Final = 22
+DIGEST_VERSION: Final = 23
 """Version of what is stored of a bag and how; another one has every bag digested again."""
 _ALWAYS_READ_BYTES: Final = 64 << 20
 _MESSAGE_BYTES: Final = 200

@@ -116,9 +116,11 @@ class PlacedPoses:
 
     Attributes:
         frames: looks up any frame of the bag.
+        own: the frame of the poses themselves.
     """
 
     frames: BagFrames
+    own: str
     times: Times
     x: Floats
     y: Floats
@@ -253,11 +255,11 @@ class MapCollector:
             track = track_of(times, x, y, _heading((qx, qy, qz, qw), turned))
             in_own = MapDigest(own, statics.key, track, len(self._times) - len(times))
         if poses is None:
-            return PlacedPoses(frames, times[:0], x[:0], y[:0], x[:0]), target, in_own
+            return PlacedPoses(frames, own, times[:0], x[:0], y[:0], x[:0]), target, in_own
         px, py, _ = poses.points((x, y, z))
         heading = _heading(multiply(poses.rotation, (qx, qy, qz, qw)), turned)
         valid = poses.valid
-        placed = PlacedPoses(frames, times[valid], px[valid], py[valid], heading[valid])
+        placed = PlacedPoses(frames, own, times[valid], px[valid], py[valid], heading[valid])
         return placed, target, in_own
 
 

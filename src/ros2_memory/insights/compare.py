@@ -28,6 +28,7 @@ from ros2_memory.places.where import parse_where, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things
+from ros2_memory.things.unseen import vague_notes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -132,7 +133,9 @@ def _things(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    return frame, ThingsBetween(known, (first, second), where, limits.places).compared()
+    for note in vague_notes(known, windows):
+        view.notes.add(note)
+    return frame, ThingsBetween(known, first, second, where, limits.places).compared()
 
 
 def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:

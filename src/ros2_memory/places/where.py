@@ -42,6 +42,10 @@ class Where:
     frame_id: str | None = None
     name: str | None = None
 
+    def contains(self, frame_id: str, x: float, y: float) -> bool:
+        """Whether a point (m) of a frame lies in the region."""
+        return self.frame_id in {None, frame_id} and self.region.contains(x, y)
+
     @property
     def shown(self) -> JsonValue:
         """The argument as a reply repeats it: a place's name, or the bounds."""

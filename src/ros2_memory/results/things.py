@@ -90,6 +90,7 @@ def thing(most_stays: int) -> Keys:
     """Returns the keys of a thing with so many of its newest places."""
     return keys(
         PLAIN("label").in_short,
+        PAIRS("labels").if_any,
         PLAIN("also_seen_as").if_any,
         PLAIN("misread_as").if_any,
         PLAIN("moves").if_any.in_short,
@@ -117,6 +118,7 @@ class Thing:
     """One thing that detectors saw, or one label of things that move by themselves.
 
     Attributes:
+        labels: how often each of several labels was given to it, the commonest first.
         also_seen_as: other spellings that it was seen under, the commonest first; `misread_as`:
             labels of other things.
         place: its last one (m), in `frame_id`; `spread_m` is the root mean square distance of its
@@ -145,6 +147,7 @@ class Thing:
     still_there: StillThere | None
     moved: tuple[ThingStay, ...] = ()
     misread_as: tuple[str, ...] = ()
+    labels: tuple[tuple[str, int], ...] = ()
     at_once: int | None = None
     moves: bool = False
 

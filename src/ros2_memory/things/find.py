@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot, Unplaced
+from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import places_at
-from ros2_memory.core.text import abbreviate, counted, listed
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
-from ros2_memory.insights.silences import describe_silences
+from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
+from ros2_memory.things.unseen import Asked, notes_on
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
@@ -87,29 +85,31 @@ def find_things(
     finder = _Finder(known, window, region, limits.places)
     found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
     things = tuple(each.described() for each in found[:limit])
-    totals: dict[str, int] = {}
+    totals: Counter[str] = Counter()
     for each in found:
-        totals[each.label] = totals.get(each.label, 0) + (each.at_once or 1)
-    held = describe_held(being_written(view.snapshot, asked_for))
-    notes = [*view.notes.sentences(), *held]
-    if not found:
-        notes += [*_unseen(view, known, window)]
+        totals[each.label] += each.at_once or 1
     is_bounded = start_s is not None or end_s is not None
     bounds = [*["window"] * is_bounded, *([] if region is None else ["region"])]
-    inside = f" in this {' and '.join(bounds)}" if bounds else ""
-    notes += _notes(known)
-    keys_found = {known.labels.key(each.label) for each in found}
-    for key, label in asked.items():
-        of_label = _label_notes(known, label, key, window, inside, found=key in keys_found)
-        notes += [note if len(asked) == 1 else f"{abbreviate(label)}: {note}" for note in of_label]
+    question = Asked(
+        labels=asked,
+        found=frozenset(key for each in found for key in each.keys),
+        vague=frozenset(each.label for each in found if each.is_vague),
+        window=window,
+        inside=f" in this {' and '.join(bounds)}" if bounds else "",
+        min_score=f"min_score {lowest:g}" + " (data.min_score)" * (min_score is None),
+    )
     return Things(
         frame_id=_frame_of(known, things),
         things=things,
-        total=sum(totals.values()),
+        total=totals.total(),
         labels=tuple(sorted(totals.items())),
         now=now,
         all_counted=known.since is None,
-        notes=tuple(notes),
+        notes=(
+            *view.notes.sentences(),
+            *describe_held(being_written(view.snapshot, asked_for)),
+            *notes_on(view, known, question),
+        ),
     )
 
 
@@ -120,33 +120,15 @@ def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
     return known.frames[0] if known.has_map else "".join(known.frames[1:][-1:])
 
 
-def _unseen(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
-    """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    sights = known.estimate.sights
-    times = (
-        (sights.looks, Look.FIRST, Look.LAST),
-        (sights.spots, Spot.FIRST, Spot.LAST),
-        (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
-    )
-    published = any(
-        bool(((table[:, first] < window.stop) & (table[:, last] >= window.start)).any())
-        for table, first, last in times
-    )
-    if sights.topics and not published:
-        yield (
-            f"{listed(sights.topics)} published nothing in this window: whether things were there "
-            "is not known"
-        )
-    yield from describe_silences(view, sights.topics, window)
-
-
 class _Found(NamedTuple):
     """A thing of a question, which is described where it is shown: there may be thousands."""
 
     label: str
+    keys: Collection[str]
     last: Ns
     place: tuple[float, float, float]
     at_once: int | None
+    is_vague: bool
     described: Callable[[], Thing]
 
 
@@ -163,61 +145,86 @@ class _Finder:
         """Yields the things of these keys, or all where there are none."""
         result = self.known.estimate
         for instance in result.instances:
-            if not keys or instance.key in keys:
-                thing = self._instance(instance)
-                if thing is not None:
-                    yield thing
+            names = {self.known.labels.key(name) for name in instance.labels}
+            if not keys or not names.isdisjoint(keys):
+                yield from self._instance(instance, names)
         for mover in result.movers:
-            if not keys or mover.key in keys:
-                thing = self._mover(mover)
-                if thing is not None:
-                    yield thing
+            names = {self.known.labels.key(name) for name, _ in self._labels(mover.spots)}
+            if not keys or not names.isdisjoint(keys):
+                yield from self._mover(mover, names)
 
-    def _instance(self, instance: Instance) -> _Found | None:
-        seen = ((stay, self._seen(stay.spots)) for stay in instance.stays)
+    def _instance(self, instance: Instance, names: Collection[str]) -> Iterator[_Found]:
+        result = self.known.estimate
+        seen = ((stay, result.seen_in(stay.spots, self.window)) for stay in instance.stays)
         parts = [(stay, rows) for stay, rows in seen if len(rows)]
         if not parts:
-            return None
+            return
         last, newest = parts[-1]
         if not self._is_there(self.known.frames[instance.epoch], last.x, last.y):
-            return None
-        spots = self.known.estimate.sights.spots
+            return
+        seen_last = max(int(result.sights.spots[rows, Spot.LAST].max()) for _, rows in parts)
         at_once = self._side_by_side(newest)
-        return _Found(
-            self.known.estimate.names[instance.key],
-            max(int(spots[rows, Spot.LAST].max()) for _, rows in parts),
-            _place(last.x, last.y, last.z),
-            at_once,
-            partial(self._described, instance, parts, at_once),
-        )
+        describe = partial(self._described, instance, parts, at_once)
+        place = _place(last)
+        is_vague = result.is_vague(np.concatenate([rows for _, rows in parts]))
+        yield _Found(instance.label, names, seen_last, place, at_once, is_vague, describe)
 
     def _described(
         self, instance: Instance, parts: Sequence[tuple[PlacedStay, Ints]], at_once: int | None
     ) -> Thing:
         last, newest = parts[-1]
         frame = self.known.frames[instance.epoch]
-        every = np.concatenate([rows for _, rows in parts])
         stays = [self._stay(frame, group) for group in _by_place(parts)]
-        best, median = self._scores(every)
-        spots = self.known.estimate.sights.spots[every]
-        return Thing(
-            label=self.known.estimate.names[instance.key],
-            also_seen_as=self._names(instance, [stay.spellings for stay in instance.stays]),
-            misread_as=self._names(instance, [stay.also for stay in instance.stays]),
-            place=_place(last.x, last.y, last.z),
+        every = np.concatenate([rows for _, rows in parts])
+        labels = self._labels(every)
+        spellings = Counter(name for stay in instance.stays for name in stay.spellings.elements())
+        misread = Counter(name for stay in instance.stays for name in stay.also.elements())
+        return replace(
+            self._thing(instance.label, frame, _place(last), every, newest),
+            labels=tuple(labels) if len(labels) > 1 else (),
+            also_seen_as=_commonest(spellings, instance.labels),
+            misread_as=_commonest(misread, instance.labels),
             spread_m=last.dev_mm / _MM,
-            frame_id=frame,
-            inside=places_at(self.places, frame, last.x / _MM, last.y / _MM),
-            first=int(spots[:, Spot.FIRST].min()),
-            last=int(spots[:, Spot.LAST].max()),
-            count=int(self.known.estimate.counts[every].sum()),
-            best=best,
-            median=median,
-            robot=self._robot(newest),
             still_there=self._still_there(instance, last, newest),
             moved=tuple(stays) if len(stays) > 1 else (),
             at_once=at_once,
         )
+
+    def _thing(
+        self,
+        label: str,
+        frame: str,
+        place: tuple[float, float, float],
+        rows: Ints,
+        newest: Ints,
+    ) -> Thing:
+        """Returns what spots say of a thing; `newest` are those of its place."""
+        spots = self.known.estimate.sights.spots[rows]
+        best, median = self._scores(rows)
+        return Thing(
+            label=label,
+            also_seen_as=(),
+            place=place,
+            spread_m=0.0,
+            frame_id=frame,
+            inside=places_at(self.places, frame, place[0], place[1]),
+            first=int(spots[:, Spot.FIRST].min()),
+            last=int(spots[:, Spot.LAST].max()),
+            count=int(self.known.estimate.counts[rows].sum()),
+            best=best,
+            median=median,
+            robot=self._robot(newest),
+            still_there=None,
+        )
+
+    def _labels(self, rows: Ints) -> list[tuple[str, int]]:
+        """Returns how often each label has these spots, the commonest first."""
+        result = self.known.estimate
+        counts: Counter[str] = Counter()
+        labels = result.sights.spots[rows, Spot.LABEL].tolist()
+        for label, n in zip(labels, result.counts[rows].tolist(), strict=True):
+            counts[result.names[self.known.labels.key(result.sights.labels[label])]] += n
+        return counts.most_common()
 
     def _side_by_side(self, rows: Ints) -> int | None:
         """Returns how many of a label are at one place, where messages have several at once.
@@ -242,53 +249,37 @@ class _Finder:
         number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
         return number if number > 1 else None
 
-    def _mover(self, mover: Mover) -> _Found | None:
-        """Returns a mover: where it was last seen, inside the region if one is given."""
-        rows = self._seen(mover.spots)
+    def _mover(self, mover: Mover, names: Collection[str]) -> Iterator[_Found]:
+        """Yields a mover: where it was last seen, inside the region if one is given."""
         result, frame = self.known.estimate, self.known.frames[mover.epoch]
+        rows = result.seen_in(mover.spots, self.window)
         if self.where is not None:
             places = result.sights.spots[rows][:, [Spot.X, Spot.Y]].tolist()
             rows = rows[[self._is_there(frame, x, y) for x, y in places]]
         if not len(rows):
-            return None
+            return
         spots = result.sights.spots[rows]
         newest = int(spots[:, Spot.LAST].argmax())
-        x, y, z, dev = spots[newest, [Spot.X, Spot.Y, Spot.Z, Spot.DEV]].tolist()
-        best, median = self._scores(rows)
-        thing = Thing(
-            label=result.names[mover.key],
-            also_seen_as=(),
-            place=_place(x, y, z),
-            spread_m=dev / _MM,
-            frame_id=frame,
-            inside=places_at(self.places, frame, x / _MM, y / _MM),
-            first=int(spots[:, Spot.FIRST].min()),
-            last=int(spots[newest, Spot.LAST]),
-            count=int(result.counts[rows].sum()),
-            best=best,
-            median=median,
-            robot=self._robot(rows[[newest]]),
-            still_there=None,
+        x, y, z = spots[newest, [Spot.X, Spot.Y, Spot.Z]].tolist()
+        place = x / _MM, y / _MM, z / _MM
+        thing = replace(
+            self._thing(result.names[mover.key], frame, place, rows, rows[[newest]]),
+            spread_m=int(spots[newest, Spot.DEV]) / _MM,
             at_once=most_at_once(spots),
             moves=True,
         )
-        return _Found(thing.label, thing.last, thing.place, thing.at_once, lambda: thing)
+        yield _Found(
+            thing.label,
+            names,
+            thing.last,
+            place,
+            thing.at_once,
+            result.is_vague(rows),
+            lambda: thing,
+        )
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
-        where = self.where
-        if where is None:
-            return True
-        if where.frame_id not in {None, frame}:
-            return False
-        return where.region.contains(x_mm / _MM, y_mm / _MM)
-
-    def _seen(self, rows: Ints) -> Ints:
-        """Returns the spots of bags that reach into the window."""
-        spots = self.known.estimate.sights.spots[rows]
-        inside = (spots[:, Spot.FIRST] < self.window.stop) & (
-            spots[:, Spot.LAST] >= self.window.start
-        )
-        return rows[inside & (self.known.estimate.counts[rows] > 0)]
+        return self.where is None or self.where.contains(frame, x_mm / _MM, y_mm / _MM)
 
     def _stay(self, frame: str, parts: Sequence[tuple[PlacedStay, Ints]]) -> ThingStay:
         """Returns the stays at one place in a row, as one."""
@@ -298,7 +289,7 @@ class _Finder:
         return ThingStay(
             start=int(spots[:, Spot.FIRST].min()),
             end=int(spots[:, Spot.LAST].max()),
-            place=_place(last.x, last.y, last.z),
+            place=_place(last),
             count=int(self.known.estimate.counts[rows].sum()),
             inside=places_at(self.places, frame, last.x / _MM, last.y / _MM),
         )
@@ -331,14 +322,6 @@ class _Finder:
         x, y, yaw = pose
         return x / _MM, y / _MM, math.radians((yaw + 180) % 360 - 180)
 
-    def _names(self, instance: Instance, seen: Iterable[Mapping[str, int]]) -> tuple[str, ...]:
-        """Returns the commonest of these names, other than the thing's own."""
-        counts: Counter[str] = Counter()
-        for each in seen:
-            counts.update(each)
-        counts.pop(self.known.estimate.names[instance.key], None)
-        return tuple(sorted(counts, key=lambda each: (-counts[each], each))[:_MOST_NAMES])
-
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere:
         """Returns the state of a thing since it was last seen in the window."""
         spots = self.known.estimate.sights.spots
@@ -357,8 +340,13 @@ class _Finder:
         return StillThere("not_looked_at_since", last)
 
 
-def _place(x_mm: float, y_mm: float, z_mm: float) -> tuple[float, float, float]:
-    return x_mm / _MM, y_mm / _MM, z_mm / _MM
+def _place(stay: PlacedStay) -> tuple[float, float, float]:
+    return stay.x / _MM, stay.y / _MM, stay.z / _MM
+
+
+def _commonest(names: Counter[str], without: Collection[str]) -> tuple[str, ...]:
+    others = [name for name in names if name not in without]
+    return tuple(sorted(others, key=lambda name: (-names[name], name))[:_MOST_NAMES])
 
 
 def _by_place(
@@ -377,48 +365,3 @@ def _by_place(
         else:
             groups.append([part])
     return groups
-
-
-def _notes(known: KnownThings) -> Iterator[str]:
-    """Yields notes on resets of odometry, and on missing detectors."""
-    sights = known.estimate.sights
-    if len(known.frames) > 1 + bool(known.frames[0]):
-        yield (
-            "without a map, each run of odometry has its own coordinates: a thing may be listed "
-            "once for each run"
-        )
-    if not sights.topics and known.since is None:
-        yield (
-            "no things are known: there is no message of a detector "
-            "(a type such as vision_msgs/msg/Detection3DArray); find_matches searches text"
-        )
-
-
-def _label_notes(
-    known: KnownThings, label: str, asked: str, window: TimeWindow, inside: str, *, found: bool
-) -> Iterator[str]:
-    """Yields notes on a label; `inside` says how it was asked about."""
-    sights = known.estimate.sights
-    mine = np.array([known.labels.key(each) == asked for each in sights.labels], bool)
-    unplaced = sights.unplaced[mine[sights.unplaced[:, Unplaced.LABEL]], Unplaced.N].sum()
-    if unplaced:
-        yield f"{counted(int(unplaced), 'detection')} of it could not be placed, and are left out"
-    if found:
-        return
-    spots = sights.spots[mine[sights.spots[:, Spot.LABEL]]]
-    during = (spots[:, Spot.FIRST] < window.stop) & (spots[:, Spot.LAST] >= window.start)
-    every, seen = int(spots[:, Spot.N].sum()), int(spots[during, Spot.N].sum())
-    names = sorted(set(known.estimate.names.values()))
-    if seen:
-        yield (
-            f"it was detected {counted(seen, 'time')} in this time, but does not count as a thing"
-            f"{inside}: find_matches lists single detections"
-        )
-    elif every:
-        yield f"it was detected {counted(every, 'time')} in all, and not once in this window"
-    elif names:
-        close = [each for each in names if asked in each or each in asked]
-        close += difflib.get_close_matches(asked, names, 3)
-        shown = [*dict.fromkeys(close)] or names
-        meant = f"; did you mean {close[0]}?" if close else ""
-        yield f"no detector reported {abbreviate(label)}; there are: {listed(shown)}{meant}"

@@ -9,14 +9,18 @@ are many and short is of something that moves by itself: it has a track, and no 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Beside, Hit, Score, Spot
-from ros2_memory.things.places import places_of
+from ros2_memory.analysis.sights import SCORE_BINS, Hit, Score, Spot, Unplaced
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.things.labels import moves_by_itself
+from ros2_memory.things.localisation import poorly_localised
+from ros2_memory.things.moves import Sightings, stays_in
+from ros2_memory.things.places import GATE_MM, distinct_rows, places_of
 from ros2_memory.things.presence import (
     Cells,
     Stay,
@@ -26,18 +30,21 @@ from ros2_memory.things.presence import (
     in_ranges,
     stays_at,
 )
+from ros2_memory.things.synonyms import with_synonyms
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.sights import Ints, Sights
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.things.labels import Labels
     from ros2_memory.things.presence import Evidence, FieldOfView
 
     Floats = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
 
 _FEWEST: Final = 3
 """Fewer detections are no thing: a detector sees what is not there."""
@@ -50,22 +57,8 @@ _SMALL_SHARE: Final = 1 / 3
 _HALO_SHARE: Final = 0.2
 _TINY_SHARE: Final = 0.1
 _BESIDE_SHARE: Final = 0.2
-_MOVES_BY_ITSELF: Final = frozenset(
-    (
-        "person",
-        "human",
-        "pedestrian",
-        "man",
-        "woman",
-        "child",
-        "boy",
-        "girl",
-        "baby",
-        "dog",
-        "cat",
-        "pet",
-    )
-)
+_SEVERAL_SHARE: Final = 0.1
+"""Where so many bags have several of a label at one place, it is no single thing that moves."""
 _RESTLESS_MOVES: Final = 6
 _RESTLESS_SHARE: Final = 0.2
 
@@ -81,6 +74,7 @@ class PlacedStay:
         left: the time by which it was seen to be gone; None if it was not.
         spots: rows of `Sights.spots`, in order of time.
         spellings: how often it was seen under each label.
+        place: its number.
         weak: whether it was seen too rarely to be a thing.
         also: how often it was seen under the labels of other things.
     """
@@ -96,11 +90,11 @@ class PlacedStay:
     left: Ns | None
     count: int
     spots: Ints
-    spellings: dict[str, int]
+    spellings: Counter[str]
     place: int
     stay: Stay
     weak: bool
-    also: dict[str, int] = field(default_factory=dict)
+    also: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(slots=True)
@@ -116,11 +110,13 @@ class Instance:
     """Detector messages since it was last seen, from where it would have been."""
     missed_by: Ns | None = None
     """When that chance fell below 1 %; None where it did not."""
+    labels: Mapping[str, int] = field(default_factory=dict)
+    """How often it was seen under each name, the commonest first."""
 
     @property
-    def count(self) -> int:
-        """Returns how often it was seen."""
-        return sum(each.count for each in self.stays)
+    def label(self) -> str:
+        """The name to show."""
+        return next(iter(self.labels), self.key)
 
 
 @dataclass(slots=True)
@@ -141,22 +137,46 @@ class Estimate:
     movers: list[Mover]
     counts: Ints
     """How many detections of each spot count."""
+    poor: Flags
+    """Which spots were seen while localisation was poor."""
     hits: Ints
     """The hits of these, by spot; `hit_starts` is where each spot's begin."""
     hit_starts: Ints
     names: dict[str, str]
     """The name to show of each key."""
     cells: Cells
-    evidence: dict[tuple[str, int], dict[int, Evidence]]
+    evidence: dict[tuple[str, int], list[Evidence]]
     """By key and epoch: the evidence for each place."""
+
+    def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
+        """Returns which of some spots are of bags that reach into a window and end before a time.
+
+        Bags count as a whole; a spot without detections that count is left out.
+        """
+        first, last = self.sights.spots[rows][:, [Spot.FIRST, Spot.LAST]].T
+        inside = (first < window.stop) & (last >= window.start) & (last < before)
+        found: Ints = rows[inside & (self.counts[rows] > 0)]
+        return found
+
+    def is_vague(self, rows: Ints) -> bool:
+        """Whether the newest of some spots was seen while localisation was poor."""
+        return bool(self.poor[rows[self.sights.spots[rows, Spot.LAST].argmax()]])
+
+    def place_of(self, stay: PlacedStay, rows: Ints) -> tuple[float, float, float]:
+        """Returns the mean place (m) of some spots of a stay, by what it was when all are poor."""
+        rows = rows[~self.poor[rows]]
+        if not len(rows):
+            return stay.x / 1000, stay.y / 1000, stay.z / 1000
+        spots = self.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.Z]]
+        x, y, z = (np.average(spots, axis=0, weights=self.counts[rows]) / 1000).tolist()
+        return x, y, z
 
     def seen_from(self, spots: Ints) -> tuple[float, float, float] | None:
         """Returns the pose (mm, degrees) from which most messages saw some spots; None if unknown.
 
         That is the mean pose in one cell; of two with equal numbers, in the one that saw it later.
         """
-        starts = self.hit_starts[spots]
-        hits = self.hits[in_ranges(starts, self.hit_starts[spots + 1] - starts)]
+        hits = _rows_of(spots, self.hits, self.hit_starts)
         hits = hits[hits[:, Hit.LOOK] >= 0]
         if not len(hits):
             return None
@@ -180,13 +200,14 @@ class Estimate:
 
 @dataclass(slots=True)
 class _Group:
-    """The places of one label in one epoch."""
+    """The places of one label in one epoch, each with its spots."""
 
     key: str
     epoch: int
     rows: Ints
+    places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
-    evidence: dict[int, Evidence] = field(default_factory=dict)
+    evidence: list[Evidence] = field(default_factory=list)
 
 
 def estimate(
@@ -202,50 +223,50 @@ def estimate(
     Detections whose score lies below `min_score`, to 0.05, do not count. `go_on` is called again
     and again; what it raises ends the estimate.
     """
-    spots = sights.spots
     epoch = np.zeros(sights.bags, np.int64) if epochs is None else np.array(epochs, np.int64)
     seen = _Seen(sights, epoch, min_score)
-    keys = [labels.key(each) for each in sights.labels]
-    shown = [*dict.fromkeys(keys)]
-    key_of = np.array([shown.index(key) for key in keys], np.int64)
-    group_of = epoch[spots[:, Spot.BAG]] * (len(shown) + 1) + key_of[spots[:, Spot.LABEL]]
-    group_of[seen.counts == 0] = -1
-    groups = []
-    for number in np.unique(group_of[group_of >= 0]).tolist():
-        nth, key = divmod(number, len(shown) + 1)
-        key_name = shown[key]
-        group = _Group(key_name, nth, np.flatnonzero(group_of == number))
-        if not _is_named_mover(key_name):
-            _find_stays(group, seen, go_on)
-        groups.append(group)
+    names = _names(sights, labels)
+    epoch_of = epoch[sights.spots[:, Spot.BAG]]
+    keys = with_synonyms(sights, seen.counts, epoch_of, labels, go_on)
+    groups = _groups(seen, epoch, keys)
+    _find_places(groups, seen, go_on)
+    for group in groups:
+        _find_stays(group, seen, go_on)
     _fold(groups, seen, keys, go_on)
     instances: list[Instance] = []
     movers: list[Mover] = []
     for group in groups:
         linked = _link(group, seen, go_on)
-        if _moves_by_itself(group, linked):
-            if not _is_seen(group, seen):
-                continue
+        _add_poor(group, linked, seen)
+        if not _moves_by_itself(group, linked):
+            instances += linked
+        elif _is_seen(group, seen):
             movers.append(Mover(group.key, group.epoch, group.rows))
-            continue
-        for each in linked:
-            last = each.stays[-1]
-            each.chance, each.looks, each.missed_by = chance_of_missing(
-                seen.cells, group.evidence[last.place], last.stay, last.last
-            )
-        instances += linked
-    instances.sort(key=lambda each: (each.key, each.stays[0].first, each.stays[0].x))
-    return Estimate(
-        sights,
-        instances,
-        movers,
-        seen.counts,
-        seen.hits,
-        seen.starts,
-        _names(sights, labels),
-        seen.cells,
-        {(each.key, each.epoch): each.evidence for each in groups},
+    found = Estimate(
+        sights=sights,
+        instances=instances,
+        movers=movers,
+        counts=seen.counts,
+        poor=seen.poor,
+        hits=seen.hits,
+        hit_starts=seen.starts,
+        names=names,
+        cells=seen.cells,
+        evidence={(group.key, group.epoch): group.evidence for group in groups},
     )
+    for each in instances:
+        each.chance, each.looks, each.missed_by = found.missing(each, each.stays[-1])
+        each.labels = _labels_of(each, labels, names)
+    instances.sort(key=lambda each: (each.label, each.stays[0].first, each.stays[0].x))
+    return found
+
+
+def _labels_of(instance: Instance, labels: Labels, names: Mapping[str, str]) -> dict[str, int]:
+    counts: Counter[str] = Counter()
+    for stay in instance.stays:
+        for spelling, n in stay.spellings.items():
+            counts[names[labels.key(spelling)]] += n
+    return dict(sorted(counts.items(), key=lambda each: (-each[1], each[0])))
 
 
 class _Seen:
@@ -253,22 +274,53 @@ class _Seen:
 
     Attributes:
         counts: how many detections of each spot count.
+        poor: which spots were seen while localisation was poor: these move nothing.
         hits: the hits of these, by spot; `starts` is where each spot's begin.
+        side: of each spot, the mean of the unit vectors to it from where it was seen.
     """
 
     def __init__(self, sights: Sights, epoch: Ints, min_score: float) -> None:
         self.sights = sights
         self.counts = _counts(sights, min_score)
-        hits = _hits(sights, self.counts)
-        self.hits = hits[np.argsort(hits[:, Hit.SPOT], kind="stable")]
-        self.starts = np.searchsorted(self.hits[:, Hit.SPOT], np.arange(len(sights.spots) + 1))
-        self.cells = Cells(sights, epoch)
-        self.view = _fields_of_view(sights, self.cells, self.hits)
+        self.poor, poor = poorly_localised(sights)
+        self.hits, self.starts = _by_spot(_hits(sights, self.counts), sights)
+        self.hits[np.append(poor, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
+        self.cells = Cells(sights, epoch, poor)
+        hits = self.hits[self.hits[:, Hit.LOOK] >= 0]
+        away, bearing = self.cells.seen_at(
+            hits[:, Hit.LOOK], *(sights.spots[hits[:, Hit.SPOT]][:, [Spot.X, Spot.Y]].T)
+        )
+        self.view = _fields_of_view(sights, hits, away, bearing)
+        heading = np.radians(bearing + self.cells.yaw[hits[:, Hit.LOOK]])
+        spot, n, size = hits[:, Hit.SPOT], hits[:, Hit.N], len(sights.spots)
+        sums = [np.bincount(spot, n * of(heading), size) for of in (np.cos, np.sin)]
+        self.side: Floats = (
+            np.stack(sums, axis=1) / np.maximum(np.bincount(spot, n, size), 1)[:, None]
+        )
 
-    def hits_of(self, spots: Ints) -> Ints:
-        """Returns the hits of some spots."""
-        starts = self.starts[spots]
-        return self.hits[in_ranges(starts, self.starts[spots + 1] - starts)]
+    def firm(self, rows: Ints) -> Ints:
+        """Returns the spots that were seen while localisation was good, all if none was."""
+        good: Ints = rows[~self.poor[rows]]
+        return good if self.counts[good].sum() >= _FEWEST else rows
+
+    def sightings(self, rows: Ints) -> Sightings:
+        """Returns some spots as sightings of one thing."""
+        spots = self.sights.spots[rows]
+        place = spots[:, [Spot.X, Spot.Y]].astype(np.float64)
+        times = spots[:, Spot.FIRST], spots[:, Spot.LAST]
+        return Sightings(place, self.counts[rows], spots[:, Spot.DEV], self.side[rows], *times)
+
+
+def _by_spot(table: Ints, sights: Sights) -> tuple[Ints, Ints]:
+    """Returns rows ordered by spot, their column 0, and where those of each spot begin."""
+    ordered = table[np.argsort(table[:, 0], kind="stable")]
+    return ordered, np.searchsorted(ordered[:, 0], np.arange(len(sights.spots) + 1))
+
+
+def _rows_of(spots: Ints, table: Ints, starts: Ints) -> Ints:
+    """Returns the rows of some spots in a table that is ordered by spot."""
+    rows: Ints = table[in_ranges(starts[spots], starts[spots + 1] - starts[spots])]
+    return rows
 
 
 def _counts(sights: Sights, min_score: float) -> Ints:
@@ -289,72 +341,101 @@ def _hits(sights: Sights, counts: Ints) -> Ints:
     return hits[hits[:, Hit.N] > 0]
 
 
-def _fields_of_view(sights: Sights, cells: Cells, hits: Ints) -> dict[int, FieldOfView]:
+def _fields_of_view(
+    sights: Sights, hits: Ints, away: Floats, bearing: Floats
+) -> dict[int, FieldOfView]:
     """Returns by topic the field of view that its detections show."""
-    hits = hits[hits[:, Hit.LOOK] >= 0]
-    spots = sights.spots[hits[:, Hit.SPOT]]
-    looks = hits[:, Hit.LOOK]
-    dx = spots[:, Spot.X] - cells.x[looks]
-    dy = spots[:, Spot.Y] - cells.y[looks]
-    away = np.hypot(dx, dy)
-    bearing = (np.degrees(np.arctan2(dy, dx)) - cells.yaw[looks] + 180.0) % 360.0 - 180.0
-    found = {}
-    for topic in np.unique(spots[:, Spot.TOPIC]).tolist():
-        of = spots[:, Spot.TOPIC] == topic
-        found[topic] = field_of_view(away[of], bearing[of], hits[of, Hit.N])
-    return found
+    topics = sights.spots[hits[:, Hit.SPOT], Spot.TOPIC]
+    return {
+        topic: field_of_view(away[of], bearing[of], hits[of, Hit.N])
+        for topic in np.unique(topics).tolist()
+        for of in (topics == topic,)
+    }
+
+
+def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
+    """Returns the labels in each epoch that have detections that count."""
+    shown = [*dict.fromkeys(keys)]
+    number = np.array([shown.index(key) for key in keys], np.int64)
+    spots = seen.sights.spots
+    of = epoch[spots[:, Spot.BAG]] * (len(shown) + 1) + number[spots[:, Spot.LABEL]]
+    of[seen.counts == 0] = -1
+    groups = []
+    for each in np.unique(of[of >= 0]).tolist():
+        nth, key = divmod(each, len(shown) + 1)
+        groups.append(_Group(shown[key], nth, np.flatnonzero(of == each)))
+    return groups
+
+
+def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None]) -> None:
+    """Finds the places of labels, each with one for every time that it was moved a little."""
+    spots = seen.sights.spots
+    single: list[tuple[_Group, Ints]] = []
+    for group in groups:
+        if moves_by_itself(group.key):
+            continue
+        go_on()
+        rows = seen.firm(group.rows)
+        place = places_of(spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows])
+        for nth in range(int(place.max(initial=-1)) + 1):
+            mine = rows[place == nth]
+            if _are_several(spots[mine]):
+                group.places.append(mine)
+            elif seen.counts[mine].sum() >= _FEWEST:
+                single.append((group, mine))
+    steps = stays_in([seen.sightings(rows) for _, rows in single])
+    for (group, rows), step in zip(single, steps, strict=True):
+        group.places += [rows[step == each] for each in range(int(step.max()) + 1)]
+
+
+def _are_several(spots: Ints) -> bool:
+    """Whether bags have several spots of a label at one place: things that stand together."""
+    distinct = len(
+        distinct_rows([spots[:, each] for each in (Spot.BAG, Spot.TOPIC, Spot.LABEL)])[0]
+    )
+    return len(spots) - distinct > _SEVERAL_SHARE * distinct
 
 
 def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
-    """Finds the places of a label, and when it was there."""
-    every, counts = seen.sights.spots, seen.counts
-    spots = every[group.rows]
-    place, where = places_of(spots[:, Spot.X], spots[:, Spot.Y], counts[group.rows])
-    for nth, (x, y) in enumerate(where.tolist()):
+    """Finds when a label was at its places."""
+    every = seen.sights.spots
+    for place, mine in enumerate(group.places):
         go_on()
-        mine = group.rows[place == nth]
-        if not len(mine) or counts[mine].sum() < _FEWEST:
-            continue
-        rows = seen.hits_of(mine)
+        bag, n = every[mine, Spot.BAG], seen.counts[mine]
+        x, y = (float(np.average(every[mine, column], weights=n)) for column in (Spot.X, Spot.Y))
+        rows = _rows_of(mine, seen.hits, seen.starts)
         rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.BAG]
-        evidence = evidence_at(seen.cells, seen.view, x, y, rows)
-        group.evidence[nth] = evidence
-        bag = every[mine, Spot.BAG]
-        for stay in stays_at(seen.cells, evidence):
+        group.evidence.append(evidence_at(seen.cells, seen.view, x, y, rows))
+        for stay in stays_at(seen.cells, group.evidence[-1]):
             inside = mine[(bag >= stay.first_bag) & (bag <= stay.last_bag)]
-            group.stays.append(_placed(seen, nth, stay, inside))
+            group.stays.append(_placed(seen, place, stay, inside))
 
 
 def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
-    sights, cells = seen.sights, seen.cells
-    spots, n = sights.spots[rows], seen.counts[rows]
-    total = int(n.sum())
-    x, y, z = (float((spots[:, each] * n).sum() / total) for each in (Spot.X, Spot.Y, Spot.Z))
+    spots, n = seen.sights.spots[rows], seen.counts[rows]
+    x, y, z = (float(np.average(spots[:, at], weights=n)) for at in (Spot.X, Spot.Y, Spot.Z))
     squares = spots[:, Spot.DEV] ** 2 + (spots[:, Spot.X] - x) ** 2 + (spots[:, Spot.Y] - y) ** 2
-    spellings: dict[str, int] = {}
+    spellings: Counter[str] = Counter()
     for label, count in zip(spots[:, Spot.LABEL].tolist(), n.tolist(), strict=True):
-        name = sights.labels[label]
-        spellings[name] = spellings.get(name, 0) + count
+        spellings[seen.sights.labels[label]] += count
     left = None
     if stay.left is not None:
-        of = cells.bag == stay.left
-        left = int(cells.last[of].min()) if of.any() else None
-    firm = np.ones(len(rows), bool)
-    if stay.firm_first >= 0:
-        bag = spots[:, Spot.BAG]
-        firm = (bag >= stay.firm_first) & (bag <= stay.firm_last)
-        firm = firm if firm.any() else np.ones(len(rows), bool)
+        of = seen.cells.bag == stay.left
+        left = int(seen.cells.last[of].min()) if of.any() else None
+    firm = spots[:, Spot.BAG]
+    firm = spots[(firm >= stay.firm_first) & (firm <= stay.firm_last)]
+    firm = firm if len(firm) and stay.firm_first >= 0 else spots
     return PlacedStay(
         x=x,
         y=y,
         z=z,
-        dev_mm=float(np.sqrt((squares * n).sum() / total)),
+        dev_mm=float(np.sqrt(np.average(squares, weights=n))),
         first=int(spots[:, Spot.FIRST].min()),
         last=int(spots[:, Spot.LAST].max()),
-        firm_first=int(spots[firm, Spot.FIRST].min()),
-        firm_last=int(spots[firm, Spot.LAST].max()),
+        firm_first=int(firm[:, Spot.FIRST].min()),
+        firm_last=int(firm[:, Spot.LAST].max()),
         left=left,
-        count=total,
+        count=int(n.sum()),
         spots=rows,
         spellings=spellings,
         place=place,
@@ -364,7 +445,7 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
 
 
 def _fold(
-    groups: list[_Group], seen: _Seen, keys: Sequence[str], go_on: Callable[[], None]
+    groups: Sequence[_Group], seen: _Seen, keys: Sequence[str], go_on: Callable[[], None]
 ) -> None:
     """Removes stays that are other things under a wrong name, or the noise around one."""
     every = [(group, stay) for group in groups for stay in group.stays]
@@ -374,21 +455,22 @@ def _fold(
         go_on()
         group, stay = every[nth]
         best, most = None, 0
-        for other, hosted in hosts.of(nth, gone):
+        for other, hosted in hosts.of(nth):
             host_group, host = every[other]
             share = _HALO_SHARE if host_group is group else _SMALL_SHARE
             few = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
-            if (few or stay.count <= hosted * share) and hosted > most:
+            if other not in gone and (few or stay.count <= hosted * share) and hosted > most:
                 best, most = other, hosted
         if best is not None:
             gone.add(nth)
             host_group, host = every[best]
             if host_group is not group:
-                for name, count in stay.spellings.items():
-                    host.also[name] = host.also.get(name, 0) + count
+                host.also += stay.spellings
     for group in groups:
-        kept = {id(stay) for nth, (_, stay) in enumerate(every) if nth not in gone}
-        group.stays = [each for each in group.stays if id(each) in kept and not each.weak]
+        group.stays = []
+    for nth, (group, stay) in enumerate(every):
+        if nth not in gone and not stay.weak:
+            group.stays.append(stay)
 
 
 class _Hosts:
@@ -397,90 +479,48 @@ class _Hosts:
     def __init__(
         self, every: Sequence[tuple[_Group, PlacedStay]], seen: _Seen, keys: Sequence[str]
     ) -> None:
-        self._every = every
-        self._near = _NearStays([stay for _, stay in every])
-        self._often = [_SeenDuring(seen, stay) for _, stay in every]
-        self._beside = _BesideCounts(seen.sights, keys)
+        self._every, self._seen, self._keys = every, seen, keys
+        self._beside = _by_spot(seen.sights.beside, seen.sights)
+        columns = [
+            (stay.x, stay.y, stay.first, stay.last, group.epoch, stay.weak) for group, stay in every
+        ]
+        table = np.array(columns, np.float64).reshape(-1, 6)
+        self._order = np.argsort(table[:, 0], kind="stable")
+        self._columns = table[self._order].T
 
-    def of(self, nth: int, gone: Container[int]) -> Iterator[tuple[int, int]]:
+    def of(self, nth: int) -> Iterator[tuple[int, int]]:
         """Yields their numbers, in order, and how often each was seen in the bags of the stay."""
         group, stay = self._every[nth]
-        beside: dict[str, int] | None = None
-        for other, away in self._near.of(stay):
+        start, stop = np.searchsorted(self._columns[0], (stay.x - _HALO_MM, stay.x + _HALO_MM))
+        x, y, first, last, epoch, weak = self._columns[:, start:stop]
+        away = np.hypot(x - stay.x, y - stay.y)
+        near = (away <= _HALO_MM) & (first <= stay.last) & (last >= stay.first)
+        near &= (epoch == group.epoch) & (weak == 0)
+        beside: Counter[str] | None = None
+        found = zip(self._order[start:stop][near].tolist(), away[near].tolist(), strict=True)
+        for other, metres in sorted(found):
             host_group, host = self._every[other]
-            if other == nth or other in gone or host.weak or host_group.epoch != group.epoch:
+            if other == nth:
                 continue
             if host_group is not group:
-                if away > _SAME_PLACE_MM:
+                if metres > _SAME_PLACE_MM:
                     continue
-                beside = self._beside.of(stay) if beside is None else beside
-                if beside.get(host_group.key, 0) >= _BESIDE_SHARE * stay.count:
+                beside = self._beside_of(stay) if beside is None else beside
+                if beside[host_group.key] >= _BESIDE_SHARE * stay.count:
                     continue
-            yield other, self._often[other].during(stay.stay)
+            yield other, self._seen_during(host, stay.stay)
 
-
-class _NearStays:
-    """Finds stays near others, in squares as wide as what is near."""
-
-    def __init__(self, stays: Sequence[PlacedStay]) -> None:
-        self._x = np.array([stay.x for stay in stays])
-        self._y = np.array([stay.y for stay in stays])
-        self._first = np.array([stay.first for stay in stays])
-        self._last = np.array([stay.last for stay in stays])
-        squares: dict[tuple[int, int], list[int]] = {}
-        for nth, stay in enumerate(stays):
-            squares.setdefault(self._square(stay), []).append(nth)
-        self._squares = {square: np.array(inside) for square, inside in squares.items()}
-
-    def _square(self, stay: PlacedStay) -> tuple[int, int]:
-        return math.floor(stay.x / _HALO_MM), math.floor(stay.y / _HALO_MM)
-
-    def of(self, stay: PlacedStay) -> Iterator[tuple[int, float]]:
-        """Yields which stays are near one while it lasts, in order, and how far (mm)."""
-        column, row = self._square(stay)
-        around = [(column + dx, row + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
-        parts = [self._squares[each] for each in around if each in self._squares]
-        some = np.sort(np.concatenate(parts))
-        some = some[(self._first[some] <= stay.last) & (self._last[some] >= stay.first)]
-        away = np.hypot(self._x[some] - stay.x, self._y[some] - stay.y)
-        near = away <= _HALO_MM
-        yield from zip(some[near].tolist(), away[near].tolist(), strict=True)
-
-
-class _BesideCounts:
-    """How often a stay's detections had other labels beside them in the same message."""
-
-    def __init__(self, sights: Sights, keys: Sequence[str]) -> None:
-        table = sights.beside
-        self._rows = table[np.argsort(table[:, Beside.SPOT], kind="stable")]
-        self._starts = np.searchsorted(self._rows[:, Beside.SPOT], np.arange(len(sights.spots) + 1))
-        self._keys = keys
-
-    def of(self, stay: PlacedStay) -> dict[str, int]:
-        """Returns how often, by the key of the label."""
-        starts = self._starts[stay.spots]
-        rows = self._rows[in_ranges(starts, self._starts[stay.spots + 1] - starts)]
-        counts: dict[str, int] = {}
-        for _, label, n in rows.tolist():
-            key = self._keys[label]
-            counts[key] = counts.get(key, 0) + n
+    def _beside_of(self, stay: PlacedStay) -> Counter[str]:
+        """Returns how often its detections had other labels beside them, by the key of these."""
+        counts: Counter[str] = Counter()
+        for _, label, n in _rows_of(stay.spots, *self._beside).tolist():
+            counts[self._keys[label]] += n
         return counts
 
-
-class _SeenDuring:
-    """How often a stay was seen in some bags."""
-
-    def __init__(self, seen: _Seen, stay: PlacedStay) -> None:
-        bags = seen.sights.spots[stay.spots, Spot.BAG]
-        order = np.argsort(bags, kind="stable")
-        self._bags: list[int] = bags[order].tolist()
-        self._counts: list[int] = [0, *np.cumsum(seen.counts[stay.spots][order]).tolist()]
-
-    def during(self, stay: Stay) -> int:
-        """Returns how often in the bags of another one."""
-        begin = bisect_left(self._bags, stay.first_bag)
-        end = bisect_right(self._bags, stay.last_bag)
-        return self._counts[end] - self._counts[begin]
+    def _seen_during(self, host: PlacedStay, stay: Stay) -> int:
+        bags = self._seen.sights.spots[host.spots, Spot.BAG]
+        start, stop = np.searchsorted(bags, (stay.first_bag, stay.last_bag + 1))
+        return int(self._seen.counts[host.spots[start:stop]].sum())
 
 
 def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instance]:
@@ -490,7 +530,7 @@ def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instanc
     that is known to be moved, a place that was not looked at may have been left, too.
     """
     instances = _chained(group, group.stays, proven=True)
-    if any(_is_moved(each) for each in instances):
+    if any(_is_far(each.stays[0], stay) for each in instances for stay in each.stays):
         unproven = _chained(group, group.stays, proven=False)
         split = _chained(group, _split(group.stays, seen, go_on), proven=False)
         instances = min(instances, unproven, split, key=len)
@@ -502,30 +542,27 @@ def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instanc
 def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> list[Instance]:
     instances: list[Instance] = []
     for stay in sorted(stays, key=lambda each: each.firm_first):
-        candidates = [
-            each
-            for each in instances
-            if (each.stays[-1].left is not None or not proven)
-            and each.stays[-1].firm_last <= stay.firm_first
+        ended = [
+            (last.place == stay.place, is_left, last.last, -nth)
+            for nth, each in enumerate(instances)
+            for last in (each.stays[-1],)
+            for is_left in (last.left is not None or _was_moved_a_little(last, stay),)
+            if (is_left or not proven) and last.firm_last <= stay.firm_first
         ]
-        best = max(
-            candidates,
-            key=lambda each: (
-                each.stays[-1].place == stay.place,
-                each.stays[-1].left is not None,
-                each.stays[-1].last,
-            ),
-            default=None,
-        )
-        if best is None:
-            instances.append(Instance(group.key, group.epoch, [stay]))
+        if ended:
+            instances[-max(ended)[-1]].stays.append(stay)
         else:
-            best.stays.append(stay)
+            instances.append(Instance(group.key, group.epoch, [stay]))
     return instances
 
 
-def _is_moved(instance: Instance) -> bool:
-    return len({each.place for each in instance.stays}) > 1
+def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
+    return math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
+
+
+def _was_moved_a_little(last: PlacedStay, stay: PlacedStay) -> bool:
+    """Whether one stay follows another so near that two things would have been seen together."""
+    return last.last <= stay.first and not _is_far(last, stay)
 
 
 def _split(stays: Sequence[PlacedStay], seen: _Seen, go_on: Callable[[], None]) -> list[PlacedStay]:
@@ -556,10 +593,9 @@ def _split_at(stay: PlacedStay, others: Sequence[tuple[Ns, Ns]], seen: _Seen) ->
             cuts.add(int(after.argmax()))
     if not cuts:
         return [stay]
-    return [
-        _placed(seen, stay.place, stay.stay._replace(firm_first=-1, firm_last=-1), part)
-        for part in np.split(order, sorted(cuts))
-    ]
+    whole = stay.stay._replace(firm_first=-1, firm_last=-1)
+    parts = np.split(order, sorted(cuts))
+    return [_placed(seen, stay.place, whole, part) for part in parts]
 
 
 def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
@@ -580,6 +616,24 @@ def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
     return found
 
 
+def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None:
+    """Adds what was seen while localisation was poor to the things that it may have been."""
+    for row in np.setdiff1d(group.rows, seen.firm(group.rows)).tolist():
+        spot, n = seen.sights.spots[row], int(seen.counts[row])
+        here = [
+            (math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]), nth)
+            for nth, each in enumerate(instances)
+            for stay in [stay for stay in each.stays if stay.first <= spot[Spot.LAST]][-1:]
+        ]
+        away, nth = min(here, default=(math.inf, 0))
+        if away <= GATE_MM:
+            stay = [stay for stay in instances[nth].stays if stay.first <= spot[Spot.LAST]][-1]
+            stay.spots = np.sort(np.append(stay.spots, row))
+            stay.last = max(stay.last, int(spot[Spot.LAST]))
+            stay.count += n
+            stay.spellings[seen.sights.labels[spot[Spot.LABEL]]] += n
+
+
 def most_at_once(spots: Ints) -> int:
     """Returns how many of a label were seen at once; one message in a hundred may have a false one.
 
@@ -589,16 +643,10 @@ def most_at_once(spots: Ints) -> int:
     return max(1, int(together[-max(1, len(together) // 100)]))
 
 
-def _is_named_mover(key: str) -> bool:
-    return key.rpartition(" ")[2] in _MOVES_BY_ITSELF
-
-
 def _moves_by_itself(group: _Group, linked: Sequence[Instance]) -> bool:
-    if _is_named_mover(group.key):
-        return True
     moves = len(group.stays) - len(linked)
-    bags = len(group.rows)
-    return moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * bags
+    is_restless = moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * len(group.rows)
+    return is_restless or moves_by_itself(group.key)
 
 
 def _is_seen(group: _Group, seen: _Seen) -> bool:
@@ -609,9 +657,13 @@ def _is_seen(group: _Group, seen: _Seen) -> bool:
 
 def _names(sights: Sights, labels: Labels) -> dict[str, str]:
     counts: dict[str, dict[str, int]] = {}
-    spots = sights.spots
-    of_label = np.bincount(spots[:, Spot.LABEL], spots[:, Spot.N], len(sights.labels))
+    of_label = np.zeros(len(sights.labels), np.int64)
+    for table in (
+        sights.spots[:, [Spot.LABEL, Spot.N]],
+        sights.unplaced[:, [Unplaced.LABEL, Unplaced.N]],
+    ):
+        np.add.at(of_label, table[:, 0], table[:, 1])
     for name, n in zip(sights.labels, of_label.tolist(), strict=True):
         if n:
-            counts.setdefault(labels.key(name), {})[name] = int(n)
+            counts.setdefault(labels.key(name), {})[name] = n
     return {key: labels.name(key, each) for key, each in counts.items()}

@@ -9,7 +9,6 @@ there are too many sightings: a detector that sees things everywhere has thousan
 from __future__ import annotations
 
 import time
-from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import accumulate
 from threading import Lock
@@ -30,6 +29,7 @@ from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.places.map_digests import MapDigests
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things.instances import Estimate, estimate
 from ros2_memory.things.labels import Labels
 
@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
 
-_MADE: Final = 1024
+_MADE_BYTES: Final = 4 << 20
+_ENTRY_BYTES: Final = 1_000
 _ESTIMATES: Final = 4
 _MOST_SPOTS: Final = 300_000
 """Places of a label in a bag that are looked at together: a home robot has 50,000 in a week."""
@@ -87,45 +88,14 @@ class _Made:
     """The sights that were made from bags last, and the estimates. Thread-safe."""
 
     def __init__(self) -> None:
+        self.sights = ByteLru[bytes](_MADE_BYTES)
+        self.most_spots = ByteLru[int](_ESTIMATES)
+        self._estimates: WeakKeyDictionary[Timeline, ByteLru[KnownThings]] = WeakKeyDictionary()
         self._lock = Lock()
-        self._sights: OrderedDict[tuple[object, ...], bytes] = OrderedDict()
-        self._estimates: WeakKeyDictionary[
-            Timeline, OrderedDict[tuple[object, ...], KnownThings]
-        ] = WeakKeyDictionary()
-        self._most_spots: dict[tuple[object, ...], int] = {}
 
-    def most_spots(self, key: tuple[object, ...]) -> int:
+    def estimates(self, timeline: Timeline) -> ByteLru[KnownThings]:
         with self._lock:
-            return self._most_spots.get(key, _MOST_SPOTS)
-
-    def put_most_spots(self, key: tuple[object, ...], most: int) -> None:
-        with self._lock:
-            self._most_spots[key] = most
-
-    def sights(self, key: tuple[object, ...]) -> bytes | None:
-        with self._lock:
-            found = self._sights.get(key)
-            if found is not None:
-                self._sights.move_to_end(key)
-            return found
-
-    def put_sights(self, key: tuple[object, ...], sights: bytes) -> None:
-        with self._lock:
-            self._sights[key] = sights
-            if len(self._sights) > _MADE:
-                self._sights.popitem(last=False)
-
-    def estimate(self, timeline: Timeline, key: tuple[object, ...]) -> KnownThings | None:
-        with self._lock:
-            of_timeline = self._estimates.get(timeline)
-            return None if of_timeline is None else of_timeline.get(key)
-
-    def put_estimate(self, timeline: Timeline, key: tuple[object, ...], known: KnownThings) -> None:
-        with self._lock:
-            of_timeline = self._estimates.setdefault(timeline, OrderedDict())
-            of_timeline[key] = known
-            if len(of_timeline) > _ESTIMATES:
-                of_timeline.popitem(last=False)
+            return self._estimates.setdefault(timeline, ByteLru(_ESTIMATES))
 
 
 _CACHE: Final = _Made()
@@ -142,14 +112,15 @@ def known_things(
     timeline = view.snapshot.timeline
     described = tuple(sorted((name, tuple(each)) for name, each in spellings.items()))
     key = (min_score, described, view.memory.limits.map_frame, id(view.memory.reader))
-    known = _CACHE.estimate(timeline, key)
+    estimates = _CACHE.estimates(timeline)
+    known = estimates.get(key)
     if known is None:
         before = view.notes.added
         known = _Loader(view).load(min_score, Labels(spellings), (id(view.memory.index), *key))
         active = any(bag.state is BagState.ACTIVE for bag in view.snapshot.bags)
         is_read = known.since is None or known.crowded
         if is_read and not active and view.notes.added == before:
-            _CACHE.put_estimate(timeline, key, known)
+            estimates.put(key, known, 1)
     if known.crowded and known.since is not None:
         view.notes.complete = False
         view.notes.add(
@@ -174,7 +145,7 @@ class _Loader:
 
     def load(self, min_score: float, labels: Labels, key: tuple[object, ...]) -> KnownThings:
         """Returns the things in all that could be read, and compared in time."""
-        most = _CACHE.most_spots(key)
+        most = _CACHE.most_spots.get(key) or _MOST_SPOTS
         parts, crowded = self._newest(most)
         if self._since is not None:
             self._view.notes.complete = False
@@ -188,12 +159,12 @@ class _Loader:
                 found = self._known(parts, min_score, labels, crowded=crowded)
             except _TakesTooLongError:
                 most = max(sum(len(part.sights.spots) for part in parts) // _FEWER, 1)
-                _CACHE.put_most_spots(key, most)
+                _CACHE.most_spots.put(key, most, 1)
                 parts, crowded = _within(parts, most), True
             else:
                 # It may have been the machine that was slow for a while.
                 if most < _MOST_SPOTS and time.monotonic() - begun_s < _ESTIMATING_S / _QUICK:
-                    _CACHE.put_most_spots(key, min(2 * most, _MOST_SPOTS))
+                    _CACHE.most_spots.put(key, min(2 * most, _MOST_SPOTS), 1)
                 return found
 
     def _newest(self, most: int) -> tuple[list[_Part], bool]:
@@ -234,7 +205,9 @@ class _Loader:
         since = self._since
         if crowded:
             since = max(bags[0].start, MIN_NS if since is None else since)
-        return KnownThings(found, labels, names, since, 0 in epochs, crowded)
+        return KnownThings(
+            found, labels, names, since, bool(sights.topics) and 0 in epochs, crowded
+        )
 
     def _part(self, segment: Segment) -> _Part:
         digests = self._view.bags.digests_of(segment)
@@ -281,7 +254,7 @@ class _Loader:
         memory = self._view.memory
         stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
         key = (*stat, self._maps.statics.of(bag).key, memory.limits.map_frame, id(memory.reader))
-        known = _CACHE.sights(key)
+        known = _CACHE.sights.get(key)
         if known is not None:
             return known
         if self._reading is None:
@@ -294,7 +267,7 @@ class _Loader:
         except QueryTimeoutError:
             return None
         if bag.state is not BagState.ACTIVE and self._view.notes.added == before:
-            _CACHE.put_sights(key, digest.sights)
+            _CACHE.sights.put(key, digest.sights, len(digest.sights) + _ENTRY_BYTES)
         return digest.sights
 
     def _epochs(

@@ -30,6 +30,22 @@ _IRREGULAR: Final = {
     "wolves": "wolf",
     "bookshelves": "bookshelf",
 }
+_MOVES_BY_ITSELF: Final = frozenset(
+    {
+        "person",
+        "human",
+        "pedestrian",
+        "man",
+        "woman",
+        "child",
+        "boy",
+        "girl",
+        "baby",
+        "dog",
+        "cat",
+        "pet",
+    }
+)
 _NO_PLURALS: Final = ("ss", "us", "is", "as", "os")
 _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
@@ -43,6 +59,16 @@ def singular(name: str) -> str:
     """Returns a plain name with its last word in the singular, as far as simple rules know it."""
     before, space, word = name.rpartition(" ")
     return before + space + _singular(word)
+
+
+def last_word(key: str) -> str:
+    """Returns what a key is a kind of: "mug" of "coffee mug"."""
+    return key.rpartition(" ")[2]
+
+
+def moves_by_itself(key: str) -> bool:
+    """Whether a key names people or pets."""
+    return last_word(key) in _MOVES_BY_ITSELF
 
 
 def _singular(word: str) -> str:
@@ -79,6 +105,10 @@ class Labels:
         """Returns the key of a label."""
         own = singular(plain(label))
         return self._keys.get(own, own)
+
+    def are_apart(self, one: str, other: str) -> bool:
+        """Whether the owner declared two keys as different things."""
+        return one in self._shown and other in self._shown
 
     def name(self, key: str, counts: Mapping[str, int]) -> str:
         """Returns the name to show for a key: declared, or the plain label seen most often."""

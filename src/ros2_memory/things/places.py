@@ -26,7 +26,8 @@ _PEAK_MM: Final = 300
 """Spots this near to each other make a peak."""
 _CLAIM_MM: Final = 600
 """Spots this near to a place are of it before another place is looked for."""
-_GATE_MM: Final = 900
+GATE_MM: Final = 900
+"""What was seen farther from a place is not of it."""
 _HALO_MM: Final = 950
 _HALO_SHARE: Final = 0.1
 """A peak this near to another one, and lighter than this share of it, is its noise."""
@@ -39,18 +40,18 @@ _FULL_WEIGHT: Final = 10
 """A spot of more detections weighs no more: all of one bag share its error of localisation."""
 
 
-def places_of(x: Ints, y: Ints, n: Ints) -> tuple[Ints, Floats]:
-    """Returns the place of each spot (-1: of none), and the places' x and y (mm) as rows."""
+def places_of(x: Ints, y: Ints, n: Ints) -> Ints:
+    """Returns the number of the place of each spot (mm); -1 of none."""
     weight = np.minimum(n, _FULL_WEIGHT).astype(np.float64)
     cells, cell_of = distinct_rows((x // _CELL_MM, y // _CELL_MM))
     mass = np.bincount(cell_of, weight).astype(np.float64)
     centre = np.stack([np.bincount(cell_of, weight * each) / mass for each in (x, y)], axis=1)
     peaks = _peaks(cells, centre, mass)
     if not len(peaks):
-        return np.full(len(x), -1, np.int64), peaks
+        return np.full(len(x), -1, np.int64)
     place, away = _nearest(np.stack((x, y), axis=1).astype(np.float64), peaks)
-    place[away > _GATE_MM**2] = -1
-    return place, _means(place, x, y, weight, peaks)
+    place[away > GATE_MM**2] = -1
+    return place
 
 
 def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
@@ -141,15 +142,3 @@ def _nearest(points: Floats, peaks: Floats) -> tuple[Ints, Floats]:
         nearest[closer] = nth
         least[closer] = away[closer]
     return nearest, least
-
-
-def _means(place: Ints, x: Ints, y: Ints, weight: Floats, peaks: Floats) -> Floats:
-    """Returns the mean of each place's spots; its peak where it has none."""
-    inside = place >= 0
-    mass = np.bincount(place[inside], weight[inside], len(peaks))
-    means = peaks.copy()
-    has = mass > 0
-    for column, values in enumerate((x, y)):
-        sums = np.bincount(place[inside], (weight * values)[inside], len(peaks))
-        means[has, column] = sums[has] / mass[has]
-    return means

@@ -19,8 +19,6 @@ from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Look
 from ros2_memory.things.places import distinct_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.sights import Ints, Sights
@@ -60,9 +58,10 @@ class Cells:
     Args:
         sights: of all bags, in order of time.
         epoch: by bag, which odometry its poses are in; the same for all that are in a map.
+        poor: which looks are not where they seem to be; those say nothing of others.
     """
 
-    def __init__(self, sights: Sights, epoch: Ints) -> None:
+    def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
         looks = sights.looks
         # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.bag, self.n, self.first, self.last, self.topic = (
@@ -74,7 +73,7 @@ class Cells:
         self.yaw = looks[:, Look.YAW] / 10.0
         _, self.cell = distinct_rows(
             (
-                self.topic,
+                self.topic + poor * (len(sights.topics) + 1),
                 epoch[self.bag],
                 looks[:, Look.X] // CELL_MM,
                 looks[:, Look.Y] // CELL_MM,
@@ -130,10 +129,8 @@ class FieldOfView:
 
     def covers(self, away: Floats, bearing: Floats) -> Flags:
         """Returns which of some places lie inside."""
-        inside: Flags = (
-            (away <= self.most_mm) & (bearing >= self.least_deg) & (bearing <= self.most_deg)
-        )
-        return inside
+        inside: Flags = (bearing >= self.least_deg) & (bearing <= self.most_deg)
+        return inside & (away <= self.most_mm)
 
 
 def field_of_view(away: Floats, bearing: Floats, n: Ints) -> FieldOfView:
@@ -167,7 +164,7 @@ class Evidence(NamedTuple):
         looks: their numbers, in order of time.
         cell: of each look, numbered from 0 within the place.
         hits: how many messages of each of these looks have the label there.
-        blind: hits of messages without a known pose, by bag.
+        blind: rows of a bag and its hits of messages without a known pose.
         fair: whether a look that has no hit could have: from a cell that sees the place, and with
             the place well inside the field of view.
     """
@@ -175,7 +172,7 @@ class Evidence(NamedTuple):
     looks: Ints
     cell: Ints
     hits: Ints
-    blind: dict[int, int]
+    blind: Ints
     fair: Flags
 
 
@@ -201,16 +198,15 @@ def evidence_at(
 ) -> Evidence:
     """Returns the evidence on a place (mm) from its rows of `Hit` with `SPOT` as the bag."""
     placed = rows[:, Hit.LOOK] >= 0
-    blind: dict[int, int] = {}
-    for bag, _, n in rows[~placed].tolist():
-        blind[bag] = blind.get(bag, 0) + n
+    blind_bags, which = np.unique(rows[~placed, Hit.SPOT], return_inverse=True)
+    times = np.bincount(which, rows[~placed, Hit.N], len(blind_bags)).astype(np.int64)
     hit, which = np.unique(rows[placed, Hit.LOOK], return_inverse=True)
     hits_of = np.bincount(which, rows[placed, Hit.N], len(hit)).astype(np.int64)
     np.minimum(hits_of, cells.n[hit], out=hits_of)
     known, cell_of = np.unique(cells.cell[hit], return_inverse=True)
     sees = _sees(cells, known, cell_of, cells.n[hit], hits_of)
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
-    bags = np.unique(np.concatenate((cells.bag[hit], np.array([*blind], np.int64))))
+    bags = np.unique(np.concatenate((cells.bag[hit], blind_bags)))
     beside = cells.looks_during(bags)
     beside = beside[np.isin(cells.cell[beside], known)]
     looks = np.union1d(beside, cells.looks_from(known[sees]))
@@ -224,7 +220,7 @@ def evidence_at(
     for topic, each in view.items():
         covered |= (cells.topic[seeing] == topic) & each.covers(away, bearing)
     fair[fair] = covered
-    return Evidence(looks, cell, hits, blind, fair)
+    return Evidence(looks, cell, hits, np.stack((blind_bags, times), axis=1), fair)
 
 
 def _sees(cells: Cells, known: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
@@ -252,12 +248,13 @@ def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
     bag, n = cells.bag[looks], cells.n[looks]
     hit = np.flatnonzero(evidence.hits)  # few of them all
     hits = evidence.hits[hit]
-    if not len(hit) and not evidence.blind:
+    blind, times = evidence.blind.T
+    if not len(hit) and not len(blind):
         return []
-    bags, at = _numbered(bag, evidence.blind)
+    bags = np.union1d(bag, blind)
+    at, blind = np.searchsorted(bags, bag), np.searchsorted(bags, blind)
     seen = np.bincount(at[hit], hits, len(bags))
-    for each, count in evidence.blind.items():
-        seen[int(np.searchsorted(bags, each))] += count
+    seen[blind] += times
     there = np.flatnonzero((seen > 0)[at])
     # For each cell, how often it sees the thing while that is there.
     of = np.bincount(cell[there], n[there], int(cell.max(initial=-1)) + 1)
@@ -269,15 +266,13 @@ def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
     odds[hit] = np.where(evidence.fair[hit], own, own.clip(_LEAST_BLIND))
     again = cells.repeated_misses(looks, evidence.hits)
     np.multiply(odds, _STANDING, out=odds, where=again)
-    by_bag = np.bincount(at, odds, len(bags))
+    by_bag = np.bincount(at, odds, len(bags)).astype(np.float64)
     messages = np.bincount(at[hit], n[hit], len(bags))
-    for each, count in evidence.blind.items():
-        nth = int(np.searchsorted(bags, each))
-        by_bag[nth] += 2.0 * count
-        messages[nth] += count
+    by_bag[blind] += 2.0 * times
+    messages[blind] += times
     by_bag = by_bag.clip(-_MOST_BY_BAG, _MOST_BY_BAG)
     stays = []
-    for start, stop in _present(by_bag.astype(np.float64)):
+    for start, stop in _present(by_bag):
         inside = np.flatnonzero(seen[start:stop]) + start
         clear = inside[by_bag[inside] >= _CLEAR]
         if not len(inside):
@@ -370,17 +365,6 @@ def _missed(
         if crossed is None and chance < math.log(_MISSED_BY_CHANCE):
             crossed = last
     return math.exp(chance), messages, crossed
-
-
-def _numbered(bag: Ints, blind: Iterable[int]) -> tuple[Ints, Ints]:
-    """Returns the bags of looks, which ascend, and of blind hits; and the number of each look's."""
-    more = np.array([*blind], np.int64)
-    if len(more):
-        bags = np.union1d(bag, more)
-        return bags, np.searchsorted(bags, bag)
-    fresh = np.ones(len(bag), bool)
-    fresh[1:] = bag[1:] != bag[:-1]
-    return bag[fresh], np.cumsum(fresh) - 1
 
 
 def _present(by_bag: Floats) -> list[tuple[int, int]]:

@@ -162,6 +162,8 @@ def built(
     builder = SightsBuilder()
     for topic, time, robot, seen in bag:
         builder.add(topic, time, robot, seen)
+        if robot is not None and seen:
+            builder.add_fix(time, robot, seen[0].score)
     return builder.sights()
 
 
@@ -193,6 +195,18 @@ def test_stored_bags_are_decoded_together_as_they_are_joined_one_by_one(
     assert which == [nth for nth, each in enumerate(every) if each.topics]
     assert found == joined(every[nth] for nth in which)
     assert frames == [every[nth].frame_id for nth in which]
+
+
+def test_fixes_are_numbered_by_bag_and_kept_where_no_detector_published() -> None:
+    builder = SightsBuilder()
+    builder.add_fix(3 * SECOND, (1.0, -2.0, math.pi / 2), 0.25)
+    alone = builder.sights("map")
+    assert decode_sights(encode_sights(alone)) == alone
+    both, which, frames = decode_joined(
+        [encode_sights(sights_of([mug(1.0)])), encode_sights(alone)]
+    )
+    assert both.fixes.tolist() == [[1, 3 * SECOND, 1000, -2000, 900, 250]]
+    assert (both.bags, which, frames) == (2, [0, 1], ["", "map"])
 
 
 @pytest.mark.parametrize(

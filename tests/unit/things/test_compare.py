@@ -144,6 +144,38 @@ def test_where_keeps_the_things_that_were_in_a_region_in_either_window(tmp_path:
     assert elsewhere["things"] == {}
 
 
+def test_places_are_those_of_the_two_windows(tmp_path: Path) -> None:
+    """The mug is in the kitchen, in between elsewhere, and then not looked at."""
+    messages = [
+        *looked(0, 20, HERE, MUG),
+        *looked(30, 40, HERE),
+        *looked(40, 55, AWAY, FAR_MUG),
+        *looked(60, 90, (9.0, 9.0, 0.0)),
+    ]
+    reply = compared(tmp_path / "gone", messages, where="kitchen")
+    [mug] = reply["things"]["not_seen_where_expected"]
+    assert mug["was"] == {"x": 3.0, "y": 0.5, "in": "kitchen", "last_seen": BEGIN + 19}
+    back = compared(
+        tmp_path / "back", messages, where="kitchen", start=BEGIN, end=BEGIN + 25,
+        with_start=BEGIN + 60, with_end=BEGIN + 89,
+    )  # fmt: skip
+    assert back["things"] == reply["things"]
+    # What came in between, from a place that it had before both windows, is new there.
+    fresh = [
+        *looked(0, 20, AWAY, FAR_MUG),
+        *looked(20, 30, AWAY),
+        *looked(30, 50, HERE, BOOK),
+        *looked(60, 90, HERE, BOOK, MUG),
+    ]
+    window = {"with_start": BEGIN + 30, "with_end": BEGIN + 50}
+    reply = compared(tmp_path / "fresh", fresh, where="kitchen", **window)
+    [mug] = reply["things"]["appeared"]
+    assert mug == {
+        "label": "mug",
+        "is": {"x": 3.0, "y": 0.5, "in": "kitchen", "first_seen": BEGIN + 60},
+    }
+
+
 def test_way_minutes_and_errors_are_listed_where_they_differ(tmp_path: Path) -> None:
     drive = [
         message for at in range(60, 90) for message in scene(at, (1.0 + (at - 60) * 0.5, 0, 0), [])

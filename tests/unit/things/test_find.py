@@ -53,11 +53,16 @@ def scene(
     *,
     in_map: bool = True,
     score: float = 0.9,
+    map_off: float = 0.0,
 ) -> list[Msg]:
-    """All messages of one moment: the robot at a pose in the map, and what it detects."""
+    """All messages of one moment: the robot at a pose in the map, and what it detects.
+
+    `map_off` is how far (m, along y) the map has moved under odometry.
+    """
     at = BEGIN * S + round(at_s * S)
     x, y, yaw = robot
     ox, oy, turn = OFF if in_map else (0.0, 0.0, 0.0)
+    oy += map_off
     cos, sin = math.cos(-turn), math.sin(-turn)
     px, py = (x - ox) * cos - (y - oy) * sin, (x - ox) * sin + (y - oy) * cos
     messages = [odom(at, px, py, yaw - turn), tf(at, base(at, px, py, yaw - turn))]
@@ -289,6 +294,91 @@ def test_several_labels_are_asked_for_at_once(tmp_path: Path) -> None:
     assert note.startswith('"keys": no detector reported "keys"')
     assert ask(tmp_path, label='["mug", "book"]')["total"] == 2
     assert ask(tmp_path, label=["mug"]) == ask(tmp_path, label="mug")
+
+
+def alternating(*labels: str, y: float = 0.5) -> list[Msg]:
+    """A thing that each message names otherwise, with 5 cm of noise."""
+    draw = Random(1)
+    return [
+        message
+        for at in range(40)
+        for message in scene(
+            at,
+            HERE,
+            [(labels[at % len(labels)], 3.0 + draw.gauss(0, 0.05), y + draw.gauss(0, 0.05))],
+        )
+    ]
+
+
+PLAIN = QuerySettings()
+
+
+@pytest.mark.parametrize(("short", "long"), [("mug", "coffee mug"), ("phone", "cell phone")])
+def test_two_labels_that_a_detector_gives_to_one_thing_are_one_row(
+    tmp_path: Path, short: str, long: str
+) -> None:
+    write(tmp_path, alternating(short, long, short) + looked(40, 50, AWAY))
+    for label in (short, long, None):
+        reply = ask(tmp_path, PLAIN, **({} if label is None else {"label": label}))
+        [thing] = reply["things"]
+        assert (thing["label"], thing["labels"]) == (short, {short: 27, long: 13})
+        assert (thing["count"], thing["still_there"]) == (40, {"not_looked_at_since": BEGIN + 39})
+        assert not thing.keys() & {"also_seen_as", "misread_as"}
+        assert (reply["labels"], "notes" in reply) == ({short: 1}, False)
+
+
+def test_labels_that_the_owner_lists_apart_are_two_things(tmp_path: Path) -> None:
+    write(tmp_path, alternating("mug", "coffee mug"))
+    apart = QuerySettings(labels={"mug": [], "coffee mug": []})
+    assert ask(tmp_path, apart)["labels"] == {"coffee mug": 1, "mug": 1}
+
+
+@pytest.mark.parametrize("other", ["dog bed", "mugshot", "cup"])
+def test_labels_that_end_in_another_word_are_two_things(tmp_path: Path, other: str) -> None:
+    write(tmp_path, alternating("coffee mug", other))
+    assert ask(tmp_path, PLAIN)["labels"] == dict.fromkeys(sorted(["coffee mug", other]), 1)
+
+
+def test_labels_that_one_message_has_both_of_are_two_things(tmp_path: Path) -> None:
+    both = [("mug", 3.0, 0.5), ("coffee mug", 3.1, 0.5)]
+    write(tmp_path, looked(0, 20, HERE, *both) + looked(20, 30, HERE, both[0]))
+    assert ask(tmp_path, PLAIN)["labels"] == {"coffee mug": 1, "mug": 1}
+
+
+def test_a_thing_that_another_took_the_place_of_is_another_thing(tmp_path: Path) -> None:
+    mug, other = ("mug", 3.0, 0.5), ("coffee mug", 3.0, 0.5)
+    write(tmp_path, looked(0, 30, HERE, mug) + looked(30, 60, HERE, other))
+    assert ask(tmp_path, PLAIN)["labels"] == {"coffee mug": 1, "mug": 1}
+
+
+def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -> None:
+    messages = [
+        message for at in range(20) for message in scene(at, HERE, [("mug", 3.0, 0.5)], score=0.3)
+    ]
+    write(tmp_path, messages + looked(20, 40, HERE, ("cup", 3.0, 0.5)))
+    strict = QuerySettings(min_score=0.5)
+    reply = ask(tmp_path, strict)
+    assert reply["labels"] == {"cup": 1}
+    limit = "detected only below min_score 0.5 (data.min_score): mug (20 times)"
+    assert reply["notes"] == [limit]
+    [note] = ask(tmp_path, strict, label="mug")["notes"]
+    assert note == (
+        "it was detected 20 times below min_score 0.5 (data.min_score), which does not count"
+    )
+    [note] = ask(tmp_path, label="mug", min_score=0.4)["notes"]
+    assert note == "it was detected 20 times below min_score 0.4, which does not count"
+
+
+def test_labels_without_a_place_are_named(tmp_path: Path) -> None:
+    at = BEGIN * S
+    lost = [detections(at + nth * S, ["Scissors (open)"], at=(0.0, 0.0, 0.0)) for nth in range(5)]
+    write(tmp_path, lost)
+    reply = ask(tmp_path)
+    times = f"from {BEGIN}.000000 to {BEGIN + 4}.000000"
+    note = f"detected, but could not be placed: scissors (open) (5 times, {times})"
+    assert (reply["things"], reply["notes"]) == ([], [note])
+    [note] = ask(tmp_path, label="scissors")["notes"]
+    assert "did you mean scissors (open)?" in note
 
 
 def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -> None:

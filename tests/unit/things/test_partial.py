@@ -14,6 +14,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call
 from ros2_memory.index import timeline
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
 from tests.support.memories import memory_of, recalling
@@ -124,7 +125,7 @@ def test_where_comparing_takes_too_long_fewer_are_compared_from_then_on(
 def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     crowded: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(known._CACHE, "put_estimate", lambda *_: None)
+    monkeypatch.setattr(known._CACHE, "estimates", lambda _: ByteLru(0))
     monkeypatch.setattr(known, "_FEWER", 100)
     monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
     labels_and_notes(crowded, Deadline.after(60))

@@ -1,0 +1,108 @@
+"""Which labels a detector uses for one thing in turn: "mug" and "coffee mug", at one place.
+
+They end in the same word, lie within the scatter of each other, alternate within a visit, and are
+not in one message there. Names that the owner declares apart stay apart.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import combinations
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.sights import Beside, Spot
+from ros2_memory.things.labels import last_word, moves_by_itself
+from ros2_memory.things.moves import visits_of
+from ros2_memory.things.places import places_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from ros2_memory.analysis.sights import Ints, Sights
+    from ros2_memory.things.labels import Labels
+
+_FEWEST: Final = 3
+_BESIDE_SHARE: Final = 0.02
+"""One message in fifty may have a thing twice."""
+_LEAST_SHARE: Final = 0.05
+"""A label that is given more rarely is a mistake."""
+_SAME_MM: Final = 100.0
+_SCATTERS: Final = 2.0
+
+
+def with_synonyms(
+    sights: Sights,
+    counts: Ints,
+    group: Ints,
+    labels: Labels,
+    go_on: Callable[[], None],
+) -> list[str]:
+    """Returns the keys of the labels of sights, one for all that are names of one thing.
+
+    `group` has the epoch of each spot, and `counts` how many of its detections count.
+    """
+    keys = [labels.key(each) for each in sights.labels]
+    by_word: dict[str, list[str]] = defaultdict(list)
+    for key in sorted(set(keys)):
+        if not moves_by_itself(key):
+            by_word[last_word(key)].append(key)
+    known = {key: key for key in keys}
+    for one, other in (pair for some in by_word.values() for pair in combinations(some, 2)):
+        if labels.are_apart(one, other) or known[one] == known[other]:
+            continue
+        go_on()
+        of = [np.array([key == each for key in keys]) for each in (one, other)]
+        if not _are_beside(sights, *of) and _alternate(sights.spots, counts, group, of):
+            gone = known[other]
+            known.update({key: known[one] for key, root in known.items() if root == gone})
+    return [known[key] for key in keys]
+
+
+def _are_beside(sights: Sights, one: Ints, other: Ints) -> bool:
+    """Whether messages have both of two labels at one place, more often than by mistake."""
+    of = sights.spots[:, Spot.LABEL]
+    beside = sights.beside
+    both = one[of[beside[:, Beside.SPOT]]] & other[beside[:, Beside.LABEL]]
+    least = min(int(sights.spots[each[of], Spot.N].sum()) for each in (one, other))
+    return bool(beside[both, Beside.N].sum() > _BESIDE_SHARE * least)
+
+
+def _alternate(every: Ints, counts: Ints, group: Ints, of: Sequence[Ints]) -> bool:
+    """Whether two labels take turns at some place, within the scatter of each other."""
+    mine = np.flatnonzero((of[0] | of[1])[every[:, Spot.LABEL]] & (counts > 0))
+    for epoch in np.unique(group[mine]).tolist():
+        rows = mine[group[mine] == epoch]
+        spots, n = every[rows], counts[rows]
+        place = places_of(spots[:, Spot.X], spots[:, Spot.Y], n)
+        for nth in range(int(place.max(initial=-1)) + 1):
+            here = place == nth
+            which = of[1][spots[here, Spot.LABEL]].astype(np.int64)
+            if which.any() and not which.all():
+                rarer, total = _turns(spots[here], n[here], which)
+                if rarer >= max(_FEWEST, _LEAST_SHARE * total):
+                    return True
+    return False
+
+
+def _turns(spots: Ints, n: Ints, which: Ints) -> tuple[int, int]:
+    """Returns how often the rarer of two labels was seen in visits with turns, and both."""
+    visit = visits_of(spots[:, Spot.FIRST], spots[:, Spot.LAST])
+    at, size = 2 * visit + which, 2 * int(visit[-1]) + 2
+    seen = np.bincount(at, n, size)
+    means = [
+        np.bincount(at, n * spots[:, column], size) / np.maximum(seen, 1)
+        for column in (Spot.X, Spot.Y)
+    ]
+    apart = np.hypot(*(np.diff(each.reshape(-1, 2))[:, 0] for each in means))
+    squares = np.bincount(visit, n * spots[:, Spot.DEV] ** 2)
+    scatter = np.sqrt(squares / np.bincount(visit, n))
+    first, last = np.full(size, np.iinfo(np.int64).max), np.zeros(size, np.int64)
+    np.minimum.at(first, at, spots[:, Spot.FIRST])
+    np.maximum.at(last, at, spots[:, Spot.LAST])
+    begin, end = first.reshape(-1, 2), last.reshape(-1, 2)
+    in_turn = (begin[:, 0] < end[:, 1]) & (begin[:, 1] < end[:, 0])
+    in_turn &= apart <= np.maximum(_SAME_MM, _SCATTERS * scatter)
+    turns = seen.reshape(-1, 2)[in_turn].sum(axis=0)
+    return int(turns.min()), int(turns.sum())

@@ -1,0 +1,199 @@
+"""What a list of things leaves out, in sentences: silent detectors, and detections without a thing.
+
+Those are too few, score too low, or could not be placed.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.sights import Look, Spot, Unplaced
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import abbreviate, counted, listed
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.history.coverage import unix_text
+from ros2_memory.insights.silences import describe_silences
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+
+    from ros2_memory.analysis.sights import Ints
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.view import View
+    from ros2_memory.things.known import KnownThings
+
+_MOST_NAMED: Final = 5
+
+
+class Asked(NamedTuple):
+    """A question about things.
+
+    Attributes:
+        labels: those that were asked for, by key; all where there are none.
+        found: the keys of things that were found; `vague` the labels of those that were seen last
+            while localisation was poor.
+        inside: says how things were asked for.
+        min_score: names the limit of scores, and where it is from.
+    """
+
+    labels: Mapping[str, str]
+    found: Collection[str]
+    vague: Collection[str]
+    window: TimeWindow
+    inside: str
+    min_score: str
+
+
+class _Detected(NamedTuple):
+    """How often a label was detected: as counts, with too low scores, and without a place.
+
+    `first` and `last` are of those without a place.
+    """
+
+    name: str
+    counted: int
+    low: int
+    unplaced: int
+    first: Ns
+    last: Ns
+
+
+def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
+    """Yields what the things that were found do not say."""
+    sights = known.estimate.sights
+    if not asked.found:
+        yield from _silences(view, known, asked.window)
+    if len(known.frames) > 1 + bool(known.frames[0]):
+        yield (
+            "without a map, each run of odometry has its own coordinates: a thing may be listed "
+            "once for each run"
+        )
+    if not sights.topics and known.since is None:
+        yield (
+            "no things are known: there is no message of a detector "
+            "(a type such as vision_msgs/msg/Detection3DArray); find_matches searches text"
+        )
+    yield from vague_notes(known, (asked.window,), asked.labels, asked.vague)
+    if not asked.labels:
+        others = sorted(known.estimate.names.keys() - asked.found)
+        yield from _left_out([_detected(known, key, asked.window) for key in others], asked)
+    for key, label in asked.labels.items():
+        about = f"{abbreviate(label)}: " if len(asked.labels) > 1 else ""
+        for note in _of_label(known, key, asked):
+            yield about + note
+
+
+def vague_notes(
+    known: KnownThings,
+    windows: Collection[TimeWindow],
+    keys: Collection[str] = (),
+    also: Collection[str] = (),
+) -> Iterator[str]:
+    """Yields which labels were detected last while localisation was poor, of some keys or all."""
+    estimate, spots = known.estimate, known.estimate.sights.spots
+    labels = {*also}
+    for window in windows if estimate.poor.any() else ():
+        during = _during(window, spots, Spot.FIRST, Spot.LAST)
+        during = during[estimate.counts[during] > 0]
+        for label in np.unique(spots[during, Spot.LABEL]).tolist():
+            key = known.labels.key(estimate.sights.labels[label])
+            if not keys or key in keys:
+                mine = during[spots[during, Spot.LABEL] == label]
+                labels |= {estimate.names[key]} if estimate.is_vague(mine) else set()
+    if labels:
+        yield (
+            "localisation was poor when these were detected last, which moves nothing, so that "
+            f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}"
+        )
+
+
+def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
+    """Yields why no thing may be known of a window: its detectors published nothing in it."""
+    sights = known.estimate.sights
+    tables = (
+        (sights.looks, Look.FIRST, Look.LAST),
+        (sights.spots, Spot.FIRST, Spot.LAST),
+        (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
+    )
+    if sights.topics and not any(len(_during(window, *table)) for table in tables):
+        yield (
+            f"{listed(sights.topics)} published nothing in this window: whether things were there "
+            "is not known"
+        )
+    yield from describe_silences(view, sights.topics, window)
+
+
+def _during(window: TimeWindow, table: Ints, first: int, last: int) -> Ints:
+    found: Ints = np.flatnonzero((table[:, first] < window.stop) & (table[:, last] >= window.start))
+    return found
+
+
+def _detected(known: KnownThings, key: str, window: TimeWindow) -> _Detected:
+    """Returns how often a label was detected in a window."""
+    estimate, sights = known.estimate, known.estimate.sights
+    mine = np.array([known.labels.key(each) == key for each in sights.labels], np.bool_)
+    rows = _during(window, sights.spots, Spot.FIRST, Spot.LAST)
+    rows = rows[mine[sights.spots[rows, Spot.LABEL]]]
+    lost = sights.unplaced[_during(window, sights.unplaced, Unplaced.FIRST, Unplaced.LAST)]
+    lost = lost[mine[lost[:, Unplaced.LABEL]]]
+    count = int(estimate.counts[rows].sum())
+    return _Detected(
+        estimate.names[key],
+        count,
+        int(sights.spots[rows, Spot.N].sum()) - count,
+        int(lost[:, Unplaced.N].sum()),
+        int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
+        int(lost[:, Unplaced.LAST].max(initial=0)),
+    )
+
+
+def _left_out(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
+    """Yields which labels were detected, and are no things."""
+    unplaced = [
+        f"{each.name} ({counted(each.unplaced, 'time')}, "
+        f"from {unix_text(each.first)} to {unix_text(each.last)})"
+        for each in detected
+        if each.unplaced
+    ]
+    low = [
+        f"{each.name} ({counted(each.low, 'time')})"
+        for each in detected
+        if each.low and not each.counted
+    ]
+    if unplaced:
+        yield f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}"
+    if low:
+        yield f"detected only below {asked.min_score}: {listed(low, at_most=_MOST_NAMED)}"
+
+
+def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
+    """Yields notes on a label that was asked for."""
+    names = sorted({*known.estimate.names.values()})
+    if key not in known.estimate.names:
+        close = [each for each in names if key in each or each in key]
+        close += difflib.get_close_matches(key, names, 3)
+        shown = [*dict.fromkeys(close)] or names
+        meant = f"; did you mean {close[0]}?" if close else ""
+        label = abbreviate(asked.labels[key])
+        if names:
+            yield f"no detector reported {label}; there are: {listed(shown)}{meant}"
+        return
+    _, count, low, unplaced, *_ = _detected(known, key, asked.window)
+    if unplaced:
+        yield f"{counted(unplaced, 'detection')} of it could not be placed, and are left out"
+    if key in asked.found:
+        return
+    if low:
+        times = counted(low, "time")
+        yield f"it was detected {times} below {asked.min_score}, which does not count"
+    if count:
+        yield (
+            f"it was detected {counted(count, 'time')} in this time, but does not count "
+            f"as a thing{asked.inside}: find_matches lists single detections"
+        )
+    if not count + low + unplaced:
+        every = sum(_detected(known, key, TimeWindow.everything())[1:4])
+        yield f"it was detected {counted(every, 'time')} in all, and not once in this window"
