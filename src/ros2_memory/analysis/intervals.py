@@ -1,4 +1,4 @@
-"""Visible intervals: when objects were in view, by message or by whole bags as columns of numbers.
+"""Visible intervals: when objects were in view, as columns of numbers.
 
 An object stays in view from one message that contains it to the next where these follow each other
 on the topic within `SILENCE_NS`, or are within `FLICKER_NS` whatever is between them: detectors
@@ -11,8 +11,7 @@ farther apart than `USUAL_PERIODS` times their mean distance, or `SHORT_NS`.
 
 from __future__ import annotations
 
-import math
-from itertools import pairwise, repeat
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -138,7 +137,7 @@ class IntervalTable(NamedTuple):
     def scoring(self, least: float) -> IntervalTable:
         """Returns the intervals with a best score of so much at least, or without any."""
         best = _rows(self.rows)["best"]
-        chosen = (best == _NO_SCORE) | (best >= _stored_score(least))
+        chosen = (best == _NO_SCORE) | (best >= _stored_scores(np.array([least])))
         return IntervalTable(self.labels, _rows(self.rows)[chosen].tobytes())
 
     def during(self, spans: Iterable[tuple[Ns, Ns]]) -> IntervalTable:
@@ -183,109 +182,57 @@ class IntervalPart(NamedTuple):
     visible: IntervalTable
 
 
-class IntervalBuilder:
-    """Takes the messages of one topic in log-time order.
+def visible_in(
+    times: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    codes: NDArray[np.int64],
+    scores: NDArray[np.float64],
+    labels: Sequence[str],
+) -> IntervalTable:
+    """Returns when objects were visible in consecutive messages of one topic.
 
     Args:
-        at_most: how many intervals are held; the rest is counted.
-
-    Attributes:
-        left_out: how many were not held.
+        times: log times of all messages, ascending.
+        rows: for each detection, its message.
+        codes: its label, by the place in `labels`.
+        scores: NaN where it has none.
+        labels: the labels, each once.
     """
-
-    def __init__(self, at_most: int) -> None:
-        self.left_out = 0
-        self._at_most = at_most
-        self._first: Ns | None = None
-        self._last: Ns = 0
-        self._nth = 0
-        self._open: dict[str, _Open] = {}
-        self._over: list[tuple[str, _Open]] = []
-
-    def add(self, time: Ns, labels: Sequence[str], scores: Sequence[float | None] = ()) -> None:
-        """Takes the next message, with the labels in it, and their scores where there are any."""
-        if self._first is None:
-            self._first = time
-        elif time - self._last > SILENCE_NS:
-            self._nth += 1  # as if an empty message came between
-        self._nth += 1
-        self._last = time
-        if not labels:
-            return
-        for label, score in zip(labels, scores or repeat(None)):  # noqa: B905 - no scores
-            best = _stored_score(score)
-            known = self._open.get(label)
-            if known is None:
-                self._open[label] = _Open(time, self._nth, best)
-            elif known.nth >= self._nth - 1 or time - known.last <= FLICKER_NS:
-                known.add(time, self._nth, best)
-            else:
-                if len(self._over) < self._at_most:
-                    self._over.append((label, known))
-                else:
-                    self.left_out += 1
-                self._open[label] = _Open(time, self._nth, best)
-
-    def add_empty(self, times: Sequence[Ns]) -> None:
-        """Takes the next messages, at least one, none of which has a label."""
-        if self._first is None:
-            self._first = self._last = times[0]
-        nth, last = self._nth, self._last
-        for time in times:
-            nth += 2 if time - last > SILENCE_NS else 1
-            last = time
-        self._nth, self._last = nth, last
-
-    def part(self) -> IntervalPart | None:
-        """Returns what was visible so far; None without a message."""
-        if self._first is None:
-            return None
-        every = [*self._over, *self._open.items()]
-        every.sort(key=lambda each: (each[1].first, each[0]))
-        labels = tuple(sorted({label for label, _ in every}))
-        place = {label: at for at, label in enumerate(labels)}
-        rows = [
-            (
-                each.first,
-                each.last,
-                place[label],
-                (each.began == 1) * _FROM_START | (each.nth == self._nth) * _TO_END,
-                each.count,
-                each.longest,
-                each.best,
-            )
-            for label, each in every
-        ]
-        return IntervalPart(
-            self._first, self._last, IntervalTable(labels, np.array(rows, ROW).tobytes())
-        )
+    if not rows.size:
+        return IntervalTable()
+    used, codes = np.unique(codes, return_inverse=True)
+    names = [labels[code] for code in used.tolist()]
+    rank = np.argsort(np.argsort(np.array(names, object)))
+    order = np.lexsort((rows, rank[codes]))
+    label, row, best = rank[codes][order], rows[order], _stored_scores(scores[order])
+    at = times[row]
+    # As if an empty message came where the topic was silent.
+    silent = np.cumsum(np.diff(times, prepend=times[0]) > SILENCE_NS)
+    nth = row + silent[row]
+    goes_on = (np.diff(nth) <= 1) | (np.diff(at) <= FLICKER_NS)
+    goes_on &= np.diff(label) == 0
+    begins = np.flatnonzero(np.append(True, ~goes_on))
+    stops = np.append(begins[1:], len(row)) - 1
+    found = np.empty(len(begins), ROW)
+    found["first"], found["last"], found["label"] = at[begins], at[stops], label[begins]
+    # Two detections of one label in a message are one.
+    is_new = np.append(True, (np.diff(row) != 0) | (np.diff(label) != 0))
+    found["count"] = np.add.reduceat(is_new, begins, dtype=np.int64)
+    pauses = np.append(0, np.where(goes_on, np.diff(at), 0))
+    found["longest"] = np.maximum.reduceat(pauses, begins)
+    found["best"] = np.maximum.reduceat(best, begins)
+    found["ends"] = (row[begins] == 0) * _FROM_START
+    found["ends"] |= ((row[stops] == len(times) - 1) * _TO_END).astype(np.uint8)
+    rows_of_time = found[np.lexsort((found["label"], found["first"]))]
+    return IntervalTable(tuple(sorted(names)), rows_of_time.tobytes())
 
 
-class _Open:
-    """An interval that may go on; `began` and `nth` number its first and last message."""
-
-    __slots__ = ("began", "best", "count", "first", "last", "longest", "nth")
-
-    def __init__(self, time: Ns, nth: int, best: int) -> None:
-        self.first = self.last = time
-        self.began = self.nth = nth
-        self.count = 1
-        self.longest = 0
-        self.best = best
-
-    def add(self, time: Ns, nth: int, best: int) -> None:
-        self.best = max(self.best, best)
-        self.longest = max(self.longest, time - self.last)
-        self.last, self.nth = time, nth
-        self.count += 1
-
-
-def _stored_score(score: float | None) -> int:
-    if score is None or math.isnan(score):
-        return _NO_SCORE
+def _stored_scores(scores: NDArray[np.float64]) -> NDArray[np.int64]:
     # The least number stands for no score.
     most = -_NO_SCORE - 1
-    return round(min(max(score * _SCORES, -most), most))
+    with np.errstate(invalid="ignore"):
+        stored = np.rint(np.clip(scores * _SCORES, -most, most))
+    return np.where(np.isnan(scores), _NO_SCORE, stored).astype(np.int64)
 
 
 def joined(parts: Sequence[IntervalPart]) -> IntervalPart:

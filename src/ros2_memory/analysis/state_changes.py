@@ -1,9 +1,7 @@
 """State that changes on a topic, for what happened before an event.
 
 Levels are small integers by name: of each diagnostic status, of each goal of an action, how low a
-battery is, and whether a velocity is commanded. Log entries of WARN and above are reports. Both are
-collected message by message or by whole bags; where a history is cut into bags changes nothing, as
-long as nothing is left out for being too much.
+battery is, and whether a velocity is commanded. Log entries of WARN and above are reports.
 """
 
 from __future__ import annotations
@@ -13,11 +11,15 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+
+    from numpy.typing import NDArray
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
@@ -45,12 +47,12 @@ _WARN: Final = 30
 _LOG_WORDS: Final = ((50, "fatal"), (40, "error"), (_WARN, "warning"))
 _STILL: Final = 1e-3
 """A commanded velocity (m/s, rad/s) below which it is zero: controllers publish -0.0 and 1e-17."""
-_MAX_LEVELS: Final = 512
+MAX_LEVELS: Final = 512
 """Levels in one message that are tracked; the rest is left out."""
 _MAX_HELD: Final = 20_000
-"""Levels, changes and reports of a topic in all bags together."""
+"""Levels, or booleans, of a topic in all bags together."""
 _MAX_CHARS: Final = 120
-_REPEATED_NS: Final = 2 * NS_PER_S
+REPEATED_NS: Final = 2 * NS_PER_S
 """A log entry that follows its like sooner is the same report."""
 _DIGITS: Final = re.compile(r"\d+")
 
@@ -63,8 +65,8 @@ class StateLevel(NamedTuple):
     text: str = ""
 
 
-class KnownLevel(NamedTuple):
-    """A level at the first message of a bag that has it, and at the last."""
+class Held(NamedTuple):
+    """A level or a boolean: its value in the first message that has it, and in the last."""
 
     name: str
     at: Ns
@@ -73,8 +75,8 @@ class KnownLevel(NamedTuple):
     text: str = ""
 
 
-class LevelChange(NamedTuple):
-    """A level that is `value` from `time` on, and was another before."""
+class Change(NamedTuple):
+    """A level or a boolean that is `value` from `time` on, and was another before."""
 
     name: str
     time: Ns
@@ -93,17 +95,17 @@ class Report(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StateChanges:
-    """The changes of state on one topic in one bag, to be joined with those before and after.
+    """The changes of state on one topic in some time, to be joined with those before and after.
 
     Attributes:
         known: each level's value at either end.
         changes: in order of time.
         reports: by the time of the first of each.
-        left_out: levels, changes and reports beyond what is stored: the earliest are.
+        left_out: levels, changes and reports beyond what is held: the earliest are.
     """
 
-    known: tuple[KnownLevel, ...] = ()
-    changes: tuple[LevelChange, ...] = ()
+    known: tuple[Held, ...] = ()
+    changes: tuple[Change, ...] = ()
     reports: tuple[Report, ...] = ()
     left_out: int = 0
 
@@ -116,6 +118,62 @@ class StateChanges:
 NO_CHANGES: Final = StateChanges()
 
 
+def joined_held(
+    parts: Iterable[tuple[Sequence[Held], Sequence[Change]]],
+) -> tuple[tuple[Held, ...], list[Change], int]:
+    """Returns what was held in times that follow each other, and the changes in and between them.
+
+    The changes are in order of time, part by part. With them how much more was held than is kept.
+    """
+    known: dict[str, Held] = {}
+    found: list[Change] = []
+    left_out = 0
+    for held, changes in parts:
+        between = [
+            Change(each.name, each.at, each.first, each.text)
+            for each in held
+            if each.name in known and known[each.name].last != each.first
+        ]
+        found += sorted([*between, *changes], key=lambda change: change.time)
+        for each in held:
+            before = known.get(each.name)
+            if before is None and len(known) >= _MAX_HELD:
+                left_out += 1
+            else:
+                known[each.name] = each if before is None else before._replace(last=each.last)
+    return tuple(known.values()), found, left_out
+
+
+def joined_reports(reports: Iterable[Report]) -> list[Report]:
+    """Returns reports in order, each joined to the newest one like it, where that is recent."""
+    found: list[Report] = []
+    newest: dict[str, int] = {}
+    for report in reports:
+        alike = like(report.text)
+        nth = newest.get(alike)
+        if nth is not None and report.first - found[nth].last <= REPEATED_NS:
+            before = found[nth]
+            found[nth] = before._replace(last=report.last, reports=before.reports + report.reports)
+        else:
+            newest[alike] = len(found)
+            found.append(report)
+    return found
+
+
+def charge_levels(charges: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the level of each charge of a battery; -1 where it is not known."""
+    with np.errstate(invalid="ignore"):
+        part = np.where(charges > 1, charges / _PERCENT, charges)
+        levels = np.sum([part < least for least in LOW_CHARGES], axis=0, dtype=np.int64)
+        return np.where((charges >= 0) & (charges <= _PERCENT), levels, -1)
+
+
+def is_still(numbers: NDArray[np.float64], error: float = 0.0) -> NDArray[np.bool_]:
+    """Returns which numbers of a command are zero even if they are off by `error`."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(numbers) + error < _STILL
+
+
 def has_levels(type_name: str) -> bool:
     """Returns whether messages of a type can contain levels."""
     return type_name in {DIAGNOSTICS, GOALS, BATTERY} or type_name in VELOCITIES
@@ -124,35 +182,15 @@ def has_levels(type_name: str) -> bool:
 def levels_of(value: JsonValue, type_name: str) -> tuple[StateLevel, ...]:
     """Returns the levels in an extracted message of a type."""
     if type_name == DIAGNOSTICS:
-        return tuple(_statuses(value))[: _MAX_LEVELS + 1]
+        return tuple(_statuses(value))[: MAX_LEVELS + 1]
     if type_name == GOALS:
-        return tuple(_goals(value))[: _MAX_LEVELS + 1]
+        return tuple(_goals(value))[: MAX_LEVELS + 1]
     if type_name == BATTERY:
         charge = charge_of(value)
         return () if charge is None else _charge(charge)
     if type_name in VELOCITIES:
         return _command(_floats(value))
     return ()
-
-
-def follow_numbers(type_name: str) -> bool:
-    """Returns whether the levels of messages of a type depend on floats in them."""
-    return type_name == BATTERY or type_name in VELOCITIES
-
-
-def levels_by_number(
-    type_name: str, names: Sequence[str], rows: Iterable[Sequence[float]]
-) -> Iterator[tuple[StateLevel, ...]]:
-    """Yields the levels of messages that differ by their floats alone.
-
-    A row has the floats of one message, `names` are those of their fields.
-    """
-    if type_name in VELOCITIES:
-        yield from map(_command, rows)
-        return
-    column = names.index(_PERCENTAGE) if _PERCENTAGE in names else None
-    for row in rows:
-        yield () if column is None else _charge(row[column])
 
 
 def reports_of(value: JsonValue, type_name: str) -> tuple[str, ...]:
@@ -167,88 +205,9 @@ def reports_of(value: JsonValue, type_name: str) -> tuple[str, ...]:
     return (shortened(f"{who}: {message}" if isinstance(message, str) else who, _MAX_CHARS),)
 
 
-class StateChangesBuilder:
-    """Takes the levels and reports of one topic, or whole bags of them, in log-time order."""
-
-    def __init__(self) -> None:
-        self._known: dict[str, KnownLevel] = {}
-        self._changes: list[LevelChange] = []
-        self._reports: list[Report] = []
-        self._newest: dict[str, int] = {}
-        self._left_out = 0
-
-    def add(self, time: Ns, levels: Sequence[StateLevel], reports: Sequence[str]) -> None:
-        """Takes the next message."""
-        for name, value, text in levels[:_MAX_LEVELS]:
-            self._add_level(KnownLevel(name, time, value, value, text))
-        self._left_out += len(levels[_MAX_LEVELS:])
-        for text in reports:
-            self._add_report(Report(text, time, time, 1))
-
-    def join(self, bag: StateChanges) -> None:
-        """Takes all messages of a bag that come next, as if they were added one by one."""
-        inside = [
-            LevelChange(known.name, known.at, known.first, known.text)
-            for known in bag.known
-            if self._is_changed(known)
-        ]
-        for change in sorted([*inside, *bag.changes], key=lambda each: each.time):
-            self._add_change(change)
-        for known in bag.known:
-            self._remember(known)
-        for report in bag.reports:
-            self._add_report(report)
-        self._left_out += bag.left_out
-
-    def changes(self, at_most: int | None = None) -> StateChanges:
-        """Returns the changes so far, `at_most` of each kind."""
-        if not (self._known or self._reports or self._left_out):
-            return NO_CHANGES
-        counts = (len(self._changes), len(self._reports))
-        left_out = 0 if at_most is None else sum(max(0, many - at_most) for many in counts)
-        return StateChanges(
-            tuple(self._known.values()),
-            tuple(self._changes[:at_most]),
-            tuple(self._reports[:at_most]),
-            self._left_out + left_out,
-        )
-
-    def _is_changed(self, known: KnownLevel) -> bool:
-        before = self._known.get(known.name)
-        return before is not None and before.last != known.first
-
-    def _add_level(self, known: KnownLevel) -> None:
-        if self._is_changed(known):
-            self._add_change(LevelChange(known.name, known.at, known.first, known.text))
-        self._remember(known)
-
-    def _remember(self, known: KnownLevel) -> None:
-        before = self._known.get(known.name)
-        if before is None and len(self._known) >= _MAX_HELD:
-            self._left_out += 1
-            return
-        self._known[known.name] = known if before is None else before._replace(last=known.last)
-
-    def _add_change(self, change: LevelChange) -> None:
-        if len(self._changes) < _MAX_HELD:
-            self._changes.append(change)
-        else:
-            self._left_out += 1
-
-    def _add_report(self, report: Report) -> None:
-        """Adds a report to the newest like it, where that is recent, or else as another."""
-        like = _DIGITS.sub("#", report.text)
-        nth = self._newest.get(like)
-        if nth is not None and report.first - self._reports[nth].last <= _REPEATED_NS:
-            before = self._reports[nth]
-            self._reports[nth] = before._replace(
-                last=report.last, reports=before.reports + report.reports
-            )
-        elif len(self._reports) < _MAX_HELD:
-            self._newest[like] = len(self._reports)
-            self._reports.append(report)
-        else:
-            self._left_out += 1
+def like(report: str) -> str:
+    """Returns what is equal for reports that differ in their numbers alone."""
+    return _DIGITS.sub("#", report)
 
 
 def _statuses(value: JsonValue) -> Iterator[StateLevel]:

@@ -1,23 +1,24 @@
 """Events on a topic: objects came into view and left, booleans toggled, errors were reported.
 
-What else changed, and only matters before another event, is in `state_changes`.
-
-Collected message by message or by whole bags; where a history is cut into bags changes nothing, as
-long as nothing is left out for being too much.
+What else changed, and only matters before another event, is in `state_changes`. Where a history is
+cut changes nothing, as long as nothing is left out for being too much.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.intervals import IntervalBuilder, IntervalPart, IntervalTable, joined
+from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.state_changes import (
     NO_CHANGES,
+    Change,
+    Held,
     StateChanges,
-    StateChangesBuilder,
     StateLevel,
     has_levels,
+    joined_held,
+    joined_reports,
     levels_of,
     reports_of,
 )
@@ -32,9 +33,9 @@ if TYPE_CHECKING:
     from ros2_memory.messages.detections import Detection
 
 MAX_PER_BAG: Final = 64
-"""Intervals, toggles and errors of one topic in one bag that are stored; the rest is counted."""
+"""Intervals, toggles and errors of one topic in one bag that a lake holds; the rest is counted."""
 MAX_HELD: Final = 20_000
-"""Toggles and errors of a topic in all bags together, which a question about a week may hold."""
+"""Toggles, errors, changes and the like of a topic that a question about a week may hold."""
 MAX_SEEN: Final = 100_000
 """Intervals likewise; they are held as numbers."""
 MAX_FLAGS: Final = 512
@@ -79,14 +80,6 @@ EMPTY_STATE: Final = State()
 _NOTHING_VISIBLE: Final = IntervalTable()
 
 
-class Toggle(NamedTuple):
-    """A boolean that is `value` from `time` on, and was the opposite before."""
-
-    path: str
-    time: Ns
-    value: bool
-
-
 class ReportedError(NamedTuple):
     """An error, and the log times of its first and last report (inclusive)."""
 
@@ -96,18 +89,9 @@ class ReportedError(NamedTuple):
     reports: int
 
 
-class KnownFlag(NamedTuple):
-    """A boolean's value at the first message of a bag that has it, and at the last."""
-
-    path: str
-    at: Ns
-    first: bool
-    last: bool
-
-
 @dataclass(frozen=True, slots=True)
 class TopicEvents:
-    """The events of one topic in one bag, to be joined with those before and after.
+    """The events of one topic in some time, to be joined with those before and after.
 
     Attributes:
         first: log time of the first message.
@@ -116,7 +100,7 @@ class TopicEvents:
         known: each boolean's value at either end.
         toggles: in order.
         errors: by the time of their first report.
-        left_out: intervals, toggles and errors beyond what is stored: the longest intervals are,
+        left_out: intervals, toggles and errors beyond what is kept: the longest intervals are,
             and the earliest of the others.
         undecodable: messages that cannot be decoded; where there are no others, `first` is after
             `last`.
@@ -127,8 +111,8 @@ class TopicEvents:
     first: Ns
     last: Ns
     visible: IntervalTable = _NOTHING_VISIBLE
-    known: tuple[KnownFlag, ...] = ()
-    toggles: tuple[Toggle, ...] = ()
+    known: tuple[Held, ...] = ()
+    toggles: tuple[Change, ...] = ()
     errors: tuple[ReportedError, ...] = ()
     left_out: int = 0
     undecodable: int = 0
@@ -143,8 +127,33 @@ class TopicEvents:
 
     @property
     def all_left_out(self) -> int:
-        """Events of any kind beyond what is stored, changes included."""
+        """Events of any kind beyond what is kept, changes included."""
         return self.left_out + self.changes.left_out
+
+    def limited(self, at_most: int, intervals: int) -> TopicEvents:
+        """Returns these with so many intervals, and so many of each other kind, at most."""
+        changes = self.changes
+        if changes is not NO_CHANGES:
+            more = _beyond(at_most, changes.changes, changes.reports)
+            changes = StateChanges(
+                changes.known,
+                changes.changes[:at_most],
+                changes.reports[:at_most],
+                changes.left_out + more,
+            )
+        left_out = _beyond(at_most, self.toggles, self.errors)
+        return replace(
+            self,
+            visible=self.visible.most_lasting(intervals),
+            toggles=self.toggles[:at_most],
+            errors=self.errors[:at_most],
+            left_out=self.left_out + left_out + max(0, self.visible.size - intervals),
+            changes=changes,
+        )
+
+
+def _beyond(at_most: int, *kinds: Sequence[object]) -> int:
+    return sum(max(0, len(kind) - at_most) for kind in kinds)
 
 
 NO_EVENTS: Final = TopicEvents(0, 0)
@@ -198,157 +207,47 @@ def _best_scores(detections: Sequence[Detection]) -> dict[str, float | None]:
     return best
 
 
-class TopicEventsBuilder:
-    """Takes the messages of one topic, or whole bags of them, in log-time order."""
+def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
+    """Returns the events of times that follow each other as those of one; None without a message.
 
-    def __init__(self) -> None:
-        self._parts: list[IntervalPart] = []
-        self._rows = 0
-        self._builder: IntervalBuilder | None = None
-        self._known: dict[str, KnownFlag] = {}
-        self._toggles: list[Toggle] = []
-        self._errors: dict[str, ReportedError] = {}
-        self._left_out = 0
-        self._undecodable = 0
-        self._beyond = 0
-        self._changes = StateChangesBuilder()
+    Where they are too many, the longest intervals are kept, and the earliest of the others.
+    """
+    undecodable = sum(part.undecodable for part in parts)
+    parts = [part for part in parts if part.first <= part.last]
+    if not parts:
+        return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
+    seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
+    visible = (seen[0] if len(seen) == 1 else joined(seen)).visible
+    known, toggles, more = joined_held((part.known, part.toggles) for part in parts)
+    errors: dict[str, ReportedError] = {}
+    for error in (error for part in parts for error in part.errors):
+        before = errors.setdefault(error.text, error)
+        if before is not error:
+            reports = before.reports + error.reports
+            errors[error.text] = before._replace(last=error.last, reports=reports)
+    whole = TopicEvents(
+        parts[0].first,
+        parts[-1].last,
+        visible,
+        known,
+        tuple(toggles),
+        tuple(sorted(errors.values(), key=lambda each: (each.first, each.text))),
+        more + sum(part.left_out for part in parts),
+        undecodable,
+        max(part.beyond for part in parts),
+        _joined_changes([part.changes for part in parts]),
+    )
+    return whole.limited(MAX_HELD, MAX_SEEN)
 
-    def add_undecodable(self) -> None:
-        """Takes the next message, which cannot be decoded."""
-        self._undecodable += 1
 
-    def add(self, time: Ns, state: State) -> None:
-        """Takes the next message."""
-        if self._builder is None:
-            self._builder = IntervalBuilder(MAX_SEEN)
-        self._builder.add(time, state.labels, state.scores)
-        if state is EMPTY_STATE:  # as of most messages
-            return
-        self._beyond = max(self._beyond, state.beyond)
-        for path, value in state.flags:
-            self._add_flag(KnownFlag(path, time, value, value))
-        for text in state.errors:
-            self._add_error(ReportedError(text, time, time, 1))
-        if state.levels or state.reports:
-            self._changes.add(time, state.levels, state.reports)
-
-    def add_empty(self, times: Sequence[Ns]) -> None:
-        """Takes the next messages, as `add` does with `EMPTY_STATE` one by one."""
-        if not times:
-            return
-        if self._builder is None:
-            self._builder = IntervalBuilder(MAX_SEEN)
-        self._builder.add_empty(times)
-
-    def join(self, events: TopicEvents) -> None:
-        """Takes all messages of a bag that come next, as if they were added one by one."""
-        self._undecodable += events.undecodable
-        if events.first > events.last:
-            return
-        self._close_part()
-        self._take(IntervalPart(events.first, events.last, events.visible))
-        if events.known:
-            toggles = [
-                Toggle(known.path, known.at, known.first)
-                for known in events.known
-                if self._is_toggled(known)
-            ]
-            for toggle in sorted([*toggles, *events.toggles], key=lambda toggle: toggle.time):
-                self._add_toggle(toggle)
-            for known in events.known:
-                self._remember_flag(known)
-        for error in events.errors:
-            self._add_error(error)
-        self._left_out += events.left_out
-        self._beyond = max(self._beyond, events.beyond)
-        if events.changes is not NO_CHANGES:
-            self._changes.join(events.changes)
-
-    def join_uneventful(self, first: Ns, last: Ns) -> None:
-        """Takes all messages of a bag that come next and report nothing, by the times of two."""
-        self._close_part()
-        self._take(IntervalPart(first, last, _NOTHING_VISIBLE))
-
-    def events(self, at_most: int | None = None) -> TopicEvents | None:
-        """Returns the events so far, `at_most` of each kind; None without a message."""
-        self._close_part()
-        if not self._parts:
-            return TopicEvents(1, 0, undecodable=self._undecodable) if self._undecodable else None
-        first, last, visible = self._merge_parts()
-        errors = sorted(self._errors.values(), key=lambda each: (each.first, each.text))
-        counts = (visible.size, len(self._toggles), len(errors))
-        left_out = 0 if at_most is None else sum(max(0, many - at_most) for many in counts)
-        return TopicEvents(
-            first,
-            last,
-            visible if at_most is None else visible.most_lasting(at_most),
-            tuple(self._known.values()),
-            tuple(self._toggles[:at_most]),
-            tuple(errors[:at_most]),
-            self._left_out + left_out,
-            self._undecodable,
-            self._beyond,
-            self._changes.changes(at_most),
-        )
-
-    def _close_part(self) -> None:
-        """Takes over what was added message by message."""
-        part = None if self._builder is None else self._builder.part()
-        if self._builder is not None and part is not None:
-            self._left_out += self._builder.left_out
-            self._builder = None
-            self._take(part)
-
-    def _take(self, part: IntervalPart) -> None:
-        self._parts.append(part)
-        self._rows += part.visible.size
-        if self._rows > 2 * MAX_SEEN:
-            self._merge_parts()
-
-    def _merge_parts(self) -> IntervalPart:
-        """Returns all parts as one, without more intervals than may be held."""
-        part = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
-        visible = part.visible.most_lasting(MAX_SEEN)
-        self._left_out += part.visible.size - visible.size
-        self._parts, self._rows = [part._replace(visible=visible)], visible.size
-        return self._parts[0]
-
-    def _is_toggled(self, known: KnownFlag) -> bool:
-        before = self._known.get(known.path)
-        return before is not None and before.last != known.first
-
-    def _add_flag(self, known: KnownFlag) -> None:
-        if self._is_toggled(known):
-            self._add_toggle(Toggle(known.path, known.at, known.first))
-        self._remember_flag(known)
-
-    def _remember_flag(self, known: KnownFlag) -> None:
-        before = self._known.get(known.path)
-        if before is None and len(self._known) >= MAX_HELD:
-            self._left_out += 1
-            return
-        if before is None:
-            self._known[known.path] = known
-        elif before.last != known.last:
-            self._known[known.path] = before._replace(last=known.last)
-
-    def _add_toggle(self, toggle: Toggle) -> None:
-        """Adds a toggle, or counts it where there are too many."""
-        if len(self._toggles) < MAX_HELD:
-            self._toggles.append(toggle)
-        else:
-            self._left_out += 1
-
-    def _add_error(self, error: ReportedError) -> None:
-        before = self._errors.get(error.text)
-        if before is None and len(self._errors) >= MAX_HELD:
-            self._left_out += 1
-            return
-        self._errors[error.text] = (
-            error
-            if before is None
-            else before._replace(last=error.last, reports=before.reports + error.reports)
-        )
+def _joined_changes(parts: Sequence[StateChanges]) -> StateChanges:
+    parts = [part for part in parts if part is not NO_CHANGES]
+    if not parts:
+        return NO_CHANGES
+    known, changes, more = joined_held((part.known, part.changes) for part in parts)
+    reports = joined_reports(report for part in parts for report in part.reports)
+    left_out = more + sum(part.left_out for part in parts)
+    return StateChanges(known, tuple(changes), tuple(reports), left_out)
 
 
 def _flags_in(value: JsonValue, path: str) -> Iterator[tuple[str, bool]]:

@@ -11,13 +11,11 @@ import json
 import math
 import struct
 from dataclasses import fields
-from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.intervals import IntervalTable, moved_rows
 from ros2_memory.analysis.motion.odometry import (
     Leg,
     MotionTotals,
@@ -34,14 +32,6 @@ from ros2_memory.analysis.motion.standstills import (
     StandstillDigest,
     StandstillRun,
 )
-from ros2_memory.analysis.state_changes import (
-    NO_CHANGES,
-    KnownLevel,
-    LevelChange,
-    Report,
-    StateChanges,
-)
-from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
 from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Box, ZoneMap
 from ros2_memory.catalogue.field_columns import outward
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
@@ -53,7 +43,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import JsonValue, Vector3
 
-_EVENTS: Final = struct.Struct("<qqqqqI")
 _ZONES: Final = struct.Struct("<Bdd")
 _BOUNDS: Final = struct.Struct("<6f")
 _SIDES: Final = (-math.inf, math.inf) * 3
@@ -227,125 +216,6 @@ def decode_zone_box(packed: bytes) -> Box | None:
         return Box(*_BOUNDS.unpack_from(packed, _ZONES.size)) if flags & _BOX else None
     except struct.error as error:
         raise ValueError(f"not a zone map: {error}") from error
-
-
-def encode_topic_events(events: TopicEvents | None) -> bytes:
-    """Encodes the events of a topic; None, where no message can be decoded, as no bytes."""
-    if events is None:
-        return b""
-    first = events.first
-    counts = (first, events.last - first, events.left_out, events.undecodable, events.beyond)
-    # Paths, and times relative to the first message, are equal in many bags: _decode_text caches
-    # them.
-    known = [
-        [each.path for each in events.known],
-        [each.at - first for each in events.known],
-        "".join(str(each.first + 2 * each.last) for each in events.known),
-    ]
-    changes = events.changes
-    rest = json.dumps(
-        [
-            events.visible.labels,
-            known,
-            events.toggles,
-            events.errors,
-            *([] if changes is NO_CHANGES else [_parts(_since(-first, changes))]),
-        ],
-        ensure_ascii=False,
-        separators=(",", ":"),
-    )
-    rows = moved_rows(events.visible.rows, -first)
-    # A lone surrogate is not valid UTF-8, and JSON of a message may contain one.
-    text = rest.encode("utf-8", "surrogatepass")
-    return _EVENTS.pack(*counts, len(rows)) + rows + text
-
-
-def decode_topic_events(packed: bytes) -> TopicEvents | None:
-    """Decodes the events of a topic; None where no message can be decoded.
-
-    Raises:
-        ValueError: the bytes are not valid.
-    """
-    if not packed:
-        return None
-    try:
-        first, lasted, left_out, undecodable, beyond, size = _EVENTS.unpack_from(packed)
-        end = _EVENTS.size + size
-        labels, (paths, after, values), flips, faults, relative = _decode_text(packed[end:])
-        known = tuple(
-            KnownFlag(path, first + at, value in "13", value in "23")
-            for path, at, value in zip(paths, after, values, strict=True)
-        )
-        changes = _since(first, relative)
-        rows = moved_rows(packed[_EVENTS.size : end], first)
-    except (TypeError, struct.error) as error:
-        raise ValueError(f"not the events of a topic: {error}") from error
-    seen = IntervalTable(labels, rows)
-    if not seen.is_sound:
-        raise ValueError("not the events of a topic: a label is missing")
-    last = first + lasted
-    return TopicEvents(
-        first, last, seen, known, flips, faults, left_out, undecodable, beyond, changes
-    )
-
-
-def _parts(changes: StateChanges) -> tuple[object, ...]:
-    return changes.known, changes.changes, changes.reports, changes.left_out
-
-
-def _since(since: int, relative: StateChanges) -> StateChanges:
-    """Returns changes whose times are later by `since`."""
-    if relative is NO_CHANGES:
-        return relative
-    return StateChanges(
-        tuple(each._replace(at=each.at + since) for each in relative.known),
-        tuple(each._replace(time=each.time + since) for each in relative.changes),
-        tuple(
-            each._replace(first=each.first + since, last=each.last + since)
-            for each in relative.reports
-        ),
-        relative.left_out,
-    )
-
-
-@lru_cache(2048)
-def _decode_text(
-    text: bytes,
-) -> tuple[
-    tuple[str, ...],
-    tuple[list[str], list[int], str],
-    tuple[Toggle, ...],
-    tuple[ReportedError, ...],
-    StateChanges,
-]:
-    """Decodes labels, flags, toggles, errors and changes, whose times are relative.
-
-    Cached, since those of many bags are equal.
-    """
-    labels, (paths, after, values), flips, faults, *changes = json.loads(
-        text.decode("utf-8", "surrogatepass")
-    )
-    return (
-        tuple(labels),
-        (paths, after, values),
-        tuple(Toggle(*each) for each in flips),
-        tuple(ReportedError(*each) for each in faults),
-        _decode_changes(*changes[0]) if changes else NO_CHANGES,
-    )
-
-
-def _decode_changes(
-    known: list[tuple[str, int, int, int, str]],
-    changes: list[tuple[str, int, int, str]],
-    reports: list[tuple[str, int, int, int]],
-    left_out: int,
-) -> StateChanges:
-    return StateChanges(
-        tuple(KnownLevel(*each) for each in known),
-        tuple(LevelChange(*each) for each in changes),
-        tuple(Report(*each) for each in reports),
-        left_out,
-    )
 
 
 def _decode_leg(stored: Leg | None) -> Leg | None:

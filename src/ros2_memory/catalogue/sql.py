@@ -10,13 +10,11 @@ import hashlib
 import json
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.topic_events import TopicEvents
 from ros2_memory.catalogue.codec import (
     encode_counts,
     encode_poses,
     encode_schema,
     encode_standstills,
-    encode_topic_events,
     encode_zone_map,
 )
 from ros2_memory.catalogue.field_columns import encode_field_ranges
@@ -31,11 +29,10 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.catalogue.topic_digest import TopicDigest
-    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import Record
 
 TABLES: Final = Tables(
-    version=12,
+    version=13,
     names=(
         "bags",
         "held",
@@ -60,7 +57,7 @@ CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
 CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
   kept INTEGER, relatched INTEGER, undecodable TEXT, fields INTEGER, ranges BLOB, zones BLOB,
   poses BLOB);
-CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB, story BLOB);
+CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
 CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
@@ -91,7 +88,6 @@ OF_CONFIGS: Final = f"config {_AMONG}"
 ZONE_MAP: Final = "zones"
 POSES: Final = "poses"
 STANDSTILLS: Final = "rests"
-STORY: Final = "story"
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
@@ -105,7 +101,6 @@ PACKED_IN: Final = {
     POSES: "held",
     RANGES: "held",
     STANDSTILLS: "tales",
-    STORY: "tales",
     TRACK: "maps",
     SIGHTS: "maps",
     COUNTS: "bags",
@@ -138,8 +133,6 @@ def topic_rows(
 ) -> list[sqlite3.Row]:
     """Returns the row id and these columns of what entries hold of a topic."""
     table = "tales" if columns == STANDSTILLS else "held"
-    if columns == STORY:  # `tales` has no row of messages without an event
-        columns = f"(SELECT {STORY} FROM tales WHERE tales.id = held.id)"
     number = topic_number(connection, topic)
     base = number << ROW_ID_BITS
     return connection.execute(
@@ -263,7 +256,7 @@ def insert_entry(
     for topic in digest.topics:
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
-        _insert_events(connection, (number, bag), topic, digest.summary)
+        _insert_standstills(connection, (number, bag), topic)
         for nth, record in enumerate(topic.kept or ()):
             _insert_record(connection, (bag, number, nth), record)
 
@@ -310,22 +303,16 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
     )
 
 
-def _insert_events(
-    connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest, summary: BagSummary
+def _insert_standstills(
+    connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest
 ) -> None:
-    """Inserts the topic's standstills and events; no row if there are none."""
     number, bag = key
-    spans = [(each.first, each.last) for each in summary.of(topic.topic)]
-    quiet = TopicEvents(min(first for first, _ in spans), max(last for _, last in spans))
-    rests = topic.standstills
-    if rests is None and topic.events == quiet:
+    if topic.standstills is None:
         return
-    rested = rests and packed_by_model(connection, number, STANDSTILLS, encode_standstills(rests))
-    story = None
-    if topic.events != quiet:
-        story = packed_by_model(connection, number, STORY, encode_topic_events(topic.events))
+    plain = encode_standstills(topic.standstills)
     connection.execute(
-        "INSERT INTO tales VALUES (?, ?, ?)", (number << ROW_ID_BITS | bag, rested, story)
+        "INSERT INTO tales VALUES (?, ?)",
+        (number << ROW_ID_BITS | bag, packed_by_model(connection, number, STANDSTILLS, plain)),
     )
 
 

@@ -16,13 +16,11 @@ from functools import partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.codec import (
     decode_counts,
     decode_poses,
     decode_schema,
     decode_standstills,
-    decode_topic_events,
     decode_zone_box,
     decode_zone_map,
 )
@@ -40,7 +38,6 @@ from ros2_memory.catalogue.sql import (
     RELATCHED,
     SIGHTS,
     STANDSTILLS,
-    STORY,
     TABLES,
     TRACK,
     UNDECODABLE,
@@ -224,8 +221,12 @@ class Catalogue(Database):
         return self._packed_of_topic(topic, numbers, STANDSTILLS, decode_standstills)
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
-        """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""
-        return self._packed_of_topic(topic, numbers, STORY, decode_topic_events, NO_EVENTS)
+        """Returns the events on the topic, which a lake holds: `NO_EVENTS`, or None.
+
+        None where no message can be decoded.
+        """
+        del topic, numbers
+        return {}
 
     def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
         """Returns the frame edges of the topic; not where they are not all known."""
@@ -315,24 +316,18 @@ class Catalogue(Database):
         numbers: Sequence[int],
         kind: str,
         decode: Callable[[bytes], T],
-        absent: T | None = None,
     ) -> dict[int, T]:
-        """Decodes what is packed of one topic, by entry.
-
-        If there is none it is `absent`; without that, the entry is left out.
-        """
+        """Decodes what is packed of one topic, by entry, where there is some."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, T]:
             offset = self.offset
             model = model_of(connection, topic_number(connection, topic), kind)
             rows = topic_rows(connection, kind, topic, self.row_ids(numbers))
-            found: dict[int, T] = {}
-            for number, stored in rows:
-                if stored is not None:
-                    found[offset + number] = decode(unpacked(stored, model))
-                elif absent is not None:
-                    found[offset + number] = absent
-            return found
+            return {
+                offset + number: decode(unpacked(stored, model))
+                for number, stored in rows
+                if stored is not None
+            }
 
         return self.read(ask, {})
 

@@ -11,26 +11,17 @@ from ros2_memory.analysis.field_ranges import FieldRangesBuilder
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
 from ros2_memory.analysis.motion.trajectory import PoseCollector
-from ros2_memory.analysis.state_changes import follow_numbers, levels_by_number
-from ros2_memory.analysis.topic_events import (
-    EMPTY_STATE,
-    MAX_PER_BAG,
-    TopicEventsBuilder,
-    state_of,
-)
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.analysis.field_ranges import FieldRange
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
-    from ros2_memory.analysis.state_changes import StateLevel
-    from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector
     from ros2_memory.core.model import Pose, StampedTransform
@@ -70,7 +61,6 @@ class TopicDigest:
         zone_map: what can be in its messages; rules conditions out.
         poses: the digest of its poses; None where some message carries none.
         standstills: among its poses; None where `poses` is None or has no valid one.
-        events: on the topic; None where no message can be decoded.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
         relatched: whether one of its messages may repeat a message of another recording.
@@ -82,7 +72,6 @@ class TopicDigest:
     zone_map: ZoneMap
     poses: PoseDigest | None
     standstills: StandstillDigest | None
-    events: TopicEvents | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
     fields: Mapping[str, FieldRange] | None = None
@@ -100,7 +89,6 @@ class _Sample(NamedTuple):
 
     pose: Pose | None
     speed_mps: float | None
-    state: State
     detections: tuple[Detection, ...] | None = None
     pairs: frozenset[tuple[str, str]] | None = frozenset()
 
@@ -143,7 +131,6 @@ class TopicCollector:
         self._fields = FieldRangesBuilder()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
         self._standstills = StandstillCollector()
-        self._events = TopicEventsBuilder()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
@@ -174,7 +161,6 @@ class TopicCollector:
             zone_map=self._zone_map.zone_map(),
             poses=None if self._poses is None else self._poses.digest(),
             standstills=None if self._poses is None else self._standstills.digest(),
-            events=self._events.events(MAX_PER_BAG),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
             fields=self._fields.ranges(),
@@ -206,12 +192,10 @@ class TopicCollector:
         return self._extractor.transforms(message, record.log_time, static=False)
 
     def _decode_batch(self) -> None:
-        """Decodes the waiting messages, and takes their poses and states in order."""
+        """Decodes the waiting messages, and takes their poses in order."""
         batch, self._batch, self._batch_bytes = self._batch, [], 0
         if batch:
             self._ends = (batch[0] if self._ends is None else self._ends[0], batch[-1])
-        events = self._events
-        quiet: list[Ns] = []
         map_poses = self._map if self._map_poses else None
         samples = self._decoder.decode(batch)
         self._add_sights(batch, samples)
@@ -220,15 +204,8 @@ class TopicCollector:
                 self._zone_map.give_up()
                 self._fields.give_up()
                 self._pairs = self._poses = None
-                events.add_undecodable()
                 continue
             time = record.log_time
-            if sample.state is EMPTY_STATE:  # as of most messages
-                quiet.append(time)
-            else:
-                events.add_empty(quiet)
-                quiet.clear()
-                events.add(time, sample.state)
             pose = sample.pose
             if pose is None:
                 self._poses = None
@@ -239,7 +216,6 @@ class TopicCollector:
                 self._poses.add(time, pose, sample.speed_mps)
                 if is_place(pose.position):
                     self._standstills.add(time, pose.position, pose.orientation)
-        events.add_empty(quiet)
 
     def _add_sights(
         self, batch: Sequence[Record], samples: Sequence[_Sample | UndecodableError]
@@ -273,7 +249,7 @@ class TopicCollector:
             pairs = self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
         seen = detections_of(value) if self._wants_sights(type_name) else None
-        return _Sample(*motion, state_of(value, type_name, seen), seen, pairs)
+        return _Sample(*motion, seen, pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
         """Takes the valid transforms of a message, and returns their frames."""
@@ -287,40 +263,19 @@ class TopicCollector:
         return pairs
 
     def _template(self, record: Record, sample: _Sample) -> PayloadTemplate | None:
-        if sample.state.scores:
+        if any(each.score is not None for each in sample.detections or ()):
             return None  # they differ from message to message
         template = self._templates.of(record)
         # A transform that is invalid in this message may be valid in others of the template.
         return template if template is not None and template.pairs == sample.pairs else None
 
     def _apply(
-        self, template: PayloadTemplate, first: _Sample, records: Sequence[Record], rows: Bytes
+        self, template: PayloadTemplate, _: _Sample, records: Sequence[Record], rows: Bytes
     ) -> Iterable[_Sample]:
         self._zone_map.add_rows(template, rows)
         self._fields.add_rows(template, rows)
         if self._map is not None and self._map_transforms:
             self._map.add_rows(template, records, rows)
-        is_varied = template.position is not None or template.velocity is not None
-        if not is_varied and not follow_numbers(template.type_name):
-            return repeat(_Sample(None, None, first.state), len(rows))
-        return map(
-            _Sample,
-            template.poses(rows),
-            template.speeds(rows),
-            _states(template, first, rows),
-        )
-
-
-def _states(template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterator[State]:
-    """Yields the state of each message: the first's, but for levels that follow numbers."""
-    if not follow_numbers(template.type_name):
-        yield from repeat(first.state, len(rows))
-        return
-    columns = [template.column(rows, offset).tolist() for offset in template.numbers]
-    numbers = zip(*columns, strict=True) if columns else repeat((), len(rows))
-    known: dict[tuple[StateLevel, ...], State] = {}
-    for levels in levels_by_number(template.type_name, template.names, numbers):
-        state = known.get(levels)
-        if state is None:
-            state = known[levels] = first.state._replace(levels=levels)
-        yield state
+        if template.position is None and template.velocity is None:
+            return repeat(_Sample(None, None), len(rows))
+        return map(_Sample, template.poses(rows), template.speeds(rows))

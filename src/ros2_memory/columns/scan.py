@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.pack import Packed
     from ros2_memory.columns.store import ColumnStore, PartHead
@@ -51,6 +52,8 @@ _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
 _ATTEMPTS: Final = 5
 """How often a scan looks what is stored, while that changes; then it reads the bags."""
+_MOST_LOOKED_UP: Final = 64
+"""Parts whose columns are looked up at once."""
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
 
@@ -153,6 +156,7 @@ class Scanner:
 
     Attributes:
         censuses: by topic, span and bags, what is stored of each type and what of it counts.
+        events: by part, what happened in it; of parts of which all rows count.
     """
 
     def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
@@ -162,6 +166,7 @@ class Scanner:
         self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
+        self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of a topic in a window.
@@ -210,10 +215,7 @@ class Scanner:
         """
         assert self.store is not None  # noqa: S101 - there are no parts without one
         offset = self.store.offset
-        known = self._known.get(head.number)
-        if known is None:
-            known = self.store.part_columns(head.number)
-            self._known.put(head.number, known, _COLUMN_BYTES * len(known))
+        known = self._known.get(head.number) or self.look_up([head]).get(head.number)
         topic = self.store.topic(head.topic)
         if not known or topic is None:
             raise GoneError
@@ -240,6 +242,15 @@ class Scanner:
             return bag
 
         return PartUnit(head, table, integers, counting - offset, bag_of)
+
+    def look_up(self, heads: Iterable[PartHead]) -> Mapping[int, Mapping[str, Packed]]:
+        """Reads at once what is known of the columns of parts, where it is not known yet."""
+        missing = [head.number for head in heads if self._known.get(head.number) is None]
+        found = self.store.part_columns(missing) if self.store is not None and missing else {}
+        for number, columns in found.items():
+            if columns:
+                self._known.put(number, columns, _COLUMN_BYTES * len(columns))
+        return found
 
     def split(self, number: int, topic: str) -> list[Table] | None:
         """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
@@ -298,7 +309,14 @@ class _Scan:
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
         window = self._asked.window
-        for source in sources:
+        ahead = together = 1
+        for nth, source in enumerate(sources):
+            if nth == ahead:
+                # Who goes on reads many.
+                together = min(2 * together, _MOST_LOOKED_UP)
+                ahead += together
+                parts = [each.part for each in sources[nth:ahead] if each.part is not None]
+                self._scanner.look_up(parts)
             if window.overlaps(source.first, source.last):
                 self._asked.check(source.last if newest_first else source.first)
                 for unit in self._units(source, self._asked.may_match):

@@ -40,8 +40,14 @@ Object: TypeAlias = Message | Group
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Scored:
-    """An object that may be a detection: what names it, in order, and what its score is."""
+class Scored:
+    """An object that may be a detection: what names it, in order, and what its score is.
+
+    Attributes:
+        level: where it lies.
+        labels: texts, the first of which that is not blank names it.
+        scores: numbers, of which the first that is known is its score.
+    """
 
     level: Level
     labels: tuple[Leaf, ...]
@@ -78,7 +84,7 @@ class _Scored:
 class _Scores:
     """Which detections score enough; `kept` and its kin are computed once for each table."""
 
-    scored: _Scored
+    scored: Scored
     least: float
     texts: tuple[Leaf, ...]
     has_inner: bool
@@ -112,7 +118,7 @@ class _BestScores:
     """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
 
     level: Level
-    hypotheses: _Scored
+    hypotheses: Scored
     least: float
     texts: tuple[Leaf, ...]
     has_inner: bool
@@ -197,32 +203,37 @@ def is_object(node: Node) -> TypeGuard[Object]:
 
 def _object_without_low(node: Object, least: float, depth: int) -> Node:
     fields = dict(children(node))
-    scored = _scored(fields)
-    if scored is not None:
-        return Narrowed(_Scores(scored, least, *_inside(fields, depth)), node)
-    results = fields.get("results")
-    if isinstance(results, Listing) and isinstance(results.element, Message | Group):
-        inner = dict(children(results.element))
-        named = inner.get("hypothesis")
-        hypotheses = _scored(dict(children(named)) if isinstance(named, Message | Group) else inner)
-        if hypotheses is not None:
-            others = {name: child for name, child in fields.items() if name != "results"}
-            texts, has_inner = _inside(others, depth)
-            level = hypotheses.level.parent or hypotheses.level
-            best = _BestScores(level, hypotheses, least, texts, has_inner)
-            kept = Narrowed(_Hypotheses(best), results.element)
-            return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
+    found = scored(fields)
+    if found is not None:
+        return Narrowed(_Scores(found, least, *_inside(fields, depth)), node)
+    results, named = fields.get("results"), hypotheses(fields)
+    if isinstance(results, Listing) and named is not None:
+        others = {name: child for name, child in fields.items() if name != "results"}
+        texts, has_inner = _inside(others, depth)
+        best = _BestScores(named.level.parent or named.level, named, least, texts, has_inner)
+        kept = Narrowed(_Hypotheses(best), results.element)
+        return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
     return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})
 
 
-def _scored(fields: Mapping[str, Node]) -> _Scored | None:
+def hypotheses(fields: Mapping[str, Node]) -> Scored | None:
+    """Returns how the hypotheses of a detection are named and scored (vision_msgs); None: none."""
+    results = fields.get("results")
+    if not isinstance(results, Listing) or not isinstance(results.element, Message | Group):
+        return None
+    inner = dict(children(results.element))
+    named = inner.get("hypothesis")
+    return scored(dict(children(named)) if isinstance(named, Message | Group) else inner)
+
+
+def scored(fields: Mapping[str, Node]) -> Scored | None:
     """Returns how an object is named and scored; None if none like it is a detection."""
     if fields.keys() & NOT_LABELLED:
         return None
     labels = _leaves(fields, NAMES, lambda leaf: leaf.kind is Kind.TEXT)
     numeric = {Kind.INTEGER, Kind.REAL}
     scores = _leaves(fields, SCORES, lambda leaf: leaf.kind in numeric)
-    return _Scored(labels[0].level, labels, scores) if labels else None
+    return Scored(labels[0].level, labels, scores) if labels else None
 
 
 def _leaves(

@@ -332,19 +332,20 @@ class ColumnStore(Database):
 
         return self.read(ask, [])
 
-    def part_columns(self, part: int) -> dict[str, Packed]:
-        """Returns what is known of each column of a part, without its values."""
+    def part_columns(self, parts: Sequence[int]) -> dict[int, dict[str, Packed]]:
+        """Returns what is known of each column of some parts, without its values."""
 
-        def ask(connection: sqlite3.Connection) -> dict[str, Packed]:
+        def ask(connection: sqlite3.Connection) -> dict[int, dict[str, Packed]]:
             rows = connection.execute(
-                "SELECT path, codec, count, error, least, greatest, nulls, words FROM part_column"
-                " WHERE part = ?",
-                (part - self.offset,),
+                "SELECT part, path, codec, count, error, least, greatest, nulls, words"
+                " FROM part_column WHERE part IN (SELECT value FROM json_each(?))",
+                (json.dumps([part - self.offset for part in parts]),),
             )
-            return {
-                path: Packed(codec, count, error, zone_of(least, greatest, nulls, words), b"")
-                for path, codec, count, error, least, greatest, nulls, words in rows
-            }
+            found: dict[int, dict[str, Packed]] = {part: {} for part in parts}
+            for part, path, codec, count, error, *zone in rows:
+                packed = Packed(codec, count, error, zone_of(*zone), b"")
+                found[part + self.offset][path] = packed
+            return found
 
         return self.read(ask, {})
 

@@ -40,9 +40,11 @@ class Unit(ABC):
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
         recording: that all the rows are of.
+        part: the number of the part; None where it is a bag's.
     """
 
     key: object
+    part: int | None = None
     table: Table
     first: Ns
     last: Ns
@@ -116,7 +118,7 @@ class PartUnit(Unit):
         counting: IntArray,
         bag_of: Callable[[int], BagFile],
     ) -> None:
-        self.key = head.number
+        self.key = self.part = head.number
         self.table = table
         self.first, self.last = head.first, head.last
         self.recording = bag_of(int(counting[0])).recording
@@ -186,6 +188,11 @@ class Rows:
         """Log times (ns) of the rows that count."""
         times = self._unit.times()
         return times if self.index is None else times[self.index]
+
+    @property
+    def part(self) -> int | None:
+        """The number of the part of which all rows count; None where it is not so."""
+        return self._unit.part if self.index is None else None
 
     @property
     def recording(self) -> Path:

@@ -6,42 +6,40 @@ What counts as once:
   back, or until nothing is recorded. It counts where it is seen to toggle.
 - A text on a topic of detections is a label. A thing is in view as in a recap: it may be missed
   for `FLICKER_NS`, since detectors miss things now and then, and it is gone after `SILENCE_NS`
-  without a message. These and booleans are counted by the digests of events, unless a least score
-  is asked for.
+  without a message. These and booleans are counted by the topic's events, unless a least score is
+  asked for.
 - Any other condition holds in sightings, as `find_matches` returns them; these are read.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
-from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, TopicEventsBuilder, has_events
+from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events
+from ros2_memory.columns.units import GoneError
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.counts.bins import BinnedWindow
-from ros2_memory.counts.segment_fold import Digested, SegmentFold
 from ros2_memory.counts.time_bins import TrueIntervals
+from ros2_memory.history.context import READING_S
 from ros2_memory.history.no_data import matching_topics
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.sightings import read_sightings
-from ros2_memory.insights.topic_events import TOPIC_EVENTS, collect_events
+from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.scope import Scope
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.analysis.topic_events import KnownFlag
-    from ros2_memory.catalogue.lookup import SegmentDigests
+    from ros2_memory.analysis.state_changes import Held
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
-    from ros2_memory.counts.segment_fold import Folded
-    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
     from ros2_memory.places.scope import WhileCondition
@@ -113,100 +111,57 @@ def _by_events(
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is None and (condition.field is not None or not isinstance(value, str)):
         return None, None
-    label = condition if wanted is None else None
-    folded = _events(view, topic, binned.counted, label)
-    _note_limits(view, topic, folded)
+    parts, since = _events(view, topic, binned.counted)
+    _note_limits(view, topic, parts)
     if wanted is not None:
-        return _flag_held(folded, condition, _gaps_of(binned, topic), wanted=wanted), folded.since
-    return _label_held(folded, condition), folded.since
+        return _flag_held(parts, condition, _gaps_of(binned, topic), wanted=wanted), since
+    return _label_held(parts, condition), since
 
 
-def _events(
-    view: View, topic: str, window: TimeWindow, label: Condition | None
-) -> Folded[TopicEvents]:
-    """Returns the events of a topic; of bags that cannot have a label perhaps not all others."""
-    fold = SegmentFold(
-        TOPIC_EVENTS,
-        partial(collect_events, view),
-        _joined_events,
-        name="events",
-        leaves_out=lambda events: events is not None and events.left_out > 0,
-        collect_all=partial(collect_events, view, at_most=None),
-        unread=None if label is None else _WithoutLabel(view, topic, label).of,
-        question="" if label is None else f"of {label}",
-    )
-    return fold.over(view, topic, window)
+def _events(view: View, topic: str, window: TimeWindow) -> tuple[list[TopicEvents], Ns | None]:
+    """Returns the events of a topic in order, and since when they are known, if not all are.
+
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    reading = view.call.partial_after(READING_S)
+    parts: list[TopicEvents] = []
+
+    def reached(_: Ns) -> None:
+        if reading.expired() and parts:
+            raise QueryTimeoutError("the rest is left out")
+
+    try:
+        parts.extend(events_back(view, topic, window, reached))
+    except GoneError:
+        raise
+    except QueryTimeoutError:
+        if not parts:
+            raise
+        return parts[::-1], parts[-1].first
+    return parts[::-1], None
 
 
-class _WithoutLabel:
-    """Finds groups of bags that cannot have a label: other labels in them do not matter."""
-
-    def __init__(self, view: View, topic: str, condition: Condition) -> None:
-        self._view = view
-        self._topic = topic
-        self._condition = condition
-
-    def of(self, group: Group) -> Digested[TopicEvents | None] | None:
-        """Returns the stored events of a group that cannot have the label."""
-        if group.may_be_relatched:
-            return None
-        builder = TopicEventsBuilder()
-        for each in group.bags:
-            entry = self._view.bags.entry(each.bag)
-            if entry is None or entry[1] in self._may_have_it(entry[0]):
-                return None
-            digests, number = entry
-            stored = digests.catalogue.topic_events(self._topic, [number])
-            if number not in stored:
-                return None
-            events = stored[number]
-            if events is NO_EVENTS:
-                builder.join(TopicEvents(each.first, each.last))
-            elif events is not None:
-                builder.join(replace(events, left_out=0))
-        first = group.first
-        last = group.last
-        return Digested(builder.events() or NO_EVENTS, first, last)
-
-    def _may_have_it(self, digests: SegmentDigests) -> set[int]:
-        """Returns the entries of a segment that may have the label."""
-
-        def may_have() -> set[int]:
-            maps = digests.zone_maps(self._topic)
-            return {number for number, each in maps.items() if self._condition.can_match(each)}
-
-        name = f"bags that may have {self._condition} on {self._topic}"
-        return digests.derived(name, may_have)
-
-
-def _joined_events(found: Sequence[Digested[TopicEvents | None]]) -> TopicEvents:
-    builder = TopicEventsBuilder()
-    for digest, first, last in found:
-        if digest is not None:
-            builder.join(TopicEvents(first, last) if digest is NO_EVENTS else digest)
-    return builder.events() or TopicEvents(1, 0)
-
-
-def _note_limits(view: View, topic: str, folded: Folded[TopicEvents]) -> None:
-    left_out = sum(each.left_out for each in folded.parts)
+def _note_limits(view: View, topic: str, parts: Sequence[TopicEvents]) -> None:
+    left_out = sum(part.left_out for part in parts)
     if left_out:
         view.notes.add(f"{topic} changes too often to count all: {left_out} more")
-    undecodable = sum(each.undecodable for each in folded.parts)
+    undecodable = sum(part.undecodable for part in parts)
     if undecodable:
         view.notes.complete = False
         view.notes.add(f"messages of {topic} that could not be decoded: {undecodable}")
 
 
-def _label_held(folded: Folded[TopicEvents], condition: Condition) -> TrueIntervals | None:
+def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueIntervals | None:
     """Returns when a thing with a label was in view; None where there are no labels at all."""
-    if not any(each.visible.labels for each in folded.parts):
+    if not any(part.visible.labels for part in parts):
         return None
-    parts = [
-        IntervalPart(each.first, each.last, _of_label(each.visible, condition))
-        for each in folded.parts
-        if each.first <= each.last
+    of_label = [
+        IntervalPart(part.first, part.last, _of_label(part.visible, condition))
+        for part in parts
+        if part.first <= part.last
     ]
-    seen = joined(parts).visible.intervals()
+    seen = joined(of_label).visible.intervals()
     return TrueIntervals.of([(each.first, each.last, True) for each in seen])
 
 
@@ -217,37 +172,31 @@ def _of_label(visible: IntervalTable, condition: Condition) -> IntervalTable:
 
 
 def _flag_held(
-    folded: Folded[TopicEvents],
+    parts: Sequence[TopicEvents],
     condition: Condition,
     gaps: Sequence[tuple[Ns, Ns]],
     *,
     wanted: bool,
 ) -> TrueIntervals | None:
     """Returns when a boolean held; None where it is not clear which boolean is meant."""
-    builder = TopicEventsBuilder()
-    for part in folded.parts:
-        if part.first <= part.last:
-            builder.join(replace(part, visible=IntervalTable(), errors=()))
-    events = builder.events()
+    events = joined_events([replace(part, visible=IntervalTable(), errors=()) for part in parts])
     if events is None:
         return TrueIntervals.of([])
-    meant = [each for each in events.known if condition.field in {None, each.path}]
+    meant = [each for each in events.known if condition.field in {None, each.name}]
     if len(meant) != 1:
         return None
     spans = _spans_of(events, meant[0], wanted=wanted)
     return TrueIntervals.of([part for each in spans for part in _without_gaps(*each, gaps)])
 
 
-def _spans_of(
-    events: TopicEvents, known: KnownFlag, *, wanted: bool
-) -> Iterator[tuple[Ns, Ns, bool]]:
+def _spans_of(events: TopicEvents, known: Held, *, wanted: bool) -> Iterator[tuple[Ns, Ns, bool]]:
     """Yields when a boolean had a value, and whether it is known that it toggled to it then."""
-    since, begun, value = known.at, False, known.first
+    since, begun, value = known.at, False, bool(known.first)
     for toggle in events.toggles:
-        if toggle.path == known.path:
+        if toggle.name == known.name:
             if value is wanted:
                 yield since, toggle.time, begun
-            since, begun, value = toggle.time, True, toggle.value
+            since, begun, value = toggle.time, True, bool(toggle.value)
     if value is wanted:
         yield since, events.last, begun
 

@@ -26,7 +26,7 @@ from ros2_memory.analysis.state_changes import (
     charge_of,
     has_levels,
 )
-from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
+from ros2_memory.analysis.topic_events import has_events, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotShippedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
@@ -34,14 +34,14 @@ from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import ns_argument, open_view
 from ros2_memory.insights.goals import GOAL_WORDS, action_of
-from ros2_memory.insights.topic_events import add_events, events_in, toggled
+from ros2_memory.insights.topic_events import events_in, events_of_messages, toggled
 from ros2_memory.places.pose_frames import placed, with_place
 from ros2_memory.results import Before, PastChange
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.state_changes import LevelChange, Report, StateChanges
+    from ros2_memory.analysis.state_changes import Change, Report, StateChanges
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.core.model import Pose
     from ros2_memory.core.timebase import Ns
@@ -222,14 +222,12 @@ def _with_lead(
     if not can_change:
         return None
     start = max(window.start - _LEAD_NS, MIN_NS)
-    builder = TopicEventsBuilder()
     newest = view.stream.newest(topic, TimeWindow(max(start - _KNOWN_NS, MIN_NS), start))
-    if newest is not None:
-        add_events(view, builder, [newest])
-    for events in (events_in(view, topic, TimeWindow(start, window.start)), found):
-        if events is not None:
-            builder.join(replace(events, visible=_NO_INTERVALS, errors=()))
-    return builder.events()
+    before = None if newest is None else events_of_messages(view, [newest])
+    parts = (before, events_in(view, topic, TimeWindow(start, window.start)), found)
+    return joined_events(
+        [replace(part, visible=_NO_INTERVALS, errors=()) for part in parts if part is not None]
+    )
 
 
 def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
@@ -255,7 +253,7 @@ def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
             yield _Change(known.at, known.at, _status(known.name, known.first, known.text))
 
 
-def _changed(topic: str, change: LevelChange, charge: int) -> str:
+def _changed(topic: str, change: Change, charge: int) -> str:
     """Returns a sentence for a change of level; empty for one that is not reported."""
     if change.name.startswith(STATUS):
         return _status(change.name, change.value, change.text)
@@ -324,7 +322,7 @@ def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]
     for topic, events in joined.items():
         is_battery = any(each.name == CHARGE for each in events.changes.known)
         for flag in () if is_battery else events.known:
-            yield topic if flag.path == "value" else f"{topic} {flag.path}", flag.last
+            yield topic if flag.name == "value" else f"{topic} {flag.name}", bool(flag.last)
         goals = [each for each in events.changes.known if each.name.startswith(GOAL)]
         if goals:
             newest = max(goals, key=lambda each: each.at)

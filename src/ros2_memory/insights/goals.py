@@ -14,11 +14,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.state_changes import GOAL, GOALS
-from ros2_memory.analysis.topic_events import TopicEventsBuilder
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.insights.topic_events import add_events, events_in, note_limits
+from ros2_memory.insights.topic_events import events_in, events_of_messages, note_limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -88,10 +87,7 @@ def goals_in(
             continue
         # Which goals it listed before: what a window's first message lists need not be new.
         before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
-        listed = TopicEventsBuilder()
-        if before is not None:
-            add_events(view, listed, [before])
-        earlier = listed.events()
+        earlier = None if before is None else events_of_messages(view, [before])
         old = {} if earlier is None else {each.name: each.last for each in earlier.changes.known}
         yield from _goals(topic, found, old)
 

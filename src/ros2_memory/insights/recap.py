@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import united
 from ros2_memory.analysis.motion.standstills import SHORTEST_NS
-from ros2_memory.analysis.topic_events import TopicEventsBuilder, has_events
+from ros2_memory.analysis.topic_events import has_events, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
@@ -409,12 +409,8 @@ def _errors(
     """Returns the errors of a window; in a region only their reports there count."""
     if there is None or all(there.covers(each.first, each.last) for each in found.errors):
         return found.errors
-    builder = TopicEventsBuilder()
-    for start, stop, *_ in there.spans:
-        events = events_in(view, topic, TimeWindow(start, stop + 1))
-        if events is not None:
-            builder.join(events)
-    inside = builder.events()
+    parts = [events_in(view, topic, TimeWindow(each.start, each.stop + 1)) for each in there.spans]
+    inside = joined_events([part for part in parts if part is not None])
     return () if inside is None else inside.errors
 
 
@@ -439,12 +435,12 @@ def _flips(topic: str, events: TopicEvents, ends: Sequence[Ns]) -> Iterator[Even
     until: dict[str, Ns] = {}
     for toggle in reversed(events.toggles):
         text = toggled(topic, toggle)
-        end = until.get(toggle.path)
+        end = until.get(toggle.name)
         ceased = bisect_left(ends, toggle.time)
         if ceased < len(ends) and (end is None or ends[ceased] < end):
             end = ends[ceased]
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
-        until[toggle.path] = toggle.time
+        until[toggle.name] = toggle.time
 
 
 def _clock_steps(view: View, window: TimeWindow) -> Iterator[Event]:

@@ -1,128 +1,194 @@
-"""The events of one topic in a window, from digests of whole bags and the messages of others."""
+"""The events of one topic in a window, from what its messages state."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.topic_events import (
-    MAX_PER_BAG,
-    NO_EVENTS,
-    TopicEvents,
-    TopicEventsBuilder,
-    state_of,
-)
-from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
+import numpy as np
+
+from ros2_memory.analysis.stated import events_of, joined_stated, stated_by
+from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, joined_events, state_of
+from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.stated import StatedColumns
+from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import UndecodableError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
-from ros2_memory.history.bag_fold import Fold
-from ros2_memory.history.bag_groups import DigestKind, store_shared
+from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Note
+from ros2_memory.history.scan import messages_of, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.topic_events import Toggle
-    from ros2_memory.core.model import TimeWindow
-    from ros2_memory.history.bag_groups import Span
+    from ros2_memory.analysis.state_changes import Change
+    from ros2_memory.analysis.stated import Stated
+    from ros2_memory.analysis.topic_events import State
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
-TOPIC_EVENTS: Final = DigestKind(
-    "story",
-    look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
-    encode=encode_topic_events,
-    decode=decode_topic_events,
-)
-
-_NOTHING: Final = b"-"
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
+_BYTES: Final = 600
+"""About how much memory the events of a part take, and each of its toggles, errors and levels."""
 
 
-def toggled(topic: str, toggle: Toggle) -> str:
+def toggled(topic: str, toggle: Change) -> str:
     """Returns a sentence for a boolean of a topic that toggled."""
-    name = topic if toggle.path == "value" else f"{topic} {toggle.path}"
+    name = topic if toggle.name == "value" else f"{topic} {toggle.name}"
     return f"{name} became {'true' if toggle.value else 'false'}"
 
 
 def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
-    """Returns what the messages of a topic report in a window; None where there is no message."""
-    builder = TopicEventsBuilder()
-    Fold(
-        TOPIC_EVENTS,
-        add=lambda messages: add_events(view, builder, messages),
-        collect=partial(collect_events, view),
-        join=partial(_join, builder),
-        reduce=_reduced,
-        encode=_encoded,
-        decode=_decoded,
-    ).over(view, topic, window)
-    return builder.events()
+    """Returns what the messages of a topic report in a window; None where there is no message.
 
-
-def _join(builder: TopicEventsBuilder, events: TopicEvents | None, span: Span) -> None:
-    if events is NO_EVENTS:
-        builder.join_uneventful(*span)
-    elif events is not None:
-        builder.join(events)
-
-
-def _reduced(
-    found: Sequence[tuple[TopicEvents | None, Span]],
-) -> Sequence[tuple[TopicEvents | None, Span]]:
-    """Returns the events of several bags as of one, unless something would be left out."""
-    builder = TopicEventsBuilder()
-    for events, span in found:
-        _join(builder, events, span)
-    whole = builder.events()
-    parts = [each for each, _ in found if each is not None]
-    if whole is None or whole.all_left_out > sum(each.all_left_out for each in parts):
-        return found
-    return [(whole, (found[0][1][0], found[-1][1][1]))]
-
-
-def _encoded(events: TopicEvents | None) -> bytes:
-    return _NOTHING if events is NO_EVENTS else encode_topic_events(events)
-
-
-def _decoded(packed: bytes) -> TopicEvents | None:
-    return NO_EVENTS if packed == _NOTHING else decode_topic_events(packed)
-
-
-def store_shared_events(view: View, topic: str, window: TimeWindow) -> int:
-    """Stores the events of recordings that touch each other; returns of how many groups of bags."""
-    return store_shared(view, topic, TOPIC_EVENTS, partial(collect_events, view), window)
-
-
-def collect_events(
-    view: View, messages: Iterable[StoredMessage], at_most: int | None = MAX_PER_BAG
-) -> tuple[TopicEvents | None, Span | None]:
-    """Returns the digest of some messages, and the times of the first and the last, if any.
-
-    It has at most so many events of each kind, as that of a bag, unless all are wanted.
+    Raises:
+        QueryTimeoutError: the call's time is over.
     """
-    collector = TopicEventsBuilder()
-    add_events(view, collector, messages)
-    events = collector.events(at_most)
-    return events, None if events is None else (events.first, events.last)
+    return joined_events([*events_back(view, topic, window)][::-1])
 
 
-def add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
-    """Adds what messages of one topic report, in log-time order."""
-    stated = view.memory.stated
+def events_back(
+    view: View, topic: str, window: TimeWindow, reached: Callable[[Ns], None] = lambda _: None
+) -> Iterator[TopicEvents]:
+    """Yields the events in times that do not overlap, the newest first.
+
+    `reached` is called before each table, as by `scan`.
+
+    Raises:
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
+    """
+    if view.memory.columns is None:
+        yield from _of_bags(view, topic, window)
+        return
+    columns = StatedColumns(view.memory.extractor)
+    together: list[Rows] = []
+    for rows in scan(view, topic, window, newest_first=True, reached=reached):
+        if together and rows.last < min(each.first for each in together):
+            yield from _events(view, columns, together)
+            together = []
+        together.append(rows)
+    if together:
+        yield from _events(view, columns, together)
+
+
+def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
+    """Returns what messages of one topic report, in log-time order; None without any."""
+    return events_of(_stated_by(view, messages))
+
+
+def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, TopicEvents]:
+    """Returns the events of those topics that have a message in a bag, read at once.
+
+    Raises:
+        BagError: the bag cannot be read.
+    """
+    reader, columns = view.memory.reader, StatedColumns(view.memory.extractor)
+    found: dict[str, list[Stated]] = {}
+    for tables in decoded(reader, bag.path, topics=topics) if topics else ():
+        for nth, table in enumerate(tables):
+            whole = with_all_messages(reader, bag.path, table, TimeWindow.everything())
+            rows = Rows(BagUnit(bag, whole, nth), lambda: None)
+            stated = _stated(view, columns, rows)
+            found.setdefault(table.channel.topic, []).append(stated)
+    events = {topic: events_of(joined_stated(parts)) for topic, parts in found.items()}
+    return {topic: each for topic, each in events.items() if each is not None}
+
+
+def _events(view: View, columns: StatedColumns, together: list[Rows]) -> Iterator[TopicEvents]:
+    """Yields the events of tables that overlap in time; those of a whole part are kept."""
+    part = together[0].part if len(together) == 1 else None
+    known = None if view.memory.columns is None else view.memory.columns.events
+    events = None if known is None or part is None else known.get(part)
+    if events is not None:
+        yield events
+        return
+    noted = view.notes.added
+    stated = [_stated(view, columns, rows, alone=len(together) == 1) for rows in together]
+    events = events_of(joined_stated(stated))
+    if events is None:
+        return
+    if known is not None and part is not None and view.notes.added == noted:
+        known.put(part, events, _size(events))
+    yield events
+
+
+def _size(events: TopicEvents) -> int:
+    changes = events.changes
+    lists = (events.known, events.toggles, events.errors, changes.known, changes.changes)
+    more = sum(map(len, lists)) + len(changes.reports) + len(events.visible.labels)
+    return _BYTES * (1 + more) + len(events.visible.rows)
+
+
+def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = False) -> Stated:
+    """Returns what the messages of some rows state: by their columns, else by reading them.
+
+    With `alone` no other messages lie between them: of those that state the same two are enough.
+    """
+    found = columns.of(rows.table)
+    if found is None:
+        return _stated_by(view, messages_of(view, rows))
+    stated, to_read = found
+    index = rows.index
+    if index is not None:
+        stated = stated.at(index)
+        to_read = np.flatnonzero(np.isin(index, to_read))
+    if alone and not to_read.size and (settled := stated.unchanging(*rows.span)) is not None:
+        return settled
+    stated = stated._replace(times=rows.times)
+    if to_read.size:
+        others = np.setdiff1d(np.arange(len(rows)), to_read)
+        read = _stated_by(view, messages_of(view, rows.some(to_read)))
+        stated = joined_stated([stated.at(others), read])
+    return stated
+
+
+def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
+    times: list[Ns] = []
+    states: list[State | None] = []
     for found in messages:
-        channel = found.record.channel
-        state = None if stated is None else stated(found.record)
-        if state is not None:
-            to.add(found.time, state)
-            continue
-        try:
-            message = view.memory.reader.decode(found.record)
-        except UndecodableError:
-            to.add_undecodable()
-            continue
-        value = view.memory.extractor.exact(message, channel.type)
-        to.add(found.time, state_of(value, channel.type))
+        times.append(found.time)
+        states.append(_state(view, found))
+    return stated_by(times, states)
+
+
+def _state(view: View, found: StoredMessage) -> State | None:
+    """Returns what a message states; None where it cannot be decoded."""
+    channel = found.record.channel
+    known = None if view.memory.stated is None else view.memory.stated(found.record)
+    if known is not None:
+        return known
+    try:
+        message = view.memory.reader.decode(found.record)
+    except UndecodableError:
+        return None
+    return state_of(view.memory.extractor.exact(message, channel.type), channel.type)
+
+
+def _of_bags(view: View, topic: str, window: TimeWindow) -> Iterator[TopicEvents]:
+    """Yields the events of a lake's bags: as it holds them of whole ones, else by their rows."""
+    for group in reversed(groups_of(view.stream, topic, window)):
+        view.bags.check_deadline()
+        events = _held(view, topic, group)
+        if events is None:
+            events = events_of_messages(view, group.messages())
+        if events is not None:
+            yield events
+
+
+def _held(view: View, topic: str, group: Group) -> TopicEvents | None:
+    """Returns the events that a lake holds of a bag that lies in the window as a whole."""
+    if not group.is_whole or len(group.bags) > 1:
+        return None
+    entry = view.bags.entry(group.bags[0].bag)
+    if entry is None:
+        return None
+    digests, number = entry
+    found = digests.catalogue.topic_events(topic, [number])
+    events = found.get(number)
+    return TopicEvents(group.first, group.last) if events is NO_EVENTS else events
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:

@@ -17,8 +17,14 @@ from ros2_memory.analysis.motion.standstills import StandstillBuilder
 from ros2_memory.analysis.motion.trajectory import TrajectoryBuilder
 from ros2_memory.analysis.sights import Spot, decode_sights
 from ros2_memory.analysis.state_changes import has_levels
-from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, has_events, state_of
-from ros2_memory.catalogue.codec import encode_poses, encode_standstills, encode_topic_events
+from ros2_memory.analysis.topic_events import (
+    MAX_PER_BAG,
+    NO_EVENTS,
+    TopicEvents,
+    has_events,
+    state_of,
+)
+from ros2_memory.catalogue.codec import encode_poses, encode_standstills
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.map_digest import encode_map_track
@@ -26,7 +32,10 @@ from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.insights.topic_events import toggled
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import View
+from ros2_memory.insights.topic_events import events_of_bag, toggled
+from ros2_memory.lake.event_codec import encode_topic_events
 from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, EmptyRuns, StateRuns, is_stated
 from ros2_memory.lake.tables import TABLES, microseconds, topic_key
 from ros2_memory.lake.typed_values import MAPS, taken_apart
@@ -156,11 +165,7 @@ class _BagRows:
 
     def rows(self, messages: Sequence[str]) -> dict[str, list[Row]]:
         in_map, own = self._maps()
-        events = {
-            topic: self._events(topic)
-            for topic, types in self._types.items()
-            if any(has_events(each) or has_levels(each) for each in types)
-        }
+        events = self._events()
         self._add_poses(in_map, own)
         self._add_digests(in_map, own, events)
         self._add_things(in_map)
@@ -178,8 +183,20 @@ class _BagRows:
             return in_map, None
         return in_map, own
 
-    def _events(self, topic: str) -> TopicEvents | None:
-        return self._catalogue.topic_events(topic, [self._number]).get(self._number)
+    def _events(self) -> dict[str, TopicEvents | None]:
+        """Returns the events on each topic that can have some; None: no message counts."""
+        topics = [
+            topic
+            for topic, types in self._types.items()
+            if any(has_events(each) or has_levels(each) for each in types)
+        ]
+        found = events_of_bag(View(self._memory, Call()), self._bag, topics)
+        return {
+            topic: NO_EVENTS
+            if events == TopicEvents(events.first, events.last)
+            else events.limited(MAX_PER_BAG, MAX_PER_BAG)
+            for topic, events in found.items()
+        }
 
     def _add_bag(self, in_map: MapDigest | None, stood_s: float | None) -> None:
         bag, content, number = self._bag, self._content, self._number

@@ -34,9 +34,7 @@ from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
-from ros2_memory.insights.changes_before import topics_with_changes
 from ros2_memory.insights.drive import drive_in, store_shared_standstills
-from ros2_memory.insights.topic_events import events_in, store_shared_events
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.queries import list_recorded_topics
@@ -302,9 +300,6 @@ class Backfill:
                 poses = resolve_pose_topic(view)
                 store_shared_paths(view, poses, window)
                 store_shared_standstills(view, poses, window)
-            for topic in topics_with_changes(view):
-                with suppress(EpisodicError):
-                    store_shared_events(view, topic, window)
         store_joined(self._memory)
 
     def prune(self) -> None:
@@ -373,9 +368,6 @@ def store_joined(memory: Memory) -> None:
     window = TimeWindow.everything()
     with suppress(EpisodicError):
         drive_in(view, window)
-    for topic in topics_with_changes(view):
-        with suppress(EpisodicError):
-            events_in(view, topic, window)
     topics = view.snapshot.timeline.topics()
     for topic in filter(lambda each: view.stream.may_be_relatched([each]), topics):
         with suppress(EpisodicError):

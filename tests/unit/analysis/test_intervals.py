@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,12 +12,12 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import (
     FLICKER_NS,
     SILENCE_NS,
-    IntervalBuilder,
     IntervalPart,
     IntervalTable,
     VisibleInterval,
     joined,
     united,
+    visible_in,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 
@@ -41,13 +43,15 @@ def histories(draw: st.DrawFn, begin: int = 0) -> Messages:
     return messages
 
 
-def watched(messages: Messages, at_most: int = 1000) -> IntervalPart:
-    watcher = IntervalBuilder(at_most)
-    for time, labels in messages:
-        watcher.add(time, labels)
-    part = watcher.part()
-    assert part is not None
-    return part
+def watched(messages: Messages, scores: Sequence[float | None] = ()) -> IntervalPart:
+    labels = sorted({label for _, labels in messages for label in labels})
+    seen = [(nth, labels.index(label)) for nth, (_, some) in enumerate(messages) for label in some]
+    rows, codes = np.array(seen, np.int64).reshape(-1, 2).T
+    times = np.array([time for time, _ in messages], np.int64)
+    best = np.array(scores or [None] * len(rows), np.float64)
+    return IntervalPart(
+        messages[0][0], messages[-1][0], visible_in(times, rows, codes, best, labels)
+    )
 
 
 def by_hand(messages: Messages) -> list[VisibleInterval]:
@@ -217,16 +221,6 @@ def test_times_at_either_end_of_the_range_are_far_apart() -> None:
     assert united([each.visible for each in ends]).size == 2
 
 
-def test_intervals_beyond_the_limit_are_counted() -> None:
-    watcher = IntervalBuilder(2)
-    for nth in range(6):
-        watcher.add(nth * 20 * NS_PER_S, ["a"])
-    assert watcher.left_out == 3
-    part = watcher.part()
-    assert part is not None
-    assert part.visible.size == 3
-
-
 @pytest.mark.parametrize(
     "seen",
     [
@@ -251,19 +245,16 @@ def test_rows_without_a_label_are_recognised(seen: IntervalTable) -> None:
 def test_the_best_score_of_an_interval_is_the_same_however_a_history_is_cut(
     messages: list[tuple[int, float | None]], cuts: set[int]
 ) -> None:
-    parts: list[IntervalPart] = []
-    builder, time, times = IntervalBuilder(100), 0, []
-    for nth, (seconds, score) in enumerate(messages):
-        part = builder.part()
-        if nth in cuts and part is not None:
-            parts.append(part)
-            builder = IntervalBuilder(100)
-        time += seconds * NS_PER_S
-        times.append(time)
-        builder.add(time, ["a"], [score])
-    last = builder.part()
-    assert last is not None
-    whole = joined([*parts, last]).visible
+    times = np.cumsum([seconds * NS_PER_S for seconds, _ in messages]).tolist()
+    ends = sorted({0, len(messages), *(cut for cut in cuts if cut < len(messages))})
+    parts = [
+        watched(
+            [(time, ("a",)) for time in times[begin:end]],
+            [score for _, score in messages[begin:end]],
+        )
+        for begin, end in pairwise(ends)
+    ]
+    whole = joined(parts).visible
     for each in whole.intervals():
         scores = [
             score

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,16 +12,18 @@ from ros2_memory.analysis.state_changes import (
     DIAGNOSTICS,
     GOALS,
     LOG,
-    LevelChange,
+    Change,
     Report,
     StateChanges,
-    StateChangesBuilder,
     StateLevel,
+    charge_levels,
     charge_of,
-    levels_by_number,
+    is_still,
     levels_of,
     reports_of,
 )
+from ros2_memory.analysis.stated import events_of, stated_by
+from ros2_memory.analysis.topic_events import State
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S as S
 
@@ -28,16 +31,18 @@ TWIST = "geometry_msgs/msg/Twist"
 
 
 def changes_of(*messages: tuple[float, list[StateLevel], list[str]]) -> StateChanges:
-    builder = StateChangesBuilder()
-    for at, levels, reports in messages:
-        builder.add(round(at * S), levels, reports)
-    return builder.changes()
+    states = [
+        State(levels=tuple(levels), reports=tuple(reports)) for _, levels, reports in messages
+    ]
+    events = events_of(stated_by([round(at * S) for at, *_ in messages], states))
+    assert events is not None
+    return events.changes
 
 
 def test_a_level_that_changes_is_a_change_and_its_first_value_is_not() -> None:
     values = [0, 0, 1, 1, 0]
     found = changes_of(*((at, [StateLevel("m", value)], []) for at, value in enumerate(values)))
-    assert found.changes == (LevelChange("m", 2 * S, 1), LevelChange("m", 4 * S, 0))
+    assert found.changes == (Change("m", 2 * S, 1), Change("m", 4 * S, 0))
 
 
 def test_entries_alike_but_for_their_numbers_are_one_report_while_they_follow_each_other() -> None:
@@ -47,15 +52,6 @@ def test_entries_alike_but_for_their_numbers_are_one_report_while_they_follow_ea
         Report("late by 0 s", 0, round(2.5 * S), 3),
         Report("late by 10 s", 10 * S, 10 * S, 1),
     )
-
-
-def test_what_a_bag_has_too_many_of_is_counted() -> None:
-    builder = StateChangesBuilder()
-    for at in range(20):
-        builder.add(at * 10 * S, [StateLevel("m", at % 2)], ["no way"])
-    found = builder.changes(at_most=5)
-    assert (len(found.changes), len(found.reports)) == (5, 5)
-    assert found.left_out == 14 + 15
 
 
 def test_statuses_and_goals_have_a_level_each() -> None:
@@ -107,12 +103,14 @@ def test_a_commanded_velocity_is_zero_where_all_of_it_is() -> None:
 numbers = st.sampled_from([0.0, -0.0, 1e-5, 0.04, 0.15, 0.3, 1.0, 80.0, -2.0, math.nan, math.inf])
 
 
-@given(st.lists(st.tuples(numbers, numbers), max_size=8))
-def test_levels_by_number_are_those_of_the_values(rows: list[tuple[float, float]]) -> None:
-    batteries = [levels_of({"voltage": a, "percentage": b}, BATTERY) for a, b in rows]
-    assert [*levels_by_number(BATTERY, ["voltage", "percentage"], rows)] == batteries
-    velocities = [levels_of({"linear": {"x": a}, "angular": {"z": b}}, TWIST) for a, b in rows]
-    assert [*levels_by_number(TWIST, ["x", "z"], rows)] == velocities
+@given(st.lists(numbers, max_size=8))
+def test_levels_of_columns_are_those_of_the_values(rows: list[float]) -> None:
+    column = np.array(rows, np.float64)
+    charges = charge_levels(column).tolist()
+    known = [levels_of({"percentage": number}, BATTERY) for number in rows]
+    assert charges == [found[0].value if found else -1 for found in known]
+    velocities = [levels_of({"linear": {"x": number}}, TWIST)[0].value for number in rows]
+    assert (~is_still(column)).tolist() == [bool(level) for level in velocities]
 
 
 def test_a_log_entry_counts_from_warn_on_and_says_how_bad_it_is() -> None:

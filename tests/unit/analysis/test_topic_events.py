@@ -1,36 +1,33 @@
 from __future__ import annotations
 
-from itertools import groupby
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
-from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable
-from ros2_memory.analysis.state_changes import StateLevel
+from ros2_memory.analysis.intervals import IntervalTable
+from ros2_memory.analysis.state_changes import Change, Held, StateLevel
+from ros2_memory.analysis.stated import events_of as events_of_stated
+from ros2_memory.analysis.stated import joined_stated, stated_by
 from ros2_memory.analysis.topic_events import (
     EMPTY_STATE,
-    KnownFlag,
     ReportedError,
     State,
-    Toggle,
     TopicEvents,
-    TopicEventsBuilder,
+    joined_events,
     state_of,
 )
-from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.lake.event_codec import decode_topic_events, encode_topic_events
 
 Messages = list[tuple[int, State]]
 
 
-def events_of(messages: Messages, at_most: int | None = None) -> TopicEvents | None:
-    builder = TopicEventsBuilder()
-    for time, state in messages:
-        builder.add(time, state)
-    return builder.events(at_most)
+def events_of(messages: Messages) -> TopicEvents | None:
+    return events_of_stated(
+        stated_by([time for time, _ in messages], [state for _, state in messages])
+    )
 
 
 def seeing(*labels: str) -> State:
@@ -77,7 +74,7 @@ def histories(draw: st.DrawFn) -> tuple[Messages, list[int]]:
 def _comparable(events: TopicEvents | None) -> object:
     """Flips of several booleans at one time stand in no order."""
     assert events is not None
-    flips = sorted(events.toggles, key=lambda flip: (flip.time, flip.path))
+    flips = sorted(events.toggles, key=lambda flip: (flip.time, flip.name))
     known = sorted(events.known)
     seen = events.visible.intervals()
     state = events.changes
@@ -86,11 +83,9 @@ def _comparable(events: TopicEvents | None) -> object:
 
 
 def _glimpse(label: str, at: int) -> IntervalTable:
-    watcher = IntervalBuilder(1)
-    watcher.add(at, [label])
-    part = watcher.part()
-    assert part is not None
-    return part.visible
+    events = events_of([(at, seeing(label))])
+    assert events is not None
+    return events.visible
 
 
 @given(histories())
@@ -98,28 +93,25 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
     history: tuple[Messages, list[int]],
 ) -> None:
     messages, cuts = history
-    builder = TopicEventsBuilder()
-    for begin, end in zip([0, *cuts], [*cuts, len(messages)], strict=True):
-        part = events_of(messages[begin:end])
-        if part is not None:
-            builder.join(part)
-    assert _comparable(builder.events()) == _comparable(events_of(messages))
+    ends = zip([0, *cuts], [*cuts, len(messages)], strict=True)
+    parts = [events_of(messages[begin:end]) for begin, end in ends]
+    whole = joined_events([part for part in parts if part is not None])
+    assert _comparable(whole) == _comparable(events_of(messages))
 
 
-@given(histories())
-def test_many_messages_without_an_event_are_taken_as_if_one_by_one(
-    history: tuple[Messages, list[int]],
+@given(histories(), st.data())
+def test_messages_of_tables_that_overlap_are_taken_as_those_of_one(
+    history: tuple[Messages, list[int]], data: st.DataObject
 ) -> None:
-    messages, _ = history
-    builder = TopicEventsBuilder()
-    for is_empty, group in groupby(messages, lambda each: each[1] is EMPTY_STATE):
-        if is_empty:
-            builder.add_empty([time for time, _ in group])
-        else:
-            for time, state in group:
-                builder.add(time, state)
-    builder.add_empty([])
-    assert builder.events() == events_of(messages)
+    # Of equal times either may be first.
+    messages = [(time + nth, state) for nth, (time, state) in enumerate(history[0])]
+    tables = data.draw(st.lists(st.integers(0, 2), min_size=len(messages), max_size=len(messages)))
+    parts = [
+        [message for message, table in zip(messages, tables, strict=True) if table == nth]
+        for nth in range(3)
+    ]
+    stated = [stated_by(*([*each] for each in zip(*part, strict=True))) for part in parts if part]
+    assert _comparable(events_of_stated(joined_stated(stated))) == _comparable(events_of(messages))
 
 
 def test_a_boolean_that_toggles_is_reported_with_its_new_value() -> None:
@@ -127,8 +119,8 @@ def test_a_boolean_that_toggles_is_reported_with_its_new_value() -> None:
     events = events_of(each_second(*flags))
     assert events is not None
     assert events.toggles == (
-        Toggle("value", 2 * NS_PER_S, True),
-        Toggle("value", 3 * NS_PER_S, False),
+        Change("value", 2 * NS_PER_S, True),
+        Change("value", 3 * NS_PER_S, False),
     )
 
 
@@ -141,8 +133,9 @@ def test_an_error_that_is_reported_again_is_listed_once_with_its_count() -> None
 
 def test_what_is_beyond_the_limit_is_counted() -> None:
     blinking = [seeing("cup") if nth % 4 == 0 else seeing() for nth in range(40)]
-    events = events_of(each_second(*blinking), at_most=3)
-    assert events is not None
+    whole = events_of(each_second(*blinking))
+    assert whole is not None
+    events = whole.limited(3, 3)
     assert [each.first for each in events.visible.intervals()] == [0, 4 * NS_PER_S, 8 * NS_PER_S]
     assert events.left_out == 7
 
@@ -152,21 +145,21 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
 ) -> None:
     monkeypatch.setattr(topic_events, "MAX_HELD", 10)
     monkeypatch.setattr(topic_events, "MAX_SEEN", 10)
-    builder = TopicEventsBuilder()
+    parts = []
     for nth in range(15):
         at = nth * 100 * NS_PER_S
-        known = [KnownFlag(path, at, first=False, last=True) for path in ("x", "y")]
-        builder.join(
+        known = [Held(path, at, first=False, last=True) for path in ("x", "y")]
+        parts.append(
             TopicEvents(
                 at,
                 at + NS_PER_S,
                 visible=_glimpse(f"cup {nth}", at),
                 known=tuple(known),
-                toggles=tuple(Toggle(each.path, at + 1, True) for each in known),
+                toggles=tuple(Change(each.name, at + 1, True) for each in known),
                 errors=(ReportedError(f"error {nth}", at, at, 1),),
             )
         )
-    events = builder.events()
+    events = joined_events(parts)
     assert events is not None
     assert events.visible.size == len(events.toggles) == len(events.errors) == 10
     assert events.visible.intervals()[0].label == "cup 0"

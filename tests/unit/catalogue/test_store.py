@@ -6,14 +6,12 @@ import random
 import sqlite3
 import threading
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 import structlog
 
-from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
@@ -126,35 +124,16 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
         )
         assert again.poses(held.topic, [number]).get(number) == held.poses
         assert again.standstills(held.topic, [number]).get(number) == held.standstills
-        assert again.topic_events(held.topic, [number]) == {
-            number: NO_EVENTS if held.events is not None and held.events.is_empty else held.events
-        }
         assert again.edges(held.topic, [number]).get(number) == held.edges
         assert again.messages(held.topic, [number]).get(number) == held.kept
     assert topic(DIGEST, "/odom").poses is not None
     assert topic(DIGEST, "/tf_static").kept is not None
-    standstills, events = topic(DIGEST, "/odom").standstills, topic(DIGEST, "/bumper").events
+    standstills = topic(DIGEST, "/odom").standstills
     assert standstills is not None
     assert standstills.head
-    assert events is not None
-    assert len(events.toggles) == 1
 
 
-def test_a_topic_that_cannot_be_decoded_has_no_events_and_is_not_taken_for_a_quiet_one(
-    tmp_path: Path,
-) -> None:
-    catalogue = catalogue_in(tmp_path)
-    quiet, unknown = topic(DIGEST, "/tf_static"), topic(DIGEST, "/bumper")
-    catalogue.put(KEY, replace(DIGEST, topics=(quiet, replace(unknown, events=None))))
-    [number] = catalogue.find([KEY])
-    assert number is not None
-    assert catalogue.topic_events("/tf_static", [number]) == {number: NO_EVENTS}
-    assert catalogue.topic_events("/bumper", [number]) == {number: None}
-    catalogue.close()
-    assert catalogue.topic_events("/tf_static", [number]) == {}
-
-
-def test_events_are_read_from_a_file_that_replaced_another(
+def test_digests_are_read_from_a_file_that_replaced_another(
     tmp_path: Path,
 ) -> None:
     catalogue = catalogue_in(tmp_path)
@@ -170,19 +149,6 @@ def test_events_are_read_from_a_file_that_replaced_another(
     assert catalogue.standstills("/odom", [former, number]) == {
         number: topic(DIGEST, "/odom").standstills
     }
-    events = topic(DIGEST, "/bumper").events
-    assert catalogue.topic_events("/bumper", [former, number]) == {number: events}
-
-
-def test_an_entry_that_was_dropped_is_not_taken_for_one_of_a_quiet_topic(tmp_path: Path) -> None:
-    catalogue = catalogue_in(tmp_path)
-    catalogue.put(KEY, DIGEST)
-    [number] = catalogue.find([KEY])
-    assert number is not None
-    for later in ("another configuration", "a third"):
-        catalogue_in(tmp_path, later).put(KEY, DIGEST)
-    catalogue_in(tmp_path, "a third").forget_older_configurations()
-    assert catalogue.topic_events("/bumper", [number]) == {}
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,16 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.analysis.motion.odometry import PoseDigest
-from ros2_memory.catalogue.codec import decode_poses, decode_standstills, decode_topic_events
+from ros2_memory.analysis.topic_events import MAX_PER_BAG
+from ros2_memory.catalogue.codec import decode_poses, decode_standstills
 from ros2_memory.columns.store import BagKey
 from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import TimeRange
+from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
+from ros2_memory.insights.topic_events import events_of_bag
+from ros2_memory.lake.event_codec import decode_topic_events
 from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, to_arrow, topic_key
 from tests.support.bags import detections, write_mcap
@@ -103,7 +106,9 @@ def test_digests_fold_to_what_the_memory_answers(
     assert decode_standstills(stood) == catalogue.standstills("/odom", [numbers])[numbers]
     events = packed[SEEN, "events"]
     assert isinstance(events, bytes)
-    assert decode_topic_events(events) == catalogue.topic_events(SEEN, [numbers])[numbers]
+    bag = memory.index.snapshot().bags[0]
+    found = events_of_bag(View(memory, Call()), bag, [SEEN])
+    assert decode_topic_events(events) == found[SEEN].limited(MAX_PER_BAG, MAX_PER_BAG)
     counts = Counter[str]()
     for row in joined(both, "digests"):
         if row["kind"] == "topic":

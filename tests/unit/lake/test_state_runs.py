@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.state_changes import StateLevel
-from ros2_memory.analysis.topic_events import EMPTY_STATE, State, TopicEvents, TopicEventsBuilder
+from ros2_memory.analysis.stated import events_of, stated_by
+from ros2_memory.analysis.topic_events import EMPTY_STATE, State, TopicEvents
 from ros2_memory.lake.memory.rows_as_messages import stated_in, states
 from ros2_memory.lake.state_runs import (
     EmptyRuns,
@@ -32,13 +33,7 @@ MESSAGES = st.lists(
 
 
 def added(stated: list[tuple[int, State | None]]) -> TopicEvents | None:
-    builder = TopicEventsBuilder()
-    for time, state in stated:
-        if state is None:
-            builder.add_undecodable()
-        else:
-            builder.add(time, state)
-    return builder.events()
+    return events_of(stated_by([time for time, _ in stated], [state for _, state in stated]))
 
 
 @given(MESSAGES)

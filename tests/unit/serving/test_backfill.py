@@ -103,12 +103,11 @@ def test_what_recordings_that_touch_hold_together_is_stored_before_anybody_asks(
     for number in range(2):
         start = T0 + number * 10 * NS_PER_S
         messages = [odom(start + n * NS_PER_S, number + n / 10, 0.0) for n in range(10)]
-        messages += [text(start + n * NS_PER_S, f"word {n}", "/said") for n in range(10)]
         write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", messages)
     memory = recalling(tmp_path)
     backfill = backfill_of(memory, tmp_path)
     fill_catalogue(backfill)
-    for question in ("poses /odom", "standstills /odom", "story /said"):
+    for question in ("poses /odom", "standstills /odom"):
         assert len(backfill.catalogue.cached_answers(question)) == 1, question
 
 
@@ -119,10 +118,10 @@ def test_beside_a_full_catalogue_only_bags_that_may_come_and_go_are_looked_at_ag
     hour = 3600 * NS_PER_S
     starts = [T0 + number * 3 * hour for number in range(7)]
     for number, start in enumerate(starts):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [text(start, "word", "/said")])
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(start, 0.0, 0.0)])
     looked: list[TimeWindow] = []
     monkeypatch.setattr(
-        serving_backfill, "store_shared_events", lambda _view, _topic, window: looked.append(window)
+        serving_backfill, "store_shared_paths", lambda _view, _topic, window: looked.append(window)
     )
 
     def windows() -> list[TimeWindow]:
@@ -133,7 +132,7 @@ def test_beside_a_full_catalogue_only_bags_that_may_come_and_go_are_looked_at_ag
     assert windows() == [TimeWindow.everything()]
     # The last of the segments, which has one bag.
     assert windows() == [TimeWindow(starts[6] - hour, starts[6] + 1 + hour)]
-    write_mcap(tmp_path / "rec" / "rec_2.mcap", [text(starts[2], "other", "/said")])
+    write_mcap(tmp_path / "rec" / "rec_2.mcap", [odom(starts[2], 1.0, 0.0)])
     assert windows() == [TimeWindow.everything()]
 
 
@@ -191,7 +190,6 @@ def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
                     catalogue.zone_maps,
                     catalogue.poses,
                     catalogue.standstills,
-                    catalogue.topic_events,
                     catalogue.edges,
                     catalogue.messages,
                 )

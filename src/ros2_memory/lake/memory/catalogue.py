@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.analysis.zone_map import UNBOUNDED, ZoneMap, joined_words, words_of
-from ros2_memory.catalogue.codec import decode_poses, decode_standstills, decode_topic_events
+from ros2_memory.catalogue.codec import decode_poses, decode_standstills
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.map_digest import NO_STATICS, decode_map_tracks
 from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.catalogue.topic_digest import EdgeDigest
+from ros2_memory.lake.event_codec import decode_topic_events
 from ros2_memory.lake.partitions import locations
 
 if TYPE_CHECKING:

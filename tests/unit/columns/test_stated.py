@@ -1,0 +1,119 @@
+"""What columns say that messages state: the same as each decoded message."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.stated import stated_by
+from ros2_memory.analysis.topic_events import state_of
+from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.stated import StatedColumns
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import Msg, goals, write_mcap
+from tests.support.drawn_tables import drawn_tables, stored
+from tests.support.examples import examples
+from tests.support.memories import memory_of, shipped_extractor
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.analysis.stated import Facts
+    from ros2_memory.analysis.topic_events import State
+    from ros2_memory.columns.table import Table
+    from tests.support.drawn_tables import Drawn
+
+EXTRACTOR = shipped_extractor()
+T0 = 1_784_000_000 * NS_PER_S
+SETTLED = (
+    "std_msgs/msg/Bool",
+    "std_msgs/msg/String",
+    "rcl_interfaces/msg/Log",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "sensor_msgs/msg/BatteryState",
+    "geometry_msgs/msg/Twist",
+    "ros2_vision_interfaces/msg/VisionDetectionArray",
+    "ros2_vision_interfaces/msg/StampedString",
+)
+
+
+def by_row(facts: Facts, rows: set[int]) -> set[tuple[int, str, str, float | None]]:
+    """Facts; of several scores of a label in a message the best one, to four digits."""
+    best: dict[tuple[int, str, str], float] = {}
+    cells = zip(facts.rows.tolist(), facts.codes.tolist(), facts.values.tolist(), strict=True)
+    for row, code, value in cells:
+        key = (row, *facts.words[code])
+        if row in rows:
+            best[key] = max(best.get(key, -math.inf), -math.inf if math.isnan(value) else value)
+    return {
+        (*key, round(value, 4) if math.isfinite(value) else value) for key, value in best.items()
+    }
+
+
+def states_of(drawn: Drawn) -> list[State | None]:
+    values = [EXTRACTOR.exact(message, drawn.type) for message in drawn.messages]
+    return [state_of(value, drawn.type) for value in values]
+
+
+def compared(table: Table, drawn: Drawn) -> int | None:
+    """Checks what the columns settle; returns how many messages are to be read, None for all."""
+    expected = stated_by(table.log_times.tolist(), states_of(drawn))
+    found = StatedColumns(EXTRACTOR).of(table)
+    if found is None:
+        return None
+    rows = {*range(len(table))} - {*found.to_read.tolist()}
+    for one, other in zip(found.stated.facts, expected.facts, strict=True):
+        assert by_row(one, rows) == by_row(other, rows)
+    return len(found.to_read)
+
+
+@settings(max_examples=examples(120), deadline=None)
+@given(drawn_tables())
+def test_columns_state_what_drawn_messages_state(drawn: Drawn) -> None:
+    compared(drawn.table, drawn)
+
+
+@settings(max_examples=examples(80), deadline=None)
+@given(drawn_tables(SETTLED))
+def test_nothing_is_read_where_columns_hold_what_matters(drawn: Drawn) -> None:
+    read = compared(drawn.table, drawn)
+    if read is None:  # an object without a name may hold detections
+        assert any(state.labels for state in states_of(drawn) if state is not None)
+    else:
+        assert read == 0
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(drawn_tables(SETTLED), st.sampled_from([0.0, 1e-6]))
+def test_rounded_columns_have_messages_read_rather_than_state_what_is_wrong(
+    drawn: Drawn, step: float
+) -> None:
+    compared(stored(drawn.table, step), drawn)
+
+
+def listing(ns: int, statuses: dict[int, int]) -> Msg:
+    """As an action server lists goals: each with when it was accepted."""
+    return replace(goals(T0, statuses), log_time=ns)
+
+
+@pytest.mark.parametrize("second", [{1: 2, 2: 2}, {1: 4}, {2: 2}, {}])
+def test_of_goals_only_messages_that_list_something_else_are_read(
+    tmp_path: Path, second: dict[int, int]
+) -> None:
+    listed = [{1: 2}, {1: 2}, second, second]
+    path = tmp_path / "bag.mcap"
+    write_mcap(path, [listing(T0 + nth * NS_PER_S, each) for nth, each in enumerate(listed)])
+    memory = memory_of(tmp_path)
+    [bag] = memory.index.snapshot().bags
+    [[table]] = decoded(memory.reader, bag.path)
+    found = StatedColumns(memory.extractor).of(table)
+    assert found is not None
+    assert found.to_read.tolist() == [0, 2]
+    assert not any(facts.rows.size for facts in found.stated.facts)
+    assert np.array_equal(found.stated.times, table.log_times)
