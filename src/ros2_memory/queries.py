@@ -154,7 +154,7 @@ def topic_range(
     note_unread(view, window)
     note_edges(view, window)
     note_robots(view, name, window)
-    extremes = extremes_of(view, name, window, fields, total) if fields else ()
+    extremes = extremes_of(view, name, window, fields) if fields else ()
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )

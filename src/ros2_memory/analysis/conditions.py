@@ -14,7 +14,6 @@ import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.analysis.zone_map import rounded
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
@@ -152,14 +151,6 @@ class Equals:
         return any(zone_map.can_contain_number(number) for number in self.numbers)
 
     @property
-    def number_bounds(self) -> tuple[float, float] | None:
-        """Between which numbers (inclusive) a leaf must be; None where it may be no number."""
-        if isinstance(self.value, str) or self.boolean is not None:
-            return None
-        least, most = min(self.numbers), max(self.numbers)
-        return rounded(least, up=False), rounded(most, up=True)
-
-    @property
     def is_on_texts(self) -> bool:
         """Whether no boolean and no number matches."""
         return self.boolean is None and not self.numbers
@@ -294,22 +285,6 @@ class Condition:
             or (isinstance(test, Contains) and test.is_number)
             or (isinstance(test, Equals) and _plain_text(test) is not None)
         )
-
-    @property
-    def bounds(self) -> tuple[float, float] | None:
-        """Between which numbers (inclusive) the field must be, where its numbers alone decide."""
-        if self.field is None:
-            return None
-        if isinstance(self.test, Beyond):
-            limit, above = self.test.limit, self.test.above
-            nearest = rounded(limit, up=not above)
-            # Greater numbers are rounded, and may be rounded to the limit.
-            if abs(limit) < _EXACT_BELOW:
-                nearest = math.nextafter(nearest, math.inf if above else -math.inf)
-            return (nearest, math.inf) if above else (-math.inf, nearest)
-        if isinstance(self.test, Equals):
-            return self.test.number_bounds
-        return None
 
     @property
     def is_on_texts_alone(self) -> bool:

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import positions
-from ros2_memory.analysis.field_ranges import joined
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.messages.conversions import ANGLES, unit
@@ -77,7 +77,6 @@ class PayloadTemplate:
         fixed: for each byte of the payload whether it is common to all.
         layout: where the numbers are.
         numbers: offsets of the numbers that are in the value unchanged.
-        names: the key of each of these.
         fields: the offsets of the numbers of each field, which is a dot-path.
         constants: fields of other numbers, which are in every value.
         times: the offsets of the times of each field, which is in seconds in the value.
@@ -95,7 +94,6 @@ class PayloadTemplate:
     fixed: Mask
     layout: CdrLayout
     numbers: tuple[int, ...]
-    names: tuple[str, ...]
     fields: tuple[tuple[str, tuple[int, ...]], ...]
     constants: tuple[tuple[str, tuple[int, ...]], ...]
     times: tuple[tuple[str, tuple[int, ...]], ...]
@@ -390,7 +388,6 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
         fixed=_fixed(layout),
         layout=layout,
         numbers=tuple(offset for offset, _ in found.numbers),
-        names=tuple(path.rpartition(".")[2] for _, path in found.numbers),
         fields=_by_field((path, offset) for offset, path in found.numbers),
         constants=_by_field(found.constants),
         times=_by_field((path, offset) for offset, path in found.times),
@@ -455,3 +452,12 @@ def _leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, JsonValue]]
             yield from _leaves(inner, path)
     else:
         yield path, value
+
+
+@lru_cache(4096)
+def joined(path: str, name: str) -> str:
+    """Returns the dot-path of a key below another."""
+    if name.removeprefix("-").isdecimal():
+        return path
+    plain = name.replace(".", "\0")  # no dot-path leads there
+    return f"{path}.{plain}" if path else plain

@@ -170,13 +170,8 @@ def has_errors(type_name: str) -> bool:
     return type_name in _ERROR_LEVELS
 
 
-def state_of(
-    value: JsonValue, type_name: str, detections: Sequence[Detection] | None = None
-) -> State:
-    """Returns what an extracted message of a type states.
-
-    `detections` are those in it, where they are known already.
-    """
+def state_of(value: JsonValue, type_name: str) -> State:
+    """Returns what an extracted message of a type states."""
     levels = levels_of(value, type_name) if has_levels(type_name) else ()
     if not has_events(type_name):
         return State(levels=levels) if levels else EMPTY_STATE
@@ -185,7 +180,7 @@ def state_of(
         reports = reports_of(value, type_name)
         state = State(errors=errors, levels=levels, reports=reports)
         return EMPTY_STATE if state.is_empty else state
-    best = _best_scores(detections_of(value) if detections is None else detections)
+    best = _best_scores(detections_of(value))
     labels = tuple(best)
     flags = tuple(_flags_in(value, ""))
     if not (labels or flags or levels):

@@ -33,7 +33,6 @@ from ros2_memory.analysis.motion.standstills import (
     StandstillRun,
 )
 from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Box, ZoneMap
-from ros2_memory.catalogue.field_columns import outward
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
@@ -46,6 +45,8 @@ if TYPE_CHECKING:
 _ZONES: Final = struct.Struct("<Bdd")
 _BOUNDS: Final = struct.Struct("<6f")
 _SIDES: Final = (-math.inf, math.inf) * 3
+_SINGLE: Final = struct.Struct("<f")
+_BITS: Final = struct.Struct("<i")
 _OPEN, _TEXTS, _FALSE, _TRUE, _WORDS, _BOX = 1, 2, 4, 8, 16, 32
 
 
@@ -307,3 +308,24 @@ def decode_counts(
     table[:, :, 1] += rows[:, :1]
     table[:, :, 2] += table[:, :, 1]
     return table
+
+
+def outward(number: float, towards: float) -> float:
+    """Returns a number that a float32 holds, near another and no less towards an infinity."""
+    try:
+        [near] = _SINGLE.unpack(_SINGLE.pack(number))
+    except OverflowError:
+        near = math.copysign(math.inf, number)
+    beyond = near > number if towards < 0 else near < number
+    return _next_single(near, towards) if beyond else near
+
+
+def _next_single(near: float, towards: float) -> float:
+    """Returns the float32 next to another, towards an infinity."""
+    [bits] = _BITS.unpack(_SINGLE.pack(near))
+    if near:
+        bits += 1 if (near > 0) == (towards > 0) else -1  # away from 0, or to it
+    else:
+        bits = 1 if towards > 0 else 1 - 2**31
+    [after] = _SINGLE.unpack(_BITS.pack(bits))
+    return float(after)

@@ -7,15 +7,11 @@ looked up again.
 
 from __future__ import annotations
 
-import json
-import math
 import threading
 from collections import OrderedDict
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
 from weakref import WeakKeyDictionary, ref
-
-import numpy as np
 
 from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Boxes, united
 from ros2_memory.catalogue.codec import decode_zone_map, encode_zone_map
@@ -27,7 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.zone_map import ZoneMap
-    from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.catalogue.topic_digest import EdgeDigest
     from ros2_memory.core.model import BagFile
@@ -35,7 +30,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
-Span: TypeAlias = "tuple[float, float]"
 Codec: TypeAlias = "tuple[Callable[[T], bytes], Callable[[bytes], T]]"
 
 _MOST_MESSAGES: Final = 65_536
@@ -44,42 +38,8 @@ _SEGMENT_COSTS: Final = 256
 """A segment counts as so many messages besides its own."""
 _MAX_DERIVED: Final = 8192
 """What is computed of segments and stays in memory: a recap of a week of 10 s splits has 4,000."""
-_MAX_BOUNDS: Final = 8
-"""Fields whose bounds stay in memory."""
 _UNKNOWN_STATE: Final = -1
 """The state of a catalogue that could not be read."""
-
-
-def _decode_span(packed: bytes) -> Span:
-    low, high = json.loads(packed)
-    return float(low), float(high)
-
-
-_SPAN: Final[Codec[Span]] = (lambda span: json.dumps(span).encode(), _decode_span)
-
-
-class FieldBounds:
-    """Between which bounds the numbers of a field are, in each of some entries."""
-
-    def __init__(self, numbers: Sequence[int], column: FieldColumn) -> None:
-        self._numbers = np.array(numbers, np.int64)
-        # An entry without a range may hold anything.
-        self._low = np.full(len(numbers), -np.inf)
-        self._high = np.full(len(numbers), np.inf)
-        order = np.argsort(self._numbers)
-        at = order[np.searchsorted(self._numbers, column.numbers, sorter=order)]
-        self._low[at], self._high[at] = column.low, column.high
-
-    @property
-    def span(self) -> Span:
-        """The least and the greatest number in all entries; NaN is none."""
-        if not len(self._numbers):
-            return math.inf, -math.inf
-        return float(np.fmin.reduce(self._low)), float(np.fmax.reduce(self._high))
-
-    def between(self, least: float, most: float) -> set[int]:
-        """Returns the entries that may have a number between two, inclusive."""
-        return {*self._numbers[(self._low <= most) & (self._high >= least)].tolist()}
 
 
 class SegmentDigests:
@@ -120,7 +80,6 @@ class SegmentDigests:
         }
         self._zone_map: dict[str, ZoneMap] = {}
         self._boxes: dict[str, Boxes] = {}
-        self._bounds: dict[str, FieldBounds] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._relatched: dict[str, dict[int, bool]] = {}
@@ -150,20 +109,6 @@ class SegmentDigests:
             self._zone_map,
             topic,
             lambda: self._stored(name, topic, compute, codec, stores=is_settled),
-        )
-
-    def field_span(self, topic: str, field: str, *, is_settled: bool = False) -> Span:
-        """Returns the least and the greatest number of a field in all entries with the topic.
-
-        Stored as `zone_map` is.
-        """
-        name = f"span {topic} {field}"
-
-        def compute() -> Span:
-            return self.field_bounds(topic, field).span
-
-        return self.derived(
-            name, lambda: self._stored(name, topic, compute, _SPAN, stores=is_settled)
         )
 
     def _stored(
@@ -209,20 +154,6 @@ class SegmentDigests:
         known = self.catalogue.boxes(topic, numbers)
         # As with zone maps, what could not be read rules nothing out.
         return Boxes({number: known.get(number, EVERYWHERE) for number in numbers})
-
-    def field_bounds(self, topic: str, field: str) -> FieldBounds:
-        """Returns between which bounds the numbers of a field are, for all entries at once.
-
-        Cached for the fields that were asked for last.
-        """
-        name = f"{topic} {field}"
-        if name not in self._bounds and len(self._bounds) >= _MAX_BOUNDS:
-            self._bounds = {}
-        return self._cached(self._bounds, name, lambda: self._field_bounds(topic, field))
-
-    def _field_bounds(self, topic: str, field: str) -> FieldBounds:
-        numbers = self._entries_with(topic)
-        return FieldBounds(numbers, self.catalogue.field_column(topic, field, numbers))
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
         """Returns the frame edges, for each entry that has them."""

@@ -17,7 +17,6 @@ from ros2_memory.catalogue.codec import (
     encode_standstills,
     encode_zone_map,
 )
-from ros2_memory.catalogue.field_columns import encode_field_ranges
 from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 from ros2_memory.columns.database import ROW_ID_BITS, Tables
@@ -43,7 +42,6 @@ TABLES: Final = Tables(
         "edges",
         "shapes",
         "maps",
-        "fields",
         "models",
         "configs",
     ),
@@ -55,14 +53,12 @@ CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
 CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
-  kept INTEGER, relatched INTEGER, undecodable TEXT, fields INTEGER, ranges BLOB, zones BLOB,
-  poses BLOB);
+  kept INTEGER, relatched INTEGER, undecodable TEXT, zones BLOB, poses BLOB);
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
 CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
   sights BLOB NOT NULL);
-CREATE TABLE fields (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
   log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
@@ -93,13 +89,11 @@ UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
 TRACK: Final = "track"
 SIGHTS: Final = "sights"
-RANGES: Final = "ranges"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
     ZONE_MAP: "held",
     POSES: "held",
-    RANGES: "held",
     STANDSTILLS: "tales",
     TRACK: "maps",
     SIGHTS: "maps",
@@ -287,7 +281,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
     edges, poses = topic.edges, topic.poses
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 11)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 9)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
@@ -296,7 +290,6 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
             topic.kept is not None,
             topic.relatched,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
-            *_ranges(connection, number, topic),
             packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),
             poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
         ),
@@ -314,31 +307,6 @@ def _insert_standstills(
         "INSERT INTO tales VALUES (?, ?)",
         (number << ROW_ID_BITS | bag, packed_by_model(connection, number, STANDSTILLS, plain)),
     )
-
-
-def _ranges(
-    connection: sqlite3.Connection, number: int, topic: TopicDigest
-) -> tuple[int | None, bytes | None]:
-    """Returns the id of the topic's fields, and their ranges; None where it has no number."""
-    if topic.fields is not None and not topic.fields:
-        return None, None
-    text, ranges = encode_field_ranges(topic.fields)
-    fields = _id_of(connection, "fields", "text", text)
-    return fields, packed_by_model(connection, number, RANGES, ranges)
-
-
-def range_rows(
-    connection: sqlite3.Connection, topic: int, row_ids: Sequence[int]
-) -> list[sqlite3.Row]:
-    """Returns row id, text of the fields and packed numbers of a topic's ranges in entries.
-
-    NULL for entries of bags in which it has no number; none for those that were deleted.
-    """
-    return connection.execute(
-        "SELECT bags.id, text, ranges FROM json_each(?) JOIN bags ON bags.id = value"
-        " LEFT JOIN held ON held.id = ? + bags.id LEFT JOIN fields ON fields.id = held.fields",
-        (json.dumps(row_ids), topic << ROW_ID_BITS),
-    ).fetchall()
 
 
 def _insert_record(

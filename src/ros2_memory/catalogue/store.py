@@ -25,7 +25,6 @@ from ros2_memory.catalogue.codec import (
     decode_zone_map,
 )
 from ros2_memory.catalogue.digest_config import may_be_one
-from ros2_memory.catalogue.field_columns import field_column
 from ros2_memory.catalogue.map_digest import decode_map_tracks
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.sql import (
@@ -34,7 +33,6 @@ from ros2_memory.catalogue.sql import (
     NO_TOPIC,
     OF_CONFIGS,
     POSES,
-    RANGES,
     RELATCHED,
     SIGHTS,
     STANDSTILLS,
@@ -52,7 +50,6 @@ from ros2_memory.catalogue.sql import (
     model_of,
     packed_by_model,
     payloads_of,
-    range_rows,
     renew_entry,
     topic_number,
     topic_rows,
@@ -77,7 +74,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.zone_map import Box, ZoneMap
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.digest_config import DigestConfig
-    from ros2_memory.catalogue.field_columns import FieldColumn
     from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.core.timebase import Ns
 
@@ -240,20 +236,6 @@ class Catalogue(Database):
             return EdgeDigest(pairs[text], first, last)
 
         return self._of_topic(topic, numbers, EDGES, decode)
-
-    def field_column(self, topic: str, field: str, numbers: Sequence[int]) -> FieldColumn:
-        """Returns the numbers of a field of the topic; not of entries where they are not known."""
-
-        def ask(connection: sqlite3.Connection) -> FieldColumn:
-            offset = self.offset
-            of_topic = topic_number(connection, topic)
-            model = model_of(connection, of_topic, RANGES)
-            rows = range_rows(connection, of_topic, self.row_ids(numbers))
-            return field_column(
-                [(offset + row[0], row[1], unpacked(row[2] or b"", model)) for row in rows], field
-            )
-
-        return self.read(ask, field_column([], field))
 
     def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
         """Returns the map digests of entries, with only their track.

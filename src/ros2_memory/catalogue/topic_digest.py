@@ -7,7 +7,6 @@ from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample
-from ros2_memory.analysis.field_ranges import FieldRangesBuilder
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
 from ros2_memory.analysis.motion.trajectory import PoseCollector
@@ -16,9 +15,8 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.field_ranges import FieldRange
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
@@ -64,7 +62,6 @@ class TopicDigest:
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
         relatched: whether one of its messages may repeat a message of another recording.
-        fields: the range of each field with numbers; None where they are not known.
         undecodable: by type, why none of its messages can be decoded; mostly empty.
     """
 
@@ -74,7 +71,6 @@ class TopicDigest:
     standstills: StandstillDigest | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
-    fields: Mapping[str, FieldRange] | None = None
     undecodable: tuple[tuple[str, str], ...] = ()
     relatched: bool = False
 
@@ -128,7 +124,6 @@ class TopicCollector:
         self._latched = latched
         self._relatched = False
         self._zone_map = ZoneMapBuilder()
-        self._fields = FieldRangesBuilder()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
         self._standstills = StandstillCollector()
         self._pairs: set[tuple[str, str]] | None = set()
@@ -163,7 +158,6 @@ class TopicCollector:
             standstills=None if self._poses is None else self._standstills.digest(),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
-            fields=self._fields.ranges(),
             undecodable=tuple(undecodable.items()),
             relatched=self._relatched,
         )
@@ -202,7 +196,6 @@ class TopicCollector:
         for record, sample in zip(batch, samples, strict=True):
             if isinstance(sample, UndecodableError):
                 self._zone_map.give_up()
-                self._fields.give_up()
                 self._pairs = self._poses = None
                 continue
             time = record.log_time
@@ -243,7 +236,6 @@ class TopicCollector:
         message = self._reader.decode(record)
         value = self._extractor.exact(message, type_name)
         self._zone_map.add(value)
-        self._fields.add(value)
         pairs = None
         if self._pairs is not None or self._map_transforms:
             pairs = self._add_transforms(self._transforms(message, record))
@@ -273,7 +265,6 @@ class TopicCollector:
         self, template: PayloadTemplate, _: _Sample, records: Sequence[Record], rows: Bytes
     ) -> Iterable[_Sample]:
         self._zone_map.add_rows(template, rows)
-        self._fields.add_rows(template, rows)
         if self._map is not None and self._map_transforms:
             self._map.add_rows(template, records, rows)
         if template.position is None and template.velocity is None:

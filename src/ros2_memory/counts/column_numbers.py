@@ -118,7 +118,7 @@ class PieceNumbers:
         self._most_read = most_read
         self._only_extremes = only_extremes
         self._read = 0
-        self._reader = FieldReader(view, topic, fields, by_digests=False)
+        self._reader = FieldReader(view, fields)
         self._reading = view.call.partial_after(READING_S)
         self._left: Ns = MAX_NS
         self._waiting: list[Rows] = []

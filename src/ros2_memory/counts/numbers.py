@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from functools import partial
-from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -14,26 +11,20 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
-from ros2_memory.counts.field_numbers import FieldReader
-from ros2_memory.history.bag_fold import shares_of
-from ros2_memory.history.counting import Counted, count_messages
+from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import open_span
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from typing import TypeAlias
 
     from numpy.typing import NDArray
 
     from ros2_memory.core.errors import UndecodableError
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
-    from ros2_memory.counts.field_numbers import FieldNumbers, Numbers, NumberTable
-    from ros2_memory.history.bag_fold import Share
-    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.results import BinColumn, Bins
@@ -94,83 +85,17 @@ def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times
     edges = binned.bins.edges[1:-1]
     size = len(binned.bins.member)
     counts, first, last = [0] * size, [MAX_NS] * size, [MIN_NS] * size
-    of_columns = view.memory.columns is not None
-    count = count_messages if of_columns else _counted_by_shares
-    for counted in count(view, topic, binned.counted, edges):
+    for counted in count_messages(view, topic, binned.counted, edges):
         counts[counted.piece] += counted.messages
         first[counted.piece] = min(first[counted.piece], counted.first)
         last[counted.piece] = max(last[counted.piece], counted.last)
     return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
 
 
-def _counted_by_shares(
-    view: View, topic: str, window: TimeWindow, edges: Times
-) -> Iterator[Counted]:
-    """Does as `count_messages` where there are no columns: in a lake."""
-    for share in shares_of(view, topic, window):
-        view.bags.check_deadline()
-        yield from _held(view, topic, share, window, edges.tolist())
-
-
-def _held(
-    view: View, topic: str, share: Share, window: TimeWindow, edges: Sequence[Ns]
-) -> Sequence[Counted]:
-    """Returns the messages of a share between edges; remembered where a window covers the share."""
-    digests = view.bags.digests_of(share.segment)
-    inner = tuple(edge for edge in edges if share.first < edge <= share.last)
-    begin = bisect_right(edges, share.first)
-    if digests is None or not share.is_covered_by(window):
-        return _counted_in(view, topic, share, window, edges)
-    # A list of none or one: what cannot be read now is counted again.
-    known: list[Sequence[Counted]] = digests.derived(f"counts {topic} {inner} {share.key}", list)
-    if not known:
-        with view.notes.isolated():
-            found = _counted_in(view, topic, share, window, inner)
-            if view.notes.complete:
-                known.append(found)
-    else:
-        found = [*known[0]]
-    return [counted._replace(piece=begin + counted.piece) for counted in found]
-
-
-def _counted_in(
-    view: View, topic: str, share: Share, window: TimeWindow, edges: Sequence[Ns]
-) -> list[Counted]:
-    """Counts the messages of a share between edges.
-
-    Messages are read where recordings overlap; the times of messages where a bag lies on both
-    sides of an edge.
-    """
-    found: dict[int, Counted] = {}
-
-    def add(piece: int, count: int, first: Ns, last: Ns) -> None:
-        known = found.get(piece, Counted(piece, 0, first, last))
-        found[piece] = Counted(
-            piece, known.messages + count, min(known.first, first), max(known.last, last)
-        )
-
-    def is_uncut(group: Group) -> bool:
-        begin, end = (bisect_right(edges, at) for at in (group.first, group.last))
-        return group.is_inside and begin == end
-
-    for whole in share.groups(view, topic, window):
-        for group in [whole] if is_uncut(whole) else view.apart(topic, whole):
-            if is_uncut(group):
-                piece = bisect_right(edges, group.first)
-                add(piece, view.count_in(topic, group), group.first, group.last)
-                continue
-            for piece, times in groupby(group.times(), key=partial(bisect_right, edges)):
-                here = [*times]
-                add(piece, len(here), here[0], here[-1])
-    return [*found.values()]
-
-
 def _numbers(
     view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]
 ) -> list[Sequence[_Cell | None]]:
     """Returns for each field the numbers in each bin, and in all of them together."""
-    if view.memory.columns is None:
-        return _numbers_by_shares(view, topic, binned, fields)
     found = PieceNumbers(view, topic, fields, binned.bins.edges[1:-1])
     found.collect(binned.counted)
     binned.count_since(found.since)
@@ -203,79 +128,11 @@ def _note_failures(view: View, failures: Sequence[UndecodableError]) -> None:
         view.notes.add(f"messages left out, since they cannot be decoded: {reason}")
 
 
-def _numbers_by_shares(
-    view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]
-) -> list[Sequence[_Cell | None]]:
-    """Does as `_numbers` where there are no columns: in a lake."""
-    reader = FieldReader(view, topic, fields)
-    folded = reader.over(binned.counted, binned.bins.edges[1:-1].tolist())
-    binned.count_since(folded.since)
-    _note_failures(view, reader.failures)
-    firsts = [at for part in folded.parts for at in part.first]
-    among = binned.bins.among(firsts)
-    rows = [np.flatnonzero(each) for each in (*among.T, np.ones(len(firsts), np.bool_))]
-    extremes = _Extremes(reader, folded.parts)
-    return [[extremes.cell(at, some.tolist()) for some in rows] for at in range(len(fields))]
-
-
 class _Cell:
     """The numbers of one field in one bin: the mean, and least and greatest with their times."""
 
     def __init__(self, mean: float, least: tuple[float, Ns], most: tuple[float, Ns]) -> None:
         self.mean, self.least, self.most = mean, least, most
-
-
-class _Extremes:
-    """Finds the least and the greatest number of many short times, and reads only what it must."""
-
-    def __init__(self, reader: FieldReader, parts: Sequence[NumberTable]) -> None:
-        self._reader = reader
-        self._first = [at for part in parts for at in part.first]
-        self._last = [at for part in parts for at in part.last]
-        self._numbers = [each for part in parts for each in part.numbers]
-        self._read: dict[int, Numbers | None] = {}
-
-    def cell(self, field: int, rows: Sequence[int]) -> _Cell | None:
-        """Returns the numbers of a field in some of the times; None if there are none."""
-        some = [row for row in rows if self._numbers[row][field].size]
-        count = sum(self._numbers[row][field].size for row in some)
-        if not count:
-            return None
-        total = math.fsum(self._numbers[row][field].total for row in some)
-        least = self._furthest(field, some, 1)
-        most = self._furthest(field, some, -1)
-        mean = _mean(total, count)
-        return _Cell(mean, (least[0] + 0.0, least[1]), (0.0 - most[0], most[1]))
-
-    def _furthest(self, field: int, rows: Sequence[int], sign: int) -> tuple[float, Ns]:
-        """Returns the least number times `sign`, and when it was first."""
-        bounds = sorted(
-            (_end(self._numbers[row][field], sign)[0], self._first[row], row) for row in rows
-        )
-        best = (math.inf, 0)
-        for bound, first, row in bounds:
-            if (bound, first) > best:
-                break
-            number, at = _end(self._exact(field, row, sign), sign)
-            if at is not None:
-                best = min(best, (number, at))
-        return best
-
-    def _exact(self, field: int, row: int, sign: int) -> FieldNumbers:
-        """Returns the numbers of a time, read where the catalogue has bounds alone."""
-        known = self._numbers[row][field]
-        if _end(known, sign)[1] is not None:
-            return known
-        if row not in self._read:
-            self._read[row] = self._reader.between(self._first[row], self._last[row])
-        read = self._read[row]
-        return known if read is None else read[field]
-
-
-def _end(numbers: FieldNumbers, sign: int) -> tuple[float, Ns | None]:
-    if sign > 0:
-        return numbers.low, numbers.low_at
-    return -numbers.high, numbers.high_at
 
 
 def _add_columns(binned: BinnedWindow, field: str, cells: Sequence[_Cell | None]) -> None:

@@ -63,11 +63,6 @@ class SegmentFold(Generic[T, R]):
         cut_ns: how long a group is cut at least: it is read, since a digest does not show what of
             it is where.
         failures: where `collect` puts messages that cannot be decoded.
-        leaves_out: whether a digest lacks something, since there is too much of it.
-        collect_all: makes one that lacks nothing, which is not stored.
-        unread: what serves this one question as well as the digest of a group that would be read,
-            with the times of its first and last message; None where nothing does.
-        question: the name of what is folded with `unread`.
     """
 
     kind: DigestKind[T]
@@ -77,10 +72,6 @@ class SegmentFold(Generic[T, R]):
     edges: Sequence[Ns] = ()
     cut_ns: Ns = _CUT_NS
     failures: Sequence[UndecodableError] = ()
-    leaves_out: Callable[[T], bool] | None = None
-    collect_all: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]] | None = None
-    unread: Callable[[Group], Digested[T] | None] | None = None
-    question: str = ""
 
     def over(self, view: View, topic: str, window: TimeWindow) -> Folded[R]:
         """Folds a window.
@@ -112,43 +103,38 @@ class SegmentFold(Generic[T, R]):
         """Returns what is folded of a share, and since when, if not all was read in time."""
         digests = view.bags.digests_of(share.segment)
         if digests is None or not share.is_covered_by(window):
-            return self._fold(view, topic, share, window, reading)[:2]
+            return self._fold(view, topic, share, window, reading)
         inner = [edge for edge in self.edges if share.first < edge <= share.last]
         # The type of a name is one: `name` is part of it.
         name = f"{self.name} {topic} {inner} {share.key}"
-        for_all: list[R | None] = digests.derived(name, list)
-        for_this = digests.derived(f"{name} {self.question}", list) if self.question else for_all
-        known = for_all or for_this
+        known: list[R | None] = digests.derived(name, list)
         if known:
             return known[0], None
         with view.notes.isolated():
-            folded, since, left_unread = self._fold(view, topic, share, window, reading)
+            folded, since = self._fold(view, topic, share, window, reading)
             if since is None and view.notes.complete and not self.failures:
-                (for_this if left_unread else for_all).append(folded)
+                known.append(folded)
         return folded, since
 
     def _fold(
         self, view: View, topic: str, share: Share, window: TimeWindow, reading: _Reading
-    ) -> tuple[R | None, Ns | None, bool]:
-        """Returns as `_share`, and whether groups were left unread for this question."""
+    ) -> tuple[R | None, Ns | None]:
         stored = StoredDigests(view, topic, self.kind, share.inside(window))
         found: list[Digested[T]] = []
         since: Ns | None = None
-        left_unread = False
         for group, known in self._looked_up(view, topic, share.groups(view, topic, window), stored):
             if known is not None:
-                found.append(known[0])
-                left_unread |= known[1]
+                found.append(known)
                 continue
             if reading.is_over:
                 since = group.last + 1
                 break
             found.extend(reversed([*self._made(view, group, stored)]))
-        return (self.reduce(found[::-1]) if found else None), since, left_unread
+        return (self.reduce(found[::-1]) if found else None), since
 
     def _looked_up(
         self, view: View, topic: str, groups: Sequence[Group], stored: StoredDigests[T]
-    ) -> Iterator[tuple[Group, tuple[Digested[T], bool] | None]]:
+    ) -> Iterator[tuple[Group, Digested[T] | None]]:
         """Yields groups, the newest first, with what `_look_up` returns.
 
         One that would have to be read is taken apart into its bags, where that can be done.
@@ -161,15 +147,12 @@ class SegmentFold(Generic[T, R]):
             else:
                 yield from ((part, self._look_up(part, stored)) for part in reversed(parts))
 
-    def _look_up(self, group: Group, stored: StoredDigests[T]) -> tuple[Digested[T], bool] | None:
-        """Returns what needs no reading, and whether it serves this one question alone."""
+    def _look_up(self, group: Group, stored: StoredDigests[T]) -> Digested[T] | None:
+        """Returns what needs no reading."""
         if not group.is_whole or self._is_cut(group):
             return None
         known = stored.of(group)
-        if known is not None and not self._lacks(known[0]):
-            return Digested(known[0], *known[1]), False
-        other = None if self.unread is None else self.unread(group)
-        return None if other is None else (other, True)
+        return None if known is None else Digested(known[0], *known[1])
 
     def _made(self, view: View, group: Group, stored: StoredDigests[T]) -> Iterator[Digested[T]]:
         """Yields the digest of a group that is read; several where it is cut."""
@@ -186,13 +169,7 @@ class SegmentFold(Generic[T, R]):
             if made is not None and span is not None:
                 if group.is_whole and failed == len(self.failures):
                     stored.store(group, made, span)
-                if self._lacks(made) and self.collect_all is not None:
-                    made, _ = self.collect_all(group.messages())
-                if made is not None:
-                    yield Digested(made, *span)
-
-    def _lacks(self, digest: T) -> bool:
-        return self.leaves_out is not None and self.leaves_out(digest)
+                yield Digested(made, *span)
 
     def _is_cut(self, group: Group) -> bool:
         is_long = group.last - group.first > self.cut_ns

@@ -139,3 +139,51 @@ class CandidateRows:
 def _together(group: Sequence[tuple[Ns, str]]) -> Candidate:
     topics = tuple(sorted({topic for _, topic in group}))
     return Candidate(TimeWindow(group[-1][0], group[0][0] + 1), topics)
+
+
+class CandidateTables:
+    """Finds the times of tables that may hold a match, by their zones, before a moment.
+
+    Attributes:
+        ruled_out: whether a table was left out.
+    """
+
+    def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
+        self.ruled_out = False
+        self._view = view
+        self._topics = topics
+        self._until = until
+        self._test = ColumnCondition(condition, view.memory.extractor)
+
+    def windows(self) -> Iterator[Candidate]:
+        """Yields the times in which a match can lie, newest first; they do not overlap."""
+        sources = [self._of_topic(topic) for topic in self._topics]
+        topics: set[str] = set()
+        start = stop = self._until
+        for last, first, topic in heapq.merge(*sources, key=lambda table: -table[0]):
+            if topics and last < start:
+                yield Candidate(TimeWindow(start, stop), tuple(sorted(topics)))
+                topics = set()
+            if not topics:
+                stop = min(last + 1, start)
+            topics.add(topic)
+            start = min(start, first)
+        if topics:
+            yield Candidate(TimeWindow(start, stop), tuple(sorted(topics)))
+
+    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, Ns, str]]:
+        window = TimeWindow(MIN_NS, self._until)
+        for rows in scan(
+            self._view,
+            topic,
+            window,
+            newest_first=True,
+            may_match=self._may_match,
+            may_be_empty=True,
+        ):
+            yield min(rows.last, self._until - 1), rows.first, topic
+
+    def _may_match(self, table: Table) -> bool:
+        found = self._test.may_match(table)
+        self.ruled_out |= not found
+        return found

@@ -22,7 +22,6 @@ from ros2_memory.analysis.conditions import (
     parse_condition,
     refusal_for,
 )
-from ros2_memory.analysis.field_ranges import field_named
 from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import (
     BagError,
@@ -34,7 +33,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history.candidates import CandidateRows
+from ros2_memory.history.candidates import CandidateRows, CandidateTables
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
@@ -286,8 +285,10 @@ class ReverseSearch:
         self._templates = Templates(view.memory.reader, view.memory.extractor)
         self._to_learn = _MOST_TEMPLATES
 
-    def candidates(self, until: Ns) -> CandidateBags:
-        """Returns the bags that can contain a match before a moment."""
+    def candidates(self, until: Ns) -> CandidateTables | CandidateBags:
+        """Returns the tables, in a lake the bags, that can contain a match before a moment."""
+        if self._view.memory.columns is not None:
+            return CandidateTables(self._view, self.topics, self.condition, until)
         return CandidateBags(self._view, self.topics, self.condition, until)
 
     def newest(self, until: Ns) -> StoredMessage | None:
@@ -300,7 +301,7 @@ class ReverseSearch:
         """
         if self._view.memory.columns is not None:
             return self._newest_by_columns(until)
-        candidates = self.candidates(until)
+        candidates = CandidateBags(self._view, self.topics, self.condition, until)
         noted_before = self._view.notes.keys()
         searched_to: Ns | None = None
         try:
@@ -565,13 +566,6 @@ def possible_entries(
         return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
     if not condition.can_match(digests.zone_map(topic, is_settled=is_settled)):
         return ()
-    bounds = condition.bounds
-    if bounds is not None and condition.field is not None:
-        field, (least, most) = field_named(condition.field), bounds
-        low, high = digests.field_span(topic, field, is_settled=is_settled)
-        if low > most or high < least:
-            return ()
-        return digests.field_bounds(topic, field).between(least, most)
 
     def possible() -> set[int]:
         maps = digests.zone_maps(topic)

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
     from ros2_memory.counts.tested import Tested
+    from ros2_memory.history.candidates import Candidate
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
@@ -402,7 +403,7 @@ class _Sightings:
 
 
 def _parts(
-    windows: Iterator[SearchWindow], window: TimeWindow
+    windows: Iterator[SearchWindow | Candidate], window: TimeWindow
 ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
     """Yields the parts of a window in which topics can have matches, and these, newest first."""
     for each in windows:

@@ -240,18 +240,6 @@ def test_templates_that_are_remembered_change_no_digest(tmp_path: Path) -> None:
         assert remembering.digest(path).topics == alone.digest(path).topics
 
 
-def test_times_of_a_template_have_their_exact_range(tmp_path: Path) -> None:
-    stamps = [T0 + n * S // 7 for n in range(40)] + [0]
-    messages = [
-        tf(T0 + n, transform(at, "odom", "base", (1.0, 0.0, 0.0))) for n, at in enumerate(stamps)
-    ]
-    at_once, singly = both(write_mcap(tmp_path / "bag.mcap", messages))
-    name = "transforms.header.stamp"
-    one, other = ((each.topics[0].fields or {})[name] for each in (at_once, singly))
-    assert one._replace(total=0.0) == other._replace(total=0.0)
-    assert one.total == pytest.approx(other.total, rel=1e-15)
-
-
 def test_a_pose_array_has_every_place_in_its_box(tmp_path: Path) -> None:
     def poses(n: int) -> Msg:
         held = [

@@ -106,27 +106,6 @@ def test_what_a_segment_can_contain_is_stored_for_later_processes(
             zone_map_of_a_process()
 
 
-def test_between_which_bounds_a_field_is_in_a_segment_is_stored_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for n, speed in enumerate((0.5, -1.5)):
-        write_mcap(tmp_path / "rec" / f"rec_{n}.mcap", [odom(T0 + n, 0.0, 0.0, vx=speed)])
-    memory = memory_of(tmp_path)
-    [run] = memory.index.snapshot().timeline.segments
-    recall = recalling(memory, tmp_path).recall
-    assert recall is not None
-    catalogue = recall.catalogue
-    for is_settled in (False, True):
-        digests = DigestCache(catalogue, tmp_path).digests_for(run, 0)
-        span = digests.field_span("/odom", "linear_velocity.x", is_settled=is_settled)
-        assert span == pytest.approx((-1.5, 0.5))
-    monkeypatch.setattr(catalogue, "field_column", None)
-    digests = DigestCache(catalogue, tmp_path).digests_for(run, 0)
-    assert digests.field_span("/odom", "linear_velocity.x") == span
-    with pytest.raises(TypeError):
-        digests.field_span("/odom", "linear_velocity.y")
-
-
 def test_a_catalogue_that_another_program_holds_is_written_to_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,20 +1,16 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.counts.field_numbers import numbers_in
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import field_extremes
-from ros2_memory.results import Extremes
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
@@ -115,20 +111,3 @@ def test_a_window_with_too_many_messages_to_read_says_so(
 def test_a_summary_of_many_numbers_has_no_extremes(summary: JsonValue) -> None:
     assert [*numbers_in(summary)] == []
     assert [*numbers_in({"bytes": 1, "rate": 2})] == [2.0, 1.0]
-
-
-@given(st.lists(st.lists(st.one_of(st.floats(), st.integers(-(10**400), 10**400)), max_size=4)))
-def test_extremes_are_the_least_and_the_greatest_finite_numbers(rows: list[list[float]]) -> None:
-    found: dict[str, Extremes] = {}
-    finite = [[*numbers_in([*row, True, None, "9"])] for row in rows]
-    for time, numbers in enumerate(finite):
-        if numbers:
-            field_extremes._update(found, "a", time, numbers)
-    flat = [number for numbers in finite for number in numbers]
-    assert sorted(map(abs, flat), reverse=True)[:1] <= [sys.float_info.max]
-    if not flat:
-        assert not found
-        return
-    assert (found["a"].least, found["a"].most) == (min(flat), max(flat))
-    assert found["a"].least in finite[found["a"].least_at]
-    assert found["a"].most in finite[found["a"].most_at]

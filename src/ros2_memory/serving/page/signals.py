@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from statistics import median
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,7 +11,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.reply import rounded
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.counts.column_numbers import PieceNumbers
-from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
 
@@ -26,9 +24,6 @@ if TYPE_CHECKING:
 
 MOST_SIGNALS: Final = 4
 MOST_BINS: Final = 400
-
-_BAGS_OF_A_BIN: Final = 2
-"""From so many bags in a bin on, bags count as a whole, by their digests."""
 
 
 class Signal(NamedTuple):
@@ -77,8 +72,7 @@ def signal_in(
         width = max((span.stop - span.start) // MOST_BINS, 1)
         # Bins begin at the same times in every answer, so that these can be joined.
         window = TimeWindow(window.start - window.start % width, window.stop)
-        found = _by_shares if memory.columns is None else _by_columns
-        parts, since, failures = found(view, topic, signal.field, window, width)
+        parts, since, failures = _numbers(view, topic, signal.field, window, width)
     except EpisodicError as error:
         return {**shown, "error": str(error)}
     if not parts:
@@ -93,7 +87,7 @@ def signal_in(
     return shown
 
 
-def _by_columns(view: View, topic: str, field: str, window: TimeWindow, width: Ns) -> _Found:
+def _numbers(view: View, topic: str, field: str, window: TimeWindow, width: Ns) -> _Found:
     """Returns the numbers of a field, of times that no edge of a bin cuts, in order."""
     inside = [
         (max(first, window.start), min(last, window.stop - 1))
@@ -112,28 +106,6 @@ def _by_columns(view: View, topic: str, field: str, window: TimeWindow, width: N
         for part in sorted(numbers.parts(0, piece))
     ]
     return parts, numbers.since, numbers.failures
-
-
-def _by_shares(view: View, topic: str, field: str, window: TimeWindow, width: Ns) -> _Found:
-    """Does as `_by_columns` where there are no columns: in a lake."""
-    reader = FieldReader(view, topic, (field,))
-    folded = reader.over(window, _edges(view, window, width))
-    parts = [
-        _Part(first, last, *(numbers[0].size, numbers[0].total, numbers[0].low, numbers[0].high))
-        for table in folded.parts
-        for first, last, numbers in zip(*table, strict=True)
-        if numbers[0].size
-    ]
-    return parts, folded.since, reader.failures
-
-
-def _edges(view: View, window: TimeWindow, width: Ns) -> Sequence[Ns]:
-    """Returns where bags are cut; nowhere where bins hold whole ones."""
-    bags = view.snapshot.timeline.overlapping(window)
-    lengths = [each.end - each.start for each in bags]
-    if lengths and width >= _BAGS_OF_A_BIN * median(lengths):
-        return ()
-    return range(window.start - window.start % width + width, window.stop, width)
 
 
 def _binned(parts: Sequence[_Part], width: Ns) -> list[tuple[float | None, ...]]:
