@@ -22,10 +22,10 @@ from ros2_memory.messages.detections import without_low_scores
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.core.model import JsonValue, Vector3
 
 Scalar: TypeAlias = bool | int | float | str
+_WORD: Final = re.compile(r"\w+")
 
 POSITION_KEYS: Final = ("position", "point", "translation")
 """Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""
@@ -103,12 +103,6 @@ class Contains:
         """
         return any(self.equal.is_leaf(each) for each in leaves(target, in_objects=False))
 
-    def can_match(self, zone_map: ZoneMap) -> bool:
-        """Returns whether some value of this zone map may contain the needle."""
-        if self.folded is not None and zone_map.can_contain_text(self.folded):
-            return True
-        return self.boolean is not None and zone_map.can_contain_boolean(self.boolean)
-
 
 @dataclass(frozen=True, slots=True)
 class Equals:
@@ -142,14 +136,6 @@ class Equals:
         """Returns whether any leaf at any depth is equal."""
         return any(self.is_leaf(leaf) for leaf in leaves(value))
 
-    def can_match(self, zone_map: ZoneMap) -> bool:
-        """Returns whether some value of this zone map may have such a leaf."""
-        if self.folded is not None and zone_map.can_contain_text(self.folded):
-            return True
-        if self.boolean is not None and zone_map.can_contain_boolean(self.boolean):
-            return True
-        return any(zone_map.can_contain_number(number) for number in self.numbers)
-
     @property
     def is_on_texts(self) -> bool:
         """Whether no boolean and no number matches."""
@@ -179,10 +165,6 @@ class Beyond:
             if isinstance(leaf, int | float) and not isinstance(leaf, bool)
         )
 
-    def can_match(self, zone_map: ZoneMap) -> bool:
-        """Returns whether some value of this zone map may have such a number."""
-        return zone_map.open or self._is_beyond(zone_map.high if self.above else zone_map.low)
-
     def _is_beyond(self, number: float) -> bool:
         return number > self.limit if self.above else number < self.limit
 
@@ -204,15 +186,6 @@ class NearPosition:
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any position in the value is near."""
         return any(self.is_near(x, y, z) for x, y, z in positions(value))
-
-    def can_match(self, zone_map: ZoneMap) -> bool:
-        """Returns whether some value of this zone map may have a position that is near."""
-        return zone_map.can_contain_place(self.x, self.y, self.z, self.tolerance_m)
-
-    def can_match_elsewhere(self, zone_map: ZoneMap) -> bool:
-        """Returns the same for a position that only a field leads to, whose numbers are known."""
-        axes = (self.x, self.y) if self.z is None else (self.x, self.y, self.z)
-        return all(zone_map.can_contain_number_near(axis, self.tolerance_m) for axis in axes)
 
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Returns whether a position (m) is near; its z may be NaN where none is asked."""
@@ -264,16 +237,20 @@ class Condition:
             return True
         return self.test.matches(target)
 
-    def can_match(self, zone_map: ZoneMap) -> bool:
-        """Returns whether some value of this zone map may match; False rules all of them out.
+    def may_match(self, words: str) -> bool:
+        """Returns whether some value may match whose texts have these words alone.
 
-        The target of a field is part of the value, so whatever the whole value rules out is out.
+        They are casefolded, each on a line of its own: longest runs of letters and digits.
         """
-        if self.field is not None and isinstance(self.test, NearPosition):
-            return self.test.can_match_elsewhere(zone_map)
-        if self.field is not None and isinstance(self.test, Contains):
-            return self.test.can_match(zone_map) or self.test.equal.can_match(zone_map)
-        return self.test.can_match(zone_map)
+        test = self.test
+        if isinstance(test, Beyond | NearPosition):
+            return True
+        equal = test.equal if isinstance(test, Contains) else test
+        is_on_elements = isinstance(test, Equals) or self.field is not None
+        if test.folded is None or (is_on_elements and equal.numbers):
+            return True
+        # A longest run in the needle is part of a longest run in any text that contains it.
+        return all(word in words for word in words_of(test.folded))
 
     @property
     def can_be_refused(self) -> bool:
@@ -653,3 +630,8 @@ def _dot_paths(value: JsonValue, prefix: str) -> Iterator[str]:
     elif isinstance(value, list):
         for element in value[:1]:
             yield from _dot_paths(element, prefix)
+
+
+def words_of(folded: str) -> list[str]:
+    """Returns the words of a casefolded string."""
+    return _WORD.findall(folded)

@@ -8,11 +8,10 @@ is equal, and `packing` stores it once. The layouts belong to the catalogue's sc
 from __future__ import annotations
 
 import json
-import math
 import struct
 from dataclasses import fields
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,7 +31,6 @@ from ros2_memory.analysis.motion.standstills import (
     StandstillDigest,
     StandstillRun,
 )
-from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Box, ZoneMap
 from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
@@ -41,13 +39,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.odometry import Vertex
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import JsonValue, Vector3
-
-_ZONES: Final = struct.Struct("<Bdd")
-_BOUNDS: Final = struct.Struct("<6f")
-_SIDES: Final = (-math.inf, math.inf) * 3
-_SINGLE: Final = struct.Struct("<f")
-_BITS: Final = struct.Struct("<i")
-_OPEN, _TEXTS, _FALSE, _TRUE, _WORDS, _BOX = 1, 2, 4, 8, 16, 32
 
 
 def encode_poses(poses: PoseDigest) -> bytes:
@@ -154,71 +145,6 @@ def decode_standstill_run(packed: bytes) -> StandstillRun:
         raise ValueError(f"not joined standstills: {error}") from error
 
 
-def encode_zone_map(zones: ZoneMap) -> bytes:
-    """Encodes a zone map, the bounds of its box as float32, rounded outwards."""
-    flags = (
-        zones.open * _OPEN
-        | zones.texts * _TEXTS
-        | (False in zones.booleans) * _FALSE
-        | (True in zones.booleans) * _TRUE
-        | (zones.words is not None) * _WORDS
-        | (zones.box is not None) * _BOX
-    )
-    numbers = json.dumps(zones.numbers, separators=(",", ":"))
-    return b"".join(
-        (
-            _ZONES.pack(flags, zones.low, zones.high),
-            b"" if zones.box is None else _BOUNDS.pack(*map(outward, zones.box, _SIDES)),
-            numbers.encode(),
-            b"\n",
-            (zones.words or "").encode("utf-8", "surrogatepass"),
-        )
-    )
-
-
-def decode_zone_map(packed: bytes) -> ZoneMap:
-    """Decodes a zone map.
-
-    Raises:
-        ValueError: the bytes are not valid.
-    """
-    try:
-        flags, low, high = _ZONES.unpack_from(packed)
-        if flags & _OPEN:
-            return UNBOUNDED
-        box, end = None, _ZONES.size
-        if flags & _BOX:
-            box, end = Box(*_BOUNDS.unpack_from(packed, end)), end + _BOUNDS.size
-        numbers, _, words = packed[end:].partition(b"\n")
-        known = json.loads(numbers)
-        return ZoneMap(
-            words=words.decode("utf-8", "surrogatepass") if flags & _WORDS else None,
-            texts=bool(flags & _TEXTS),
-            booleans=(False,) * bool(flags & _FALSE) + (True,) * bool(flags & _TRUE),
-            low=low,
-            high=high,
-            numbers=None if known is None else tuple(known),
-            box=box,
-        )
-    except (TypeError, struct.error) as error:
-        raise ValueError(f"not a zone map: {error}") from error
-
-
-def decode_zone_box(packed: bytes) -> Box | None:
-    """Decodes the box of a zone map alone: `EVERYWHERE` of one that is open.
-
-    Raises:
-        ValueError: the bytes are no zone map.
-    """
-    try:
-        flags, _, _ = _ZONES.unpack_from(packed)
-        if flags & _OPEN:
-            return EVERYWHERE
-        return Box(*_BOUNDS.unpack_from(packed, _ZONES.size)) if flags & _BOX else None
-    except struct.error as error:
-        raise ValueError(f"not a zone map: {error}") from error
-
-
 def _decode_leg(stored: Leg | None) -> Leg | None:
     """Returns the same leg, with tuples instead of JSON's lists."""
     if stored is None:
@@ -308,24 +234,3 @@ def decode_counts(
     table[:, :, 1] += rows[:, :1]
     table[:, :, 2] += table[:, :, 1]
     return table
-
-
-def outward(number: float, towards: float) -> float:
-    """Returns a number that a float32 holds, near another and no less towards an infinity."""
-    try:
-        [near] = _SINGLE.unpack(_SINGLE.pack(number))
-    except OverflowError:
-        near = math.copysign(math.inf, number)
-    beyond = near > number if towards < 0 else near < number
-    return _next_single(near, towards) if beyond else near
-
-
-def _next_single(near: float, towards: float) -> float:
-    """Returns the float32 next to another, towards an infinity."""
-    [bits] = _BITS.unpack(_SINGLE.pack(near))
-    if near:
-        bits += 1 if (near > 0) == (towards > 0) else -1  # away from 0, or to it
-    else:
-        bits = 1 if towards > 0 else 1 - 2**31
-    [after] = _SINGLE.unpack(_BITS.pack(bits))
-    return float(after)

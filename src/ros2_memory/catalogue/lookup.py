@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 from weakref import WeakKeyDictionary, ref
 
-from ros2_memory.analysis.zone_map import EVERYWHERE, UNBOUNDED, Boxes, united
-from ros2_memory.catalogue.codec import decode_zone_map, encode_zone_map
 from ros2_memory.columns.store import BagKey
 from ros2_memory.core.model import BagState
 
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.catalogue.topic_digest import EdgeDigest
     from ros2_memory.core.model import BagFile
@@ -30,7 +26,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
-Codec: TypeAlias = "tuple[Callable[[T], bytes], Callable[[bytes], T]]"
 
 _MOST_MESSAGES: Final = 65_536
 """24 MB: those of a week of 10 s splits that each repeat one, or of a log's nine hours."""
@@ -78,8 +73,6 @@ class SegmentDigests:
             for topic in segment.spans
             for bags in (segment.bags_with(topic),)
         }
-        self._zone_map: dict[str, ZoneMap] = {}
-        self._boxes: dict[str, Boxes] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._relatched: dict[str, dict[int, bool]] = {}
@@ -93,67 +86,14 @@ class SegmentDigests:
         is_final = self.whole and not self.is_outdated
         return is_final and self.catalogue.is_current(self.as_of)
 
-    def zone_map(self, topic: str, *, is_settled: bool = False) -> ZoneMap:
-        """Returns what can be in any message of the topic in the bags with an entry.
+    def words(self, topic: str) -> Mapping[int, str | None]:
+        """Returns the words in texts of the topic, for each entry that has the topic.
 
-        It is stored where these bags stay together (`is_settled`): decoding what is stored of each
-        takes half of a process's first search of a week.
+        None where they are not known.
         """
-
-        def compute() -> ZoneMap:
-            return united(self.zone_maps(topic).values())
-
-        name = f"zones {topic}"
-        codec = encode_zone_map, decode_zone_map
-        return self._cached(
-            self._zone_map,
-            topic,
-            lambda: self._stored(name, topic, compute, codec, stores=is_settled),
-        )
-
-    def _stored(
-        self, name: str, topic: str, compute: Callable[[], T], codec: Codec[T], *, stores: bool
-    ) -> T:
-        """Returns what follows from all entries with a topic, computed where it is not stored."""
-        catalogue, failures = self.catalogue, self.catalogue.failures
-        encode, decode = codec
-        entries = [self._entries_with(topic)]
-        stored = catalogue.joined(name, entries) if entries[0] else None
-        if stored:
-            with suppress(ValueError, TypeError):  # a damaged file can hold anything
-                return decode(stored)
-        found = compute()
-        if stores and self.whole and catalogue.failures == failures and self._cache.stores:
-            # Once another program holds the file, nobody waits for each of a week's segments.
-            self._cache.stores = catalogue.store_joined(name, entries, encode(found))
-        return found
-
-    def zone_maps(self, topic: str) -> Mapping[int, ZoneMap]:
-        """Returns what can be in the messages of the topic, for each entry that has the topic.
-
-        They are many, so only those that were asked for last are cached: those of all entries
-        together are asked for first, then each.
-        """
-        last = self._cache.last_zone_maps
-        if last is not None and last[0]() is self and last[1] == topic:
-            return last[2]
-        numbers, failures = self._entries_with(topic), self.catalogue.failures
-        known = self.catalogue.zone_maps(topic, numbers)
-        # Where the catalogue failed since the entries were found, nothing is ruled out.
-        found = {number: known.get(number, UNBOUNDED) for number in numbers}
-        if self.catalogue.failures == failures:
-            self._cache.last_zone_maps = ref(self), topic, found
-        return found
-
-    def boxes(self, topic: str) -> Boxes:
-        """Returns the boxes of the zone maps; cached, since they are small and often asked for."""
-        return self._cached(self._boxes, topic, lambda: self._all_boxes(topic))
-
-    def _all_boxes(self, topic: str) -> Boxes:
         numbers = self._entries_with(topic)
-        known = self.catalogue.boxes(topic, numbers)
-        # As with zone maps, what could not be read rules nothing out.
-        return Boxes({number: known.get(number, EVERYWHERE) for number in numbers})
+        known = self.catalogue.words(topic, numbers)
+        return {number: known.get(number) for number in numbers}
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
         """Returns the frame edges, for each entry that has them."""
@@ -251,10 +191,6 @@ class DigestCache:
         catalogue: what has the entries.
         bag_dir: the folder of the bags.
         most_messages: so many stored messages stay in memory, and those of one segment at least.
-
-    Attributes:
-        last_zone_maps: those that were asked for last, with their segment and topic.
-        stores: whether what is joined from a segment's zone maps is stored.
     """
 
     def __init__(
@@ -266,10 +202,8 @@ class DigestCache:
     ) -> None:
         self.catalogue = catalogue
         self.bag_dir = bag_dir
-        self.stores = True
         self._most_messages = most_messages
         self._messages = 0
-        self.last_zone_maps: tuple[ref[SegmentDigests], str, Mapping[int, ZoneMap]] | None = None
         self._lock = threading.Lock()
         self._with_messages: OrderedDict[SegmentDigests, int] = OrderedDict()
         self._derived: OrderedDict[tuple[ref[SegmentDigests], str], None] = OrderedDict()

@@ -15,7 +15,6 @@ from ros2_memory.catalogue.codec import (
     encode_poses,
     encode_schema,
     encode_standstills,
-    encode_zone_map,
 )
 from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
@@ -53,7 +52,7 @@ CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
 CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
-  kept INTEGER, relatched INTEGER, undecodable TEXT, zones BLOB, poses BLOB);
+  kept INTEGER, relatched INTEGER, undecodable TEXT, poses BLOB);
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
@@ -81,7 +80,6 @@ _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 OF_CONFIGS: Final = f"config {_AMONG}"
 
 # Columns for `topic_rows`. Those of one word are packed, and the word is the kind of their model.
-ZONE_MAP: Final = "zones"
 POSES: Final = "poses"
 STANDSTILLS: Final = "rests"
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
@@ -92,7 +90,6 @@ SIGHTS: Final = "sights"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
-    ZONE_MAP: "held",
     POSES: "held",
     STANDSTILLS: "tales",
     TRACK: "maps",
@@ -281,7 +278,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
     edges, poses = topic.edges, topic.poses
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 9)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 8)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
@@ -290,7 +287,6 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
             topic.kept is not None,
             topic.relatched,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
-            packed_by_model(connection, number, ZONE_MAP, encode_zone_map(topic.zone_map)),
             poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
         ),
     )

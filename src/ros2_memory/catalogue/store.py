@@ -21,8 +21,6 @@ from ros2_memory.catalogue.codec import (
     decode_poses,
     decode_schema,
     decode_standstills,
-    decode_zone_box,
-    decode_zone_map,
 )
 from ros2_memory.catalogue.digest_config import may_be_one
 from ros2_memory.catalogue.map_digest import decode_map_tracks
@@ -39,7 +37,6 @@ from ros2_memory.catalogue.sql import (
     TABLES,
     TRACK,
     UNDECODABLE,
-    ZONE_MAP,
     any_is_gone,
     delete_entries,
     entry_rows,
@@ -71,7 +68,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.analysis.zone_map import Box, ZoneMap
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.digest_config import DigestConfig
     from ros2_memory.catalogue.map_digest import MapDigest
@@ -200,13 +196,10 @@ class Catalogue(Database):
     # Each of the next eight reads one topic of some entries. Entries that hold none of the topic,
     # and those that were deleted meanwhile, are left out.
 
-    def zone_maps(self, topic: str, numbers: Sequence[int]) -> dict[int, ZoneMap]:
-        """Returns what can be in the messages of the topic, by entry."""
-        return self._packed_of_topic(topic, numbers, ZONE_MAP, decode_zone_map)
-
-    def boxes(self, topic: str, numbers: Sequence[int]) -> dict[int, Box | None]:
-        """Returns the boxes of these zone maps; `EVERYWHERE` of those that are open."""
-        return self._packed_of_topic(topic, numbers, ZONE_MAP, decode_zone_box)
+    def words(self, topic: str, numbers: Sequence[int]) -> dict[int, str]:
+        """Returns the words in texts of the topic, as a lake knows them; see `may_match`."""
+        del topic, numbers
+        return {}
 
     def poses(self, topic: str, numbers: Sequence[int]) -> dict[int, PoseDigest]:
         """Returns the digests of the topic's poses; not where some message carries no pose."""

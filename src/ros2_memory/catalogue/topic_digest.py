@@ -10,7 +10,6 @@ from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
 from ros2_memory.analysis.motion.trajectory import PoseCollector
-from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import detections_of
 
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
-    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.map_digest import MapCollector
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
@@ -56,7 +54,6 @@ class TopicDigest:
 
     Attributes:
         topic: its name.
-        zone_map: what can be in its messages; rules conditions out.
         poses: the digest of its poses; None where some message carries none.
         standstills: among its poses; None where `poses` is None or has no valid one.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
@@ -66,7 +63,6 @@ class TopicDigest:
     """
 
     topic: str
-    zone_map: ZoneMap
     poses: PoseDigest | None
     standstills: StandstillDigest | None
     edges: EdgeDigest | None
@@ -123,7 +119,6 @@ class TopicCollector:
         self._templates = templates
         self._latched = latched
         self._relatched = False
-        self._zone_map = ZoneMapBuilder()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
         self._standstills = StandstillCollector()
         self._pairs: set[tuple[str, str]] | None = set()
@@ -153,7 +148,6 @@ class TopicCollector:
         few = self._kept is not None and (self._latched or bool(self._pairs))
         return TopicDigest(
             topic=self._topic,
-            zone_map=self._zone_map.zone_map(),
             poses=None if self._poses is None else self._poses.digest(),
             standstills=None if self._poses is None else self._standstills.digest(),
             edges=self._edges(),
@@ -195,7 +189,6 @@ class TopicCollector:
         self._add_sights(batch, samples)
         for record, sample in zip(batch, samples, strict=True):
             if isinstance(sample, UndecodableError):
-                self._zone_map.give_up()
                 self._pairs = self._poses = None
                 continue
             time = record.log_time
@@ -231,16 +224,16 @@ class TopicCollector:
         return self._sights[type_name]
 
     def _decode(self, record: Record) -> _Sample:
-        """Decodes one message; its value and edges count at once, since their order does not."""
+        """Decodes one message; its edges count at once, since their order does not."""
         type_name = record.channel.type
         message = self._reader.decode(record)
-        value = self._extractor.exact(message, type_name)
-        self._zone_map.add(value)
         pairs = None
         if self._pairs is not None or self._map_transforms:
             pairs = self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
-        seen = detections_of(value) if self._wants_sights(type_name) else None
+        seen = None
+        if self._wants_sights(type_name):
+            seen = detections_of(self._extractor.exact(message, type_name))
         return _Sample(*motion, seen, pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
@@ -264,7 +257,6 @@ class TopicCollector:
     def _apply(
         self, template: PayloadTemplate, _: _Sample, records: Sequence[Record], rows: Bytes
     ) -> Iterable[_Sample]:
-        self._zone_map.add_rows(template, rows)
         if self._map is not None and self._map_transforms:
             self._map.add_rows(template, records, rows)
         if template.position is None and template.velocity is None:

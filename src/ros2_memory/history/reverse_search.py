@@ -542,8 +542,7 @@ class CandidateBags:
         known = {} if digests is None else digests.numbers
         possible: Collection[int] = ()
         if digests is not None and known:
-            is_settled = self._view.snapshot.timeline.is_settled(segment)
-            possible = possible_entries(digests, topic, self.condition, is_settled=is_settled)
+            possible = possible_entries(digests, topic, self.condition)
             if digests.whole and not possible:
                 self.ruled_out = True
                 return
@@ -557,19 +556,14 @@ class CandidateBags:
                 self.ruled_out = True
 
 
-def possible_entries(
-    digests: SegmentDigests, topic: str, condition: Condition, *, is_settled: bool = False
-) -> Collection[int]:
+def possible_entries(digests: SegmentDigests, topic: str, condition: Condition) -> Collection[int]:
     """Returns the numbers of the entries that can contain a match."""
-    place = condition.place
-    if place is not None:
-        return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
-    if not condition.can_match(digests.zone_map(topic, is_settled=is_settled)):
-        return ()
 
     def possible() -> set[int]:
-        maps = digests.zone_maps(topic)
-        return {number for number, each in maps.items() if condition.can_match(each)}
+        words = digests.words(topic)
+        return {
+            number for number, known in words.items() if known is None or condition.may_match(known)
+        }
 
     return digests.derived(f"possible {topic} {condition!r}", possible)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.state_changes import Change
     from ros2_memory.analysis.stated import Stated
     from ros2_memory.analysis.topic_events import State
+    from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Group
@@ -51,11 +52,16 @@ def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
 
 
 def events_back(
-    view: View, topic: str, window: TimeWindow, reached: Callable[[Ns], None] = lambda _: None
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    *,
+    may_match: Callable[[Table], bool] | None = None,
+    reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[TopicEvents]:
     """Yields the events in times that do not overlap, the newest first.
 
-    `reached` is called before each table, as by `scan`.
+    Tables that cannot match need not show any. `reached` is called before each table, as by `scan`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -67,11 +73,11 @@ def events_back(
     together: list[Rows] = []
     for rows in scan(view, topic, window, newest_first=True, reached=reached):
         if together and rows.last < min(each.first for each in together):
-            yield from _events(view, columns, together)
+            yield from _events(view, columns, together, may_match)
             together = []
         together.append(rows)
     if together:
-        yield from _events(view, columns, together)
+        yield from _events(view, columns, together, may_match)
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
@@ -97,11 +103,18 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     return {topic: each for topic, each in events.items() if each is not None}
 
 
-def _events(view: View, columns: StatedColumns, together: list[Rows]) -> Iterator[TopicEvents]:
+def _events(
+    view: View,
+    columns: StatedColumns,
+    together: list[Rows],
+    may_match: Callable[[Table], bool] | None,
+) -> Iterator[TopicEvents]:
     """Yields the events of tables that overlap in time; those of a whole part are kept."""
     part = together[0].part if len(together) == 1 else None
     known = None if view.memory.columns is None else view.memory.columns.events
     events = None if known is None or part is None else known.get(part)
+    if events is None and part is not None and may_match and not may_match(together[0].table):
+        events = TopicEvents(*together[0].span)
     if events is not None:
         yield events
         return

@@ -11,14 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import (
-    Beyond,
-    Contains,
-    Equals,
-    parse_condition,
-)
 from ros2_memory.analysis.motion.trajectory import PoseCollector, TrajectoryBuilder
-from ros2_memory.analysis.zone_map import MAX_WORDS
 from ros2_memory.catalogue.codec import (
     decode_poses,
     decode_schema,
@@ -28,14 +21,13 @@ from ros2_memory.catalogue.codec import (
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.topic_digest import MAX_STORED
 from ros2_memory.core.model import Pose
-from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform
+from tests.support.bags import Msg, boolean, odom, text, tf, transform
 from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.topic_digest import TopicDigest
-    from ros2_memory.core.model import JsonValue
 
 S = 10**9
 MS = 10**6
@@ -54,52 +46,9 @@ def topic_of(messages: list[Msg]) -> TopicDigest:
     return topic
 
 
-# Evidence
-
-
-@pytest.mark.parametrize(
-    ("condition_type", "value"),
-    [
-        ("contains", "scissors"),
-        ("contains", "red cup"),
-        ("equals", "mug"),
-        ("equals", 7),
-        ("contains", True),
-        ("near_position", {"x": 9.0, "y": 9.0}),
-        ("near_position", {"x": 1.0, "y": 0.0, "z": 3.0}),
-    ],
-)
-def test_a_zone_map_rules_out_what_was_never_there(condition_type: str, value: JsonValue) -> None:
-    seen = topic_of([detections(T0, ["cup", "Person 2"]), detections(T0 + S, ["chair"])])
-    assert not parse_condition(condition_type, value, 0.5).can_match(seen.zone_map)
-
-
-def test_a_zone_map_rules_out_a_number_beyond_all_that_were_there() -> None:
-    seen = topic_of([detections(T0, ["cup"])])
-    for limit, above in ((1e6, True), (-1e6, False)):
-        assert not Beyond(limit, above=above).can_match(seen.zone_map)
-        assert Beyond(-limit, above=above).can_match(seen.zone_map)
-
-
-@pytest.mark.parametrize(
-    ("condition_type", "value"),
-    [("contains", "person"), ("contains", "PERSON 2"), ("equals", "cup"), ("equals", 120)],
-)
-def test_a_zone_map_lets_through_what_was_there(condition_type: str, value: JsonValue) -> None:
-    seen = topic_of([detections(T0, ["cup", "Person 2"])])
-    assert parse_condition(condition_type, value, 0.5).can_match(seen.zone_map)
-
-
-def test_a_topic_of_too_many_words_is_not_ruled_out_by_words_but_still_by_numbers() -> None:
-    seen = topic_of([text(T0 + n, f"word{n}") for n in range(MAX_WORDS + 1)])
-    assert Contains("scissors").can_match(seen.zone_map)
-    assert not Equals(3).can_match(seen.zone_map)
-
-
-def test_one_message_that_cannot_be_decoded_leaves_everything_open() -> None:
+def test_one_message_that_cannot_be_decoded_leaves_poses_and_edges_unknown() -> None:
     broken = Msg("/chatter", "std_msgs/msg/String", T0 + S, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
     seen = topic_of([text(T0, "hello"), broken])
-    assert seen.zone_map.open
     assert seen.poses is None
     assert seen.edges is None
 

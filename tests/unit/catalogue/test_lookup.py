@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.history.context import Memory
     from ros2_memory.storage.base import Record
 
@@ -68,60 +66,6 @@ def test_bags_that_the_catalogue_restored_are_not_looked_up_by_path(
     again = recall.looked_up_again(restored, catalogue.newest())
     assert again.whole
     assert again.numbers[run.bags[0].file] == catalogue.newest()
-
-
-def test_what_a_segment_can_contain_is_stored_for_later_processes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory, run = recorded(tmp_path)
-    recall = recalling(memory, tmp_path).recall
-    assert recall is not None
-    catalogue = recall.catalogue
-
-    def zone_map_of_a_process(*, is_settled: bool = False) -> ZoneMap:
-        later = DigestCache(catalogue, tmp_path)
-        return later.digests_for(run, 0).zone_map("/odom", is_settled=is_settled)
-
-    expected = zone_map_of_a_process()
-    with monkeypatch.context() as patched:
-        patched.setattr(catalogue, "zone_maps", None)
-        with pytest.raises(TypeError):
-            zone_map_of_a_process()
-    assert zone_map_of_a_process(is_settled=True) == expected
-    with monkeypatch.context() as patched:
-        patched.setattr(catalogue, "zone_maps", None)
-        found = zone_map_of_a_process()
-    box, known = found.box, expected.box
-    assert replace(found, box=None) == replace(expected, box=None)
-    assert box is not None
-    assert known is not None
-    assert box == pytest.approx(known)
-    assert box.united(known) == box
-    # Other bags are another question.
-    catalogue.forget([BagKey.of(run.bags[0], tmp_path).path])
-    recalling(memory, tmp_path)
-    with monkeypatch.context() as patched:
-        patched.setattr(catalogue, "zone_maps", None)
-        with pytest.raises(TypeError):
-            zone_map_of_a_process()
-
-
-def test_a_catalogue_that_another_program_holds_is_written_to_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory, run = recorded(tmp_path)
-    recall = recalling(memory, tmp_path).recall
-    assert recall is not None
-    tried = []
-
-    def refuse(*_: object) -> bool:
-        tried.append(1)
-        return False
-
-    monkeypatch.setattr(recall.catalogue, "write", refuse)
-    for bag in run.bags:
-        recall.digests_for(Segment([bag]), 0).zone_map("/odom", is_settled=True)
-    assert len(tried) == 1
 
 
 def test_a_segment_with_a_bag_without_an_entry_is_not_complete(tmp_path: Path) -> None:

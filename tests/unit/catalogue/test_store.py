@@ -107,21 +107,6 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     file = BagFile(path, size, mtime_ns, BagState.CLOSED, *content, sidecar_ns, number)
     assert again.known_files(tmp_path) == {path: file}
     for held in DIGEST.topics:
-        evidence = again.zone_maps(held.topic, [number])[number]
-        assert set(evidence.numbers or ()) == set(held.zone_map.numbers or ())
-        box = held.zone_map.box
-        if box is None:
-            assert evidence.box is None
-        else:  # a little larger, as float32
-            assert evidence.box is not None
-            assert evidence.box.united(box) == evidence.box
-            assert evidence.box == pytest.approx(box, rel=1e-6)
-        assert (evidence.words, evidence.low, evidence.high, evidence.booleans) == (
-            held.zone_map.words,
-            held.zone_map.low,
-            held.zone_map.high,
-            held.zone_map.booleans,
-        )
         assert again.poses(held.topic, [number]).get(number) == held.poses
         assert again.standstills(held.topic, [number]).get(number) == held.standstills
         assert again.edges(held.topic, [number]).get(number) == held.edges
@@ -229,7 +214,7 @@ def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path
     assert after > before
     assert catalogue.newest() == after
     assert not holds(catalogue)
-    assert catalogue.zone_maps("/odom", [before, after]) == {}
+    assert catalogue.poses("/odom", [before, after]) == {}
 
 
 def test_compacting_gives_back_what_was_deleted(tmp_path: Path) -> None:

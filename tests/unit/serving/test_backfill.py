@@ -187,7 +187,6 @@ def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
                 each(topic, [number]).get(number)
                 for topic in sorted({each.topic for each in files[file].summary.topics})
                 for each in (
-                    catalogue.zone_maps,
                     catalogue.poses,
                     catalogue.standstills,
                     catalogue.edges,

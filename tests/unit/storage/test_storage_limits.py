@@ -47,7 +47,7 @@ from tests.fuzz.records import (
     schema,
     without_summary,
 )
-from tests.support.bags import Msg, make, text, write_db3, write_mcap
+from tests.support.bags import Msg, make, text, write_db3
 from tests.support.memories import extractor, memory_of
 
 if TYPE_CHECKING:
@@ -363,10 +363,3 @@ class TestDigests:
         path = bag(tmp_path, *STRINGS, *(message(1, n, packed) for n in range(4)))
         with pytest.raises(BagError, match="unpack to more"):
             Digester(McapReader(), extractor(), 10.0).digest(path)
-
-    def test_the_words_of_a_text_of_megabytes_are_not_kept(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "bag.mcap", [text(1, "ab " * MB)])
-        digest = Digester(McapReader(), extractor(), 10.0).digest(path)
-        [topic] = digest.topics
-        assert topic.zone_map.words is None
-        assert topic.zone_map.texts

@@ -6,8 +6,8 @@ import threading
 from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from ros2_memory.analysis.conditions import words_of
 from ros2_memory.analysis.topic_events import NO_EVENTS
-from ros2_memory.analysis.zone_map import UNBOUNDED, ZoneMap, joined_words, words_of
 from ros2_memory.catalogue.codec import decode_poses, decode_standstills
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
@@ -125,14 +125,12 @@ class LakeCatalogue(Catalogue):
         found = self._packed("sights", "", numbers)
         return {number: (NO_STATICS.key, packed) for number, packed in found.items()}
 
-    def zone_maps(self, topic: str, numbers: Sequence[int]) -> dict[int, ZoneMap]:
-        """Returns the labels that can be in detections of the topic; of others nothing is known."""
-        found: dict[int, ZoneMap] = {}
+    def words(self, topic: str, numbers: Sequence[int]) -> dict[int, str]:
+        """Returns the words of labels in detections of the topic; of others nothing is known."""
         if not self._index.is_detector(topic):
-            return dict.fromkeys(numbers, UNBOUNDED)
-        for number, labels in self._digests("labels", topic, numbers):
-            found[number] = labels if isinstance(labels, ZoneMap) else ZoneMap()
-        return found
+            return {}
+        found = self._digests("labels", topic, numbers)
+        return {number: words if isinstance(words, str) else "" for number, words in found}
 
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns that all messages could be decoded: rows are made of those alone."""
@@ -202,7 +200,7 @@ class LakeCatalogue(Catalogue):
             for bag, label in pairs:
                 of_bag[bag].update(words[label])
             return {
-                bag_id: ZoneMap(joined_words(each), texts=True)
+                bag_id: "\n".join(sorted(each))
                 for bag_id, each in zip(bags.dictionary.to_pylist(), of_bag, strict=True)
             }
         asked = {"kind": kind, "topic": topic, "version": str(DIGEST_VERSION)}
