@@ -131,7 +131,8 @@ def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scann
     filling = Filling(scanner, memory.reader, bag_dir, later, StoreLimits(max_share=1.0))
     timeline = memory.index.snapshot().timeline
     waiting = filling.waiting(timeline)[::-1]
-    for bag in waiting[: round(part * len(waiting))]:
+    # The newest first, as the server does: numbers of bags are in no order of time.
+    for bag in waiting[: round(part * len(waiting))][::-1]:
         filling.fill(bag, timeline)
     filling.merge(timeline)
     return scanner

@@ -65,11 +65,23 @@ if TYPE_CHECKING:
 class FromColumns(NamedTuple):
     """What the rows of a table state, without their log times, and but for some messages.
 
-    `to_read` are the rows of these, ascending.
+    Attributes:
+        stated: what is known.
+        unsure: the rows of the messages that have to be read besides, ascending.
+        alike: by row, equal numbers for consecutive messages that state the same, so that one of
+            them has to be read; None where only those that are `unsure` have to be.
     """
 
     stated: Stated
-    to_read: Ints
+    unsure: Ints
+    alike: Ints | None = None
+
+    def to_read(self, index: Ints | None) -> Ints:
+        """Returns the positions, among some rows (None: all), of the messages to be read."""
+        if self.alike is not None:
+            alike = self.alike if index is None else self.alike[index]
+            return np.flatnonzero(np.diff(alike, prepend=-1))
+        return self.unsure if index is None else np.flatnonzero(np.isin(index, self.unsure))
 
 
 class StatedColumns:
@@ -174,7 +186,7 @@ class _Plan(NamedTuple):
         values = Values(table)
         stated, to_read = Stated(table.log_times), np.empty(0, np.int64)
         if self.type == GOALS:
-            return FromColumns(stated, _changed(values, self.numbers))
+            return FromColumns(stated, to_read, _alike(values, self.numbers))
         if self.entry:
             return FromColumns(_entries(values, self.entry, self.type, stated), to_read)
         labels = joined_facts([found for each in self.labels for found in _read(values, each)])
@@ -444,8 +456,8 @@ def _commands(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
     )
 
 
-def _changed(values: Values, leaves: Sequence[Leaf]) -> Ints:
-    """Returns the rows that list something else than the one before, as far as columns tell.
+def _alike(values: Values, leaves: Sequence[Leaf]) -> Ints:
+    """Numbers the rows by what they list, as far as columns tell: as the one before, or another.
 
     An action server lists a goal with the time at which it accepted it, so one goal does not take
     the place of another without a trace.
@@ -466,7 +478,7 @@ def _changed(values: Values, leaves: Sequence[Leaf]) -> Ints:
     for column in found:
         differs |= column != column[before]
     is_new[elements.owners[differs]] = True
-    return np.flatnonzero(is_new)
+    return np.cumsum(is_new)
 
 
 def _named(values: Values, scored: Scored) -> tuple[Texts, Floats, float]:

@@ -81,7 +81,7 @@ def events_back(
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
-    """Returns what messages of one topic report, in log-time order; None without any."""
+    """Returns what messages of one topic report; None without any."""
     return events_of(_stated_by(view, messages))
 
 
@@ -143,11 +143,9 @@ def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = Fal
     found = columns.of(rows.table)
     if found is None:
         return _stated_by(view, messages_of(view, rows))
-    stated, to_read = found
-    index = rows.index
-    if index is not None:
-        stated = stated.at(index)
-        to_read = np.flatnonzero(np.isin(index, to_read))
+    stated, to_read = found.stated, found.to_read(rows.index)
+    if rows.index is not None:
+        stated = stated.at(rows.index)
     if alone and not to_read.size and (settled := stated.unchanging(*rows.span)) is not None:
         return settled
     stated = stated._replace(times=rows.times)
@@ -159,12 +157,10 @@ def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = Fal
 
 
 def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
-    times: list[Ns] = []
-    states: list[State | None] = []
-    for found in messages:
-        times.append(found.time)
-        states.append(_state(view, found))
-    return stated_by(times, states)
+    states = [(found.time, _state(view, found)) for found in messages]
+    # Those of a part come bag after bag, in the order in which bags were stored.
+    states.sort(key=lambda each: each[0])
+    return stated_by([time for time, _ in states], [state for _, state in states])
 
 
 def _state(view: View, found: StoredMessage) -> State | None:

@@ -104,15 +104,6 @@ def week() -> tuple[Memory, FakeReader]:
     return Memory(index, reader, extractor(), clock, QuerySettings(), recall), reader
 
 
-def test_what_was_never_seen_is_answered_over_a_week_without_reading_a_bag(
-    week: tuple[Memory, FakeReader],
-) -> None:
-    memory, reader = week
-    found = queries.find_last_match(memory, Call(), SCENE, "contains", "unicorn")
-    assert (found.found, found.notes) == (None, ())
-    assert reader.opened == []
-
-
 def test_frames_of_a_week_are_listed_without_reading_a_bag(
     week: tuple[Memory, FakeReader],
 ) -> None:

@@ -67,10 +67,11 @@ def compared(table: Table, drawn: Drawn) -> int | None:
     found = StatedColumns(EXTRACTOR).of(table)
     if found is None:
         return None
-    rows = {*range(len(table))} - {*found.to_read.tolist()}
+    to_read = found.to_read(None).tolist()
+    rows = {*range(len(table))} - {*to_read}
     for one, other in zip(found.stated.facts, expected.facts, strict=True):
         assert by_row(one, rows) == by_row(other, rows)
-    return len(found.to_read)
+    return len(to_read)
 
 
 @settings(max_examples=examples(120), deadline=None)
@@ -114,6 +115,9 @@ def test_of_goals_only_messages_that_list_something_else_are_read(
     [[table]] = decoded(memory.reader, bag.path)
     found = StatedColumns(memory.extractor).of(table)
     assert found is not None
-    assert found.to_read.tolist() == [0, 2]
+    assert found.to_read(None).tolist() == [0, 2]
+    # Of those in a window the first, and what changes after it.
+    assert found.to_read(np.array([1, 2, 3])).tolist() == [0, 1]
+    assert found.to_read(np.array([3])).tolist() == [0]
     assert not any(facts.rows.size for facts in found.stated.facts)
     assert np.array_equal(found.stated.times, table.log_times)
