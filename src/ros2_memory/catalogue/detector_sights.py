@@ -56,6 +56,8 @@ _TRIED: Final = 16
 _LOCALISER: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _FIX_NS: Final = 2_000_000_000
 """How far apart it is looked where odometry is in the map."""
+_MOST_FIXES: Final = 8_192
+"""Looks in one bag; in one that lasts longer than 4.5 h they are farther apart."""
 _COVARIANCE: Final = 36
 _SAME_M: Final = 0.1
 """What changes less from one look to the next is left out."""
@@ -215,7 +217,9 @@ class DetectorSights:
         self, robot: PlacedPoses, span: tuple[Ns, Ns]
     ) -> Iterator[tuple[Ns, tuple[float, float, float], float | None]]:
         """Yields where odometry was in the map, where that changes, and how exactly it is known."""
-        times = np.append(np.arange(*span, _FIX_NS), span[1])
+        # A bag of odd times may span centuries.
+        step = max(_FIX_NS, (span[1] - span[0]) // _MOST_FIXES)
+        times = np.append(np.arange(*span, step), span[1])
         pose = np.zeros((len(times), 3))
         target = robot.frames.target
         found = robot.frames.poses(robot.own, times) if robot.own else None

@@ -197,9 +197,15 @@ def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
         for deed in script:
             world.do(*deed)
         followed, fresh = world.index.refresh(), world.fresh_index().refresh()
-        assert followed == fresh
+        assert _without_growth(followed) == _without_growth(fresh)
         assert _views(followed) == _views(fresh)
-        assert replace(world.index.refresh(), scanned_at=0) == replace(fresh, scanned_at=0)
+        again = _without_growth(world.index.refresh())
+        assert replace(again, scanned_at=0) == replace(_without_growth(fresh), scanned_at=0)
+
+
+def _without_growth(snapshot: Snapshot) -> Snapshot:
+    """Without what only somebody knows who looked twice: that a file grew."""
+    return replace(snapshot, active=tuple(replace(each, growing=False) for each in snapshot.active))
 
 
 def _views(snapshot: Snapshot) -> tuple[object, ...]:
