@@ -12,12 +12,13 @@ from functools import lru_cache
 from random import Random
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.sights import PlacedDetection, Sights, SightsBuilder
+from tests.support.sights import Message, PlacedDetection, sights_of_messages
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.things.sights import Sights
 
 BEGIN_S: Final = 1_700_000_000
 BAG_S: Final = 30
@@ -236,16 +237,16 @@ def simulate(seed: int, hours: float = 6.0, moves: int = 14, *, walls: bool = Tr
     truths: list[list[tuple[float, str, Point, int]]] = []
     a_bag = BAG_S * RATE_HZ
     for start in range(0, len(poses), a_bag):
-        builder = SightsBuilder()
+        messages: list[Message] = []
         drift = (chance.gauss(0, 0.03), chance.gauss(0, 0.03))
         truth: list[tuple[float, str, Point, int]] = []
         for step in range(start, min(start + a_bag, len(poses))):
             time, pose = step / RATE_HZ, poses[step]
             seen = _detect(chance, things, labels, time, pose, drift, truth)
             measured = (pose[0] + drift[0], pose[1] + drift[1], pose[2])
-            builder.add("/detections", moment(time), measured, seen)
+            messages.append(Message("/detections", moment(time), measured, seen))
             looks.append((time, pose))
-        bags.append(builder.sights())
+        bags.append(sights_of_messages(messages))
         truths.append(truth)
     return Simulation(things, bags, stop_s, looks, truths)
 

@@ -8,8 +8,7 @@ of a goal, which has no columns) the messages are named that have to be read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -32,9 +31,9 @@ from ros2_memory.analysis.topic_events import (
     has_events,
     state_of,
 )
-from ros2_memory.columns.scores import hypotheses, is_object, scored
+from ros2_memory.columns.detections import found_in, sources_in, texts_of
+from ros2_memory.columns.scores import is_object
 from ros2_memory.columns.shown import (
-    Items,
     Listing,
     Narrowed,
     Shape,
@@ -44,19 +43,16 @@ from ros2_memory.columns.shown import (
     leaves_below,
     placed,
 )
-from ros2_memory.columns.table import Texts
-from ros2_memory.columns.truth import may_be_rewritten
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
-from ros2_memory.messages.detections import LISTS, MAX_DEPTH, detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.stated import Word
-    from ros2_memory.columns.scores import Scored
+    from ros2_memory.columns.detections import Source
     from ros2_memory.columns.shown import Node
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Floats, Ints
+    from ros2_memory.columns.values import Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import Definition
@@ -113,43 +109,15 @@ class StatedColumns:
             return None
 
 
-@dataclass(frozen=True, slots=True)
-class _Labels:
-    """Objects that may be detections: what names them, and what else there is where nothing does.
-
-    `is_best`: they are named by the best of several hypotheses, which is what is scored.
-    """
-
-    scored: Scored
-    otherwise: tuple[_Source, ...]
-    is_best: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class _Words:
-    """A list of labels."""
-
-    leaf: Leaf
-
-
-@dataclass(frozen=True, slots=True)
-class _Json:
-    """A text that may be JSON, and how deep detections are looked for in it."""
-
-    leaf: Leaf
-    depth: int
-
-
 _CHARGE: Final = ((CHARGE, ""),)
 _COMMAND: Final = ((COMMAND, ""),)
-_Source: TypeAlias = "_Labels | _Words | _Json"
 
 
 class _Plan(NamedTuple):
     """What is looked for in the messages of a type."""
 
     type: str
-    labels: tuple[_Source, ...] = ()
+    labels: tuple[Source, ...] = ()
     flags: tuple[tuple[str, Leaf], ...] = ()
     entry: tuple[Leaf, ...] = ()
     numbers: tuple[Leaf, ...] = ()
@@ -175,7 +143,7 @@ class _Plan(NamedTuple):
         flags = tuple(_flags(value, ""))
         if len(flags) > MAX_FLAGS:
             raise UnknownShapeError("more booleans than are tracked")
-        return cls(type_name, tuple(_sources(value, MAX_DEPTH)), flags, numbers=numbers)
+        return cls(type_name, tuple(sources_in(value)), flags, numbers=numbers)
 
     def read(self, table: Table) -> FromColumns:
         """Returns what the messages of a table state.
@@ -189,7 +157,7 @@ class _Plan(NamedTuple):
             return FromColumns(stated, to_read, _alike(values, self.numbers))
         if self.entry:
             return FromColumns(_entries(values, self.entry, self.type, stated), to_read)
-        labels = joined_facts([found for each in self.labels for found in _read(values, each)])
+        labels = joined_facts([facts for each in self.labels for facts in _labels(values, each)])
         if labels.rows.size and np.bincount(labels.rows).max() > MAX_LABELS:
             raise UnknownShapeError("more labels than are tracked")
         flags = joined_facts([_booleans(values, path, leaf) for path, leaf in self.flags])
@@ -201,41 +169,6 @@ class _Plan(NamedTuple):
 
 
 # What a type has
-
-
-def _sources(node: Node, depth: int) -> Iterator[_Source]:
-    """Yields where detections may be in a value; it goes where `detections_of` goes."""
-    if depth == 0:
-        return
-    if isinstance(node, Narrowed):
-        raise UnknownShapeError("an element of a list stands alone")
-    if isinstance(node, Leaf):
-        if node.kind is Kind.TEXT:
-            yield _Json(node, depth)
-    elif isinstance(node, Listing | Items):
-        for element in [node.element] if isinstance(node, Listing) else node.items:
-            if is_object(element) or isinstance(element, Narrowed):
-                yield from _sources(element, depth - 1)
-    elif is_object(node):
-        yield from _in_object(dict(children(node)), depth)
-
-
-def _in_object(fields: dict[str, Node], depth: int) -> Iterator[_Source]:
-    named, several = scored(fields), hypotheses(fields)
-    if named is not None:
-        yield _Labels(named, tuple(_in_fields(fields, depth)))
-    elif several is not None:
-        yield _Labels(several, tuple(_in_fields(fields, depth)), is_best=True)
-    else:
-        yield from _in_fields(fields, depth)
-
-
-def _in_fields(fields: dict[str, Node], depth: int) -> Iterator[_Source]:
-    for name, node in fields.items():
-        element = node.element if isinstance(node, Listing) else None
-        if name in LISTS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
-            yield _Words(element)
-        yield from _sources(node, depth - 1)
 
 
 def _flags(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
@@ -298,64 +231,11 @@ def _of_goals(value: Node) -> Iterator[Leaf]:
 # What a table holds
 
 
-def _read(values: Values, source: _Source) -> Iterator[Facts]:
-    """Yields the labels at one place of the messages."""
-    if isinstance(source, _Json):
-        yield _json(values, source)
-        return
-    if isinstance(source, _Words):
-        texts = _texts(values, source.leaf)
-        has = np.array([bool(word) for word in texts.words], np.bool_)
-        among = np.flatnonzero(has[texts.codes]) if texts.words else np.empty(0, np.int64)
-        yield _labelled(values, source.leaf, texts, among, np.full(len(texts), math.nan))
-        return
-    scored = source.scored
-    name, score, error = _named(values, scored)
-    among, size = np.arange(len(name)), len(name)
-    if source.is_best:
-        elements, parent = values.elements(scored.level), scored.level.parent
-        if elements is None or parent is None:
-            raise UnknownShapeError("hypotheses are not held")
-        among, size = _best(name, score, error, elements.owners), values.size(parent) or 0
-    is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
-    among = among[is_named[name.codes[among]]] if name.words else among[:0]
-    if among.size < size and any(
-        facts.rows.size for inner in source.otherwise for facts in _read(values, inner)
-    ):
-        raise UnknownShapeError("some objects are detections, and some have such in them")
-    yield _labelled(values, scored.labels[0], name, among, score)
-
-
-def _labelled(values: Values, leaf: Leaf, name: Texts, among: Ints, scores: Floats) -> Facts:
-    """Returns labels at some places of a level, by their rows."""
-    _, rows = placed(values, leaf.level, among, (), surely=True)
-    words = [(word, "") for word in name.words]
-    return Facts(rows, name.codes[among].astype(np.int64), scores[among], words)
-
-
-def _json(values: Values, source: _Json) -> Facts:
-    """Returns the labels in texts that are JSON, each of which is parsed once."""
-    zone = values.zone(source.leaf)
-    if zone is not None and not may_be_rewritten(zone):
-        return NOTHING
-    texts = _texts(values, source.leaf)
-    known: dict[int, list[tuple[str, float]]] = {}
-    for code, word in enumerate(texts.words):
-        if word[:1] in {"[", "{"}:
-            value: JsonValue = word
-            for _ in range(MAX_DEPTH - source.depth):
-                value = {"": value}
-            seen = detections_of(value)
-            known[code] = [(e.label, math.nan if e.score is None else e.score) for e in seen]
-    among = np.flatnonzero(np.isin(texts.codes, [code for code, seen in known.items() if seen]))
-    _, rows = placed(values, source.leaf.level, among, (), surely=True)
-    return Facts.of(
-        [
-            (row, (label, ""), score)
-            for row, code in zip(rows.tolist(), texts.codes[among].tolist(), strict=True)
-            for label, score in known[code]
-        ]
-    )
+def _labels(values: Values, source: Source) -> Iterator[Facts]:
+    """Yields the labels at one place of the messages, with their scores."""
+    for found in found_in(values, source, places=False):
+        words = [(word, "") for word in found.labels.words]
+        yield Facts(found.rows, found.labels.codes.astype(np.int64), found.scores, words)
 
 
 def _booleans(values: Values, path: str, leaf: Leaf) -> Facts:
@@ -377,7 +257,7 @@ def _entries(values: Values, entry: tuple[Leaf, ...], type_name: str, stated: St
         zone.greatest is None or state_of(_value(int(zone.greatest), type_name), type_name).is_empty
     ):
         return stated
-    level, (name, text) = values.numbers(entry[0]), [_texts(values, leaf) for leaf in entry[1:]]
+    level, (name, text) = values.numbers(entry[0]), [texts_of(values, leaf) for leaf in entry[1:]]
     if level is None:
         raise UnknownShapeError("levels are not held")
     numbers = level.values.astype(np.int64)
@@ -479,47 +359,3 @@ def _alike(values: Values, leaves: Sequence[Leaf]) -> Ints:
         differs |= column != column[before]
     is_new[elements.owners[differs]] = True
     return np.cumsum(is_new)
-
-
-def _named(values: Values, scored: Scored) -> tuple[Texts, Floats, float]:
-    """Returns the name of each of some objects, blank where it has none, its score, and the error.
-
-    Raises:
-        UnknownShapeError: names or scores are not held.
-    """
-    columns, score = [_texts(values, leaf) for leaf in scored.labels], scored.score(values)
-    if score is None:
-        raise UnknownShapeError("scores are not held")
-    name = columns[0]
-    for other in columns[1:]:
-        is_blank = np.array([not word.strip() for word in name.words], np.bool_)
-        codes = np.where(is_blank[name.codes], other.codes + len(name.words), name.codes)
-        name = Texts(codes.astype(np.uint32), (*name.words, *other.words))
-    return name, *score
-
-
-def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
-    """Returns the first of the hypotheses of the highest score, for each detection.
-
-    Raises:
-        UnknownShapeError: they were rounded, so that another may be the best.
-    """
-    rank = np.where(np.isnan(score), -np.inf, score)
-    order = np.lexsort((-rank, owners))
-    begins = np.diff(owners[order], prepend=-1) != 0
-    best: Ints = order[begins]
-    if error:
-        follows = np.flatnonzero(begins[:-1] & ~begins[1:])
-        one, two = order[follows], order[follows + 1]
-        with np.errstate(invalid="ignore"):  # infinity less infinity
-            is_close = rank[one] - rank[two] <= 2 * error
-        if (is_close & (name.codes[one] != name.codes[two])).any():
-            raise UnknownShapeError("another hypothesis may be the best")
-    return best
-
-
-def _texts(values: Values, leaf: Leaf) -> Texts:
-    texts = values.texts(leaf)
-    if texts is None:
-        raise UnknownShapeError(f"{leaf.sources[0]} is not held")
-    return texts

@@ -27,7 +27,7 @@ NOT_LABELLED: Final = frozenset({"stride"})
 LISTS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 """A list of strings under one of these names is a list of detections."""
 
-_POSITIONS: Final = (
+POSITIONS: Final = (
     ("point",),
     ("position",),
     ("pose", "position"),
@@ -213,7 +213,7 @@ def _frame(value: dict[str, JsonValue]) -> str:
 
 def _position(value: dict[str, JsonValue]) -> Vector3 | None:
     """Returns the first valid point; all zeros means that nobody filled it in."""
-    for path in _POSITIONS:
+    for path in POSITIONS:
         found: JsonValue = value
         for name in path:
             found = found.get(name) if isinstance(found, dict) else None

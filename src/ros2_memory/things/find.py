@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S
@@ -22,18 +21,19 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
+from ros2_memory.things.sights import SCORE_BINS, Look, Score, Spot
 from ros2_memory.things.unseen import Asked, notes_on
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
-    from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.where import Where
     from ros2_memory.things.instances import Instance, Mover, PlacedStay
+    from ros2_memory.things.sights import Ints
 
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3
@@ -235,8 +235,8 @@ class _Finder:
         spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
         many = counts >= _FEWEST_BESIDE
         of = spots[many]
-        order = np.argsort(of[:, Spot.BAG], kind="stable")
-        bags, together, often = of[order, Spot.BAG], of[order, Spot.TOGETHER], counts[many][order]
+        order = np.argsort(of[:, Spot.SLICE], kind="stable")
+        bags, together, often = of[order, Spot.SLICE], of[order, Spot.TOGETHER], counts[many][order]
         begins = np.flatnonzero(np.diff(bags, prepend=-1))
         numbers: list[int] = []
         if len(begins):

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Hit, Score, Spot, Unplaced
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.labels import moves_by_itself
 from ros2_memory.things.localisation import poorly_localised
@@ -30,6 +29,7 @@ from ros2_memory.things.presence import (
     in_ranges,
     stays_at,
 )
+from ros2_memory.things.sights import SCORE_BINS, Hit, Score, Spot, Unplaced
 from ros2_memory.things.synonyms import with_synonyms
 
 if TYPE_CHECKING:
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.things.labels import Labels
     from ros2_memory.things.presence import Evidence, FieldOfView
+    from ros2_memory.things.sights import Ints, Sights
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
@@ -213,7 +213,7 @@ class _Group:
 def estimate(
     sights: Sights,
     labels: Labels,
-    epochs: Sequence[int] | None = None,
+    epochs: Sequence[int] | Ints | None = None,
     min_score: float = 0.0,
     go_on: Callable[[], None] = lambda: None,
 ) -> Estimate:
@@ -223,10 +223,10 @@ def estimate(
     Detections whose score lies below `min_score`, to 0.05, do not count. `go_on` is called again
     and again; what it raises ends the estimate.
     """
-    epoch = np.zeros(sights.bags, np.int64) if epochs is None else np.array(epochs, np.int64)
+    epoch = np.zeros(sights.slices, np.int64) if epochs is None else np.asarray(epochs, np.int64)
     seen = _Seen(sights, epoch, min_score)
     names = _names(sights, labels)
-    epoch_of = epoch[sights.spots[:, Spot.BAG]]
+    epoch_of = epoch[sights.spots[:, Spot.SLICE]]
     keys = with_synonyms(sights, seen.counts, epoch_of, labels, go_on)
     groups = _groups(seen, epoch, keys)
     _find_places(groups, seen, go_on)
@@ -358,7 +358,7 @@ def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
     shown = [*dict.fromkeys(keys)]
     number = np.array([shown.index(key) for key in keys], np.int64)
     spots = seen.sights.spots
-    of = epoch[spots[:, Spot.BAG]] * (len(shown) + 1) + number[spots[:, Spot.LABEL]]
+    of = epoch[spots[:, Spot.SLICE]] * (len(shown) + 1) + number[spots[:, Spot.LABEL]]
     of[seen.counts == 0] = -1
     groups = []
     for each in np.unique(of[of >= 0]).tolist():
@@ -391,7 +391,7 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
 def _are_several(spots: Ints) -> bool:
     """Whether bags have several spots of a label at one place: things that stand together."""
     distinct = len(
-        distinct_rows([spots[:, each] for each in (Spot.BAG, Spot.TOPIC, Spot.LABEL)])[0]
+        distinct_rows([spots[:, each] for each in (Spot.SLICE, Spot.TOPIC, Spot.LABEL)])[0]
     )
     return len(spots) - distinct > _SEVERAL_SHARE * distinct
 
@@ -401,10 +401,10 @@ def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     every = seen.sights.spots
     for place, mine in enumerate(group.places):
         go_on()
-        bag, n = every[mine, Spot.BAG], seen.counts[mine]
+        bag, n = every[mine, Spot.SLICE], seen.counts[mine]
         x, y = (float(np.average(every[mine, column], weights=n)) for column in (Spot.X, Spot.Y))
         rows = _rows_of(mine, seen.hits, seen.starts)
-        rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.BAG]
+        rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
         group.evidence.append(evidence_at(seen.cells, seen.view, x, y, rows))
         for stay in stays_at(seen.cells, group.evidence[-1]):
             inside = mine[(bag >= stay.first_bag) & (bag <= stay.last_bag)]
@@ -422,7 +422,7 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     if stay.left is not None:
         of = seen.cells.bag == stay.left
         left = int(seen.cells.last[of].min()) if of.any() else None
-    firm = spots[:, Spot.BAG]
+    firm = spots[:, Spot.SLICE]
     firm = spots[(firm >= stay.firm_first) & (firm <= stay.firm_last)]
     firm = firm if len(firm) and stay.firm_first >= 0 else spots
     return PlacedStay(
@@ -518,7 +518,7 @@ class _Hosts:
         return counts
 
     def _seen_during(self, host: PlacedStay, stay: Stay) -> int:
-        bags = self._seen.sights.spots[host.spots, Spot.BAG]
+        bags = self._seen.sights.spots[host.spots, Spot.SLICE]
         start, stop = np.searchsorted(bags, (stay.first_bag, stay.last_bag + 1))
         return int(self._seen.counts[host.spots[start:stop]].sum())
 

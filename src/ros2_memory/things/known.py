@@ -15,12 +15,6 @@ from threading import Lock
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
-from ros2_memory.analysis.sights import (
-    Sights,
-    decode_joined,
-    decode_sights,
-    joined,
-)
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagState
@@ -32,6 +26,12 @@ from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things.instances import Estimate, estimate
 from ros2_memory.things.labels import Labels
+from ros2_memory.things.sights import (
+    Sights,
+    decode_joined,
+    decode_sights,
+    joined,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

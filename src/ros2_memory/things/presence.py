@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Look
 from ros2_memory.things.places import distinct_rows
+from ros2_memory.things.sights import CELL_DECIDEG, CELL_MM, Hit, Look
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.things.sights import Ints, Sights
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
@@ -66,7 +66,7 @@ class Cells:
         # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.bag, self.n, self.first, self.last, self.topic = (
             np.ascontiguousarray(looks[:, each])
-            for each in (Look.BAG, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
+            for each in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
         )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)

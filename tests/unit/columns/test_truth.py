@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
-from itertools import chain
 from random import Random
 from typing import TYPE_CHECKING
 
@@ -14,12 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals, NearPosition
-from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.truth import ColumnCondition, truth
-from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import make, stamp
 from tests.support.drawn_tables import (
     Drawn,
@@ -31,13 +25,11 @@ from tests.support.drawn_tables import (
 )
 from tests.support.examples import LONG, examples
 from tests.support.memories import shipped_extractor
-from tests.support.shared_bags import BAGS, needs_real, needs_recorded
+from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.truth import Truth
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.storage.base import Channel, Record
 
 EXTRACTOR = shipped_extractor()
 VISION = "ros2_vision_interfaces/msg/VisionDetectionArray"
@@ -54,7 +46,6 @@ PLAIN = (
     "std_msgs/msg/Float32",
 )
 RANDOM = st.randoms(use_true_random=False)
-SAMPLED_ROWS = 12
 
 
 def compared(found: Truth, condition: Condition, values: list[JsonValue]) -> int:
@@ -101,55 +92,6 @@ def test_truth_of_rounded_columns_is_unsure_rather_than_wrong(
         compared(truth(condition, table, EXTRACTOR), condition, values)
 
 
-@cache
-def shared_samples(folder: str) -> list[tuple[Table, list[JsonValue]]]:
-    """Some rows of each topic and type in the shared bags, and their extracted values."""
-    reader = Rosbag2Reader()
-    seen: set[tuple[str, str, bytes]] = set()
-    found = []
-    for path in sorted([*(BAGS / folder).rglob("*.mcap"), *(BAGS / folder).rglob("*.db3")]):
-        try:
-            tables = {key_of(table.channel): table for table in chain(*decoded(reader, path))}
-        except BagError:
-            continue
-        new = {
-            key: table
-            for key, table in tables.items()
-            if key not in seen and "" not in table.left_out and len(table)
-        }
-        seen |= new.keys()
-        records: dict[tuple[str, str, bytes], list[Record]] = {key: [] for key in new}
-        topics = {table.channel.topic for table in new.values()}
-        for record in reader.records(path, topics, TimeWindow.everything()) if topics else ():
-            if key_of(record.channel) in records:
-                records[key_of(record.channel)].append(record)
-        found += [sampled(reader, table, records[key]) for key, table in new.items()]
-    return found
-
-
-def key_of(channel: Channel) -> tuple[str, str, bytes]:
-    return channel.topic, channel.type, channel.schema.text
-
-
-def sampled(
-    reader: Rosbag2Reader, table: Table, records: list[Record]
-) -> tuple[Table, list[JsonValue]]:
-    rows = np.unique(np.linspace(0, len(table) - 1, SAMPLED_ROWS).astype(np.int64))
-    if table.undecodable:
-        records = [record for record in records if is_decodable(reader, record)]
-    assert len(records) == len(table)
-    messages = [reader.decode(records[row]) for row in rows]
-    return table.rows(rows), [EXTRACTOR.exact(each, table.channel.type) for each in messages]
-
-
-def is_decodable(reader: Rosbag2Reader, record: Record) -> bool:
-    try:
-        reader.decode(record)
-    except UndecodableError:
-        return False
-    return True
-
-
 @pytest.mark.parametrize(
     "folder",
     [
@@ -160,7 +102,8 @@ def is_decodable(reader: Rosbag2Reader, record: Record) -> bool:
 def test_truth_of_shared_bags_is_that_of_each_message(folder: str) -> None:
     random = Random(folder)
     unsure = rows = 0
-    for table, values in shared_samples(folder):
+    for table, messages in shared_samples(folder):
+        values = [EXTRACTOR.exact(each, table.channel.type) for each in messages]
         for _ in range(200 if LONG else 4):
             condition = condition_on(values, random)
             found = truth(condition, table, EXTRACTOR)

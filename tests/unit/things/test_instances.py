@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.sights import PlacedDetection, Sights, SightsBuilder, Spot, joined
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.instances import Estimate, estimate, most_at_once
 from ros2_memory.things.labels import Labels
+from ros2_memory.things.sights import SLICE_NS, Sights, Spot, joined, no_sights
+from tests.support.sights import Message, PlacedDetection, sights_of_messages, whole
 from tests.support.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
 
 if TYPE_CHECKING:
@@ -28,12 +30,13 @@ SEEDS = (1, 2, 3)
 ENOUGH = 3
 """Detections that make a thing; of fewer nothing is claimed."""
 HERE = (0.0, 0.0, 0.0)
+SLICE_S = SLICE_NS / NS_PER_S
 
 
 @cache
 def home(seed: int) -> tuple[Simulation, Estimate]:
     simulation = simulate(seed, hours=1.8, moves=10)
-    return simulation, estimate(joined(simulation.bags), LABELS)
+    return simulation, estimate(whole(simulation.bags), LABELS)
 
 
 def found(result: Estimate, key: str) -> list[Instance]:
@@ -94,11 +97,11 @@ def test_identities_are_hardly_ever_switched() -> None:
             for number, each in enumerate(found(result, key)):
                 for stay in each.stays:
                     for row in stay.spots.tolist():
-                        by_bag.setdefault(int(spots[row, Spot.BAG]), []).append((row, number))
+                        by_bag.setdefault(int(spots[row, Spot.SLICE]), []).append((row, number))
             for thing in things:
                 before = None
-                for bag in sorted({int(each // BAG_S) for each in thing.detected}):
-                    place = thing.place_at((bag + 0.5) * BAG_S)
+                for bag in sorted({int(each // SLICE_S) for each in thing.detected}):
+                    place = thing.place_at((bag + 0.5) * SLICE_S)
                     if place is None:
                         continue
                     near = [
@@ -172,10 +175,12 @@ def test_people_are_tracks_and_no_places() -> None:
 def bag_of(
     *messages: tuple[tuple[float, float, float], list[PlacedDetection]], start: int = 0
 ) -> Sights:
-    builder = SightsBuilder()
-    for nth, (robot, things) in enumerate(messages):
-        builder.add("/detections", (start + nth) * 10**9, robot, things)
-    return builder.sights()
+    return sights_of_messages(
+        [
+            Message("/detections", (start + nth) * 10**9, robot, things)
+            for nth, (robot, things) in enumerate(messages)
+        ]
+    )
 
 
 def seen_at(
@@ -187,7 +192,7 @@ def seen_at(
 def test_a_thing_that_was_not_looked_for_since_is_not_missed() -> None:
     there = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(3)]
     away = [bag_of(*[((0.0, 0.0, math.pi), [])] * 10, start=100 + 10 * nth) for nth in range(9)]
-    [mug] = estimate(joined([*there, *away]), LABELS).instances
+    [mug] = estimate(whole([*there, *away]), LABELS).instances
     assert (mug.missed_by, mug.looks, mug.chance) == (None, 0, 1.0)
 
 
@@ -195,10 +200,10 @@ def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None
     there = [bag_of(*[(HERE, seen_at(2, 0))] * 10)]
     twice = bag_of(*[(HERE, [])] * 2, start=100)
     often = bag_of(*[(HERE, [])] * 8, start=110)
-    [mug] = estimate(joined([*there, twice]), LABELS).instances
+    [mug] = estimate(whole([*there, twice]), LABELS).instances
     assert mug.missed_by is None
     assert mug.looks == 2
-    [mug] = estimate(joined([*there, twice, often]), LABELS).instances
+    [mug] = estimate(whole([*there, twice, often]), LABELS).instances
     assert mug.missed_by == 117 * 10**9
     assert mug.chance < 0.01
 
@@ -209,7 +214,7 @@ def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_alwa
         for t in (0, 20, 40)
     ]
     empty = bag_of(*[(HERE, [])] * 12, start=100)
-    [mug] = estimate(joined([*rarely, empty]), LABELS).instances
+    [mug] = estimate(whole([*rarely, empty]), LABELS).instances
     assert mug.missed_by is None
     assert 0.01 < mug.chance < 0.2
 
@@ -218,16 +223,16 @@ def test_a_second_place_is_a_second_thing_unless_the_first_was_seen_empty() -> N
     one = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(3)]
     back = (0.0, 0.0, math.pi)
     two = [bag_of(*[(back, seen_at(-2, 0))] * 10, start=100 + 10 * nth) for nth in range(3)]
-    assert len(estimate(joined([*one, *two]), LABELS).instances) == 2
+    assert len(estimate(whole([*one, *two]), LABELS).instances) == 2
     empty = [bag_of(*[(HERE, [])] * 10, start=50)]
-    [mug] = estimate(joined([*one, *empty, *two]), LABELS).instances
+    [mug] = estimate(whole([*one, *empty, *two]), LABELS).instances
     assert [round(each.x / 1000) for each in mug.stays] == [2, -2]
     assert mug.stays[0].left is not None
 
 
 def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:
     messages = [(HERE, seen_at(2, 0, "cup" if nth % 10 == 0 else "mug")) for nth in range(100)]
-    [mug] = estimate(joined([bag_of(*messages)]), LABELS).instances
+    [mug] = estimate(whole([bag_of(*messages)]), LABELS).instances
     assert mug.key == "mug"
     assert mug.stays[0].also == {"cup": 10}
 
@@ -237,22 +242,23 @@ def test_a_thing_that_is_rarely_seen_beside_another_is_a_thing() -> None:
     messages = [
         (HERE, [*mug, *seen_at(2.2, 0, "cup")] if nth % 4 == 0 else mug) for nth in range(99)
     ]
-    found = estimate(joined([bag_of(*messages)]), LABELS).instances
+    found = estimate(whole([bag_of(*messages)]), LABELS).instances
     assert [each.key for each in found] == ["cup", "mug"]
 
 
 def test_odometry_of_another_run_is_another_place() -> None:
     bags = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(4)]
-    assert len(estimate(joined(bags), LABELS, epochs=[0, 0, 1, 1]).instances) == 2
-    assert len(estimate(joined(bags), LABELS, epochs=[0, 0, 0, 0]).instances) == 1
+    sights, epochs = joined(bags, [0, 0, 1, 1])
+    assert len(estimate(sights, LABELS, epochs).instances) == 2
+    assert len(estimate(whole(bags), LABELS).instances) == 1
 
 
 def test_low_scores_do_not_count() -> None:
     bags = [bag_of(*[(HERE, [*seen_at(2, 0, "mug", 0.9), *seen_at(4, 0, "cup", 0.3)])] * 10)]
-    assert [each.key for each in estimate(joined(bags), LABELS, min_score=0.5).instances] == ["mug"]
-    assert len(estimate(joined(bags), LABELS, min_score=0.3).instances) == 2
+    assert [each.key for each in estimate(whole(bags), LABELS, min_score=0.5).instances] == ["mug"]
+    assert len(estimate(whole(bags), LABELS, min_score=0.3).instances) == 2
 
 
-@pytest.mark.parametrize("bags", [[], [SightsBuilder().sights()]], ids=["none", "empty"])
+@pytest.mark.parametrize("bags", [[], [no_sights()]], ids=["none", "empty"])
 def test_nothing_seen_is_no_thing(bags: list[Sights]) -> None:
-    assert estimate(joined(bags), LABELS).instances == []
+    assert estimate(whole(bags), LABELS).instances == []

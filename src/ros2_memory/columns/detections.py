@@ -1,0 +1,521 @@
+"""The detections in the messages of a table, from its columns alone.
+
+The same as `messages.detections.detections_of` finds in each extracted value: it goes where that
+goes. Where the columns do not settle it (a shape that differs from message to message) the messages
+have to be read.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.columns.scores import hypotheses, is_object, scored
+from ros2_memory.columns.shown import (
+    Group,
+    Items,
+    Listing,
+    Message,
+    Narrowed,
+    Nothing,
+    Shape,
+    UnknownShapeError,
+    children,
+    placed,
+)
+from ros2_memory.columns.table import Texts
+from ros2_memory.columns.truth import may_be_rewritten
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Values
+from ros2_memory.messages.detections import LISTS, MAX_DEPTH, POSITIONS, detections_of
+from ros2_memory.storage.base import Definition
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.columns.scores import Scored
+    from ros2_memory.columns.shown import Node
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Floats, Ints, Level
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.messages.detections import Detection
+
+Point: TypeAlias = tuple[Leaf, Leaf, Leaf]
+_STAMP: Final = "builtin_interfaces/msg/Time"
+
+
+class Detections(NamedTuple):
+    """Detections by message, in a message in its order.
+
+    Attributes:
+        rows: the message of each, ascending.
+        labels: their names.
+        scores: their detector's own, in its own unit; NaN where it gives none.
+        places: N x 3 (m), in the frame; NaN where the message has no place.
+        frames: the frame of each, empty where the message names none.
+    """
+
+    rows: Ints
+    labels: Texts
+    scores: Floats
+    places: Floats
+    frames: Texts
+
+
+class Found(NamedTuple):
+    """The detections of some messages.
+
+    Attributes:
+        detections: by the place of their message among these.
+        stamps: of the messages' headers (ns); None where they have none.
+    """
+
+    detections: Detections
+    stamps: Ints | None
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """Objects that may be detections: what names them, and what else there is where nothing does.
+
+    Attributes:
+        scored: names and scores; of the hypotheses with `is_best`.
+        otherwise: where detections are where the object is none.
+        frames: that name the frame, outermost first.
+        best_points: where the best hypothesis may say that the thing is.
+        points: where the object itself may; None where that depends on the message.
+        is_best: they are named by the best of several hypotheses, which is what is scored.
+    """
+
+    scored: Scored
+    otherwise: tuple[Source, ...]
+    frames: tuple[Leaf, ...]
+    best_points: tuple[Point, ...] | None
+    points: tuple[Point, ...] | None
+    is_best: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """A list of labels."""
+
+    leaf: Leaf
+
+
+@dataclass(frozen=True, slots=True)
+class Json:
+    """A text that may be JSON, and how deep detections are looked for in it."""
+
+    leaf: Leaf
+    depth: int
+    frames: tuple[Leaf, ...]
+
+
+Source: TypeAlias = Labels | Words | Json
+
+
+class DetectionColumns:
+    """Reads the detections of tables; remembers where they are in each type.
+
+    Args:
+        extractor: has the schema map.
+    """
+
+    def __init__(self, extractor: SchemaExtractor) -> None:
+        self._extractor = extractor
+        self._known: dict[tuple[Definition, str], tuple[Source, ...] | None] = {}
+
+    def of(self, table: Table) -> Found | None:
+        """Returns the detections of a table's messages; None where they have to be read."""
+        definition = table.definition
+        sources = self._sources(table)
+        if definition is None or sources is None:
+            return None
+        values = Values(table)
+        try:
+            parts = [part for source in sources for part in found_in(values, source, places=True)]
+            own = _own_frame(definition)
+            found = joined_detections([_with_frames(values, part, own) for part in parts])
+            return Found(found, _stamps(values, definition))
+        except UnknownShapeError:
+            return None
+
+    def may_hold(self, table: Table) -> bool:
+        """Returns whether some message of a table may hold a detection."""
+        sources, values = self._sources(table), Values(table)
+        return sources is None or any(_may_hold(values, source) for source in sources)
+
+    def _sources(self, table: Table) -> tuple[Source, ...] | None:
+        if table.definition is None or "" in table.left_out:
+            return None
+        key = (table.definition, table.channel.type)
+        if key not in self._known:
+            try:
+                shape = Shape(table.definition, table.channel.type, self._extractor)
+                self._known[key] = tuple(sources_in(shape.value))
+            except UnknownShapeError:
+                self._known[key] = None
+        return self._known[key]
+
+
+def detections_by(found: Sequence[Sequence[Detection]]) -> Detections:
+    """Returns the detections of messages that were read one by one."""
+    every = [(row, one) for row, some in enumerate(found) for one in some]
+    places = [(math.nan,) * 3 if one.place is None else one.place for _, one in every]
+    return Detections(
+        np.array([row for row, _ in every], np.int64),
+        Texts.of([one.label for _, one in every]),
+        np.array([math.nan if one.score is None else one.score for _, one in every], np.float64),
+        np.array(places, np.float64).reshape(-1, 3),
+        Texts.of([one.frame_id for _, one in every]),
+    )
+
+
+def joined_detections(parts: Sequence[Detections]) -> Detections:
+    """Returns the detections of all parts, by their messages."""
+    if len(parts) == 1:
+        return parts[0]
+    if not parts:
+        return detections_by(())
+    rows = np.concatenate([part.rows for part in parts])
+    order = np.argsort(rows, kind="stable")
+    return Detections(
+        rows[order],
+        joined_texts([part.labels for part in parts]).rows(order),
+        np.concatenate([part.scores for part in parts])[order],
+        np.concatenate([part.places for part in parts])[order],
+        joined_texts([part.frames for part in parts]).rows(order),
+    )
+
+
+def joined_texts(parts: Sequence[Texts]) -> Texts:
+    """Returns columns of texts one after the other."""
+    known: dict[str, int] = {}
+    codes = [np.empty(0, np.uint32)]
+    for part in parts:
+        new = [known.setdefault(word, len(known)) for word in part.words]
+        codes.append(np.array(new, np.uint32)[part.codes])
+    return Texts(np.concatenate(codes), tuple(known))
+
+
+# Where a type has detections
+
+
+def sources_in(
+    node: Node, depth: int = MAX_DEPTH, frames: tuple[Leaf, ...] = ()
+) -> Iterator[Source]:
+    """Yields where detections may be in a value; it goes where `detections_of` goes.
+
+    Raises:
+        UnknownShapeError: that depends on the message.
+    """
+    if depth == 0:
+        return
+    if isinstance(node, Narrowed):
+        raise UnknownShapeError("an element of a list stands alone")
+    if isinstance(node, Leaf):
+        if node.kind is Kind.TEXT:
+            yield Json(node, depth, frames)
+    elif isinstance(node, Listing | Items):
+        for element in [node.element] if isinstance(node, Listing) else node.items:
+            if is_object(element) or isinstance(element, Narrowed):
+                yield from sources_in(element, depth - 1, frames)
+    elif is_object(node):
+        yield from _in_object(dict(children(node)), depth, frames)
+
+
+def _in_object(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
+    named, several = scored(fields), hypotheses(fields)
+    frames = (*frames, *_frame(fields))
+    inner = tuple(_in_fields(fields, depth, frames))
+    if named is not None:
+        yield Labels(named, inner, frames, (), _points(fields))
+    elif several is not None:
+        results = fields["results"]
+        element = results.element if isinstance(results, Listing) else results
+        best = dict(children(element)) if isinstance(element, Message | Group) else {}
+        yield Labels(several, inner, frames, _points(best), _points(fields), is_best=True)
+    else:
+        yield from inner
+
+
+def _in_fields(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
+    for name, node in fields.items():
+        element = node.element if isinstance(node, Listing) else None
+        if name in LISTS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
+            yield Words(element)
+        yield from sources_in(node, depth - 1, frames)
+
+
+def _frame(fields: dict[str, Node]) -> Iterator[Leaf]:
+    header = fields.get("header")
+    if isinstance(header, Message | Group):
+        fields = dict(children(header))
+    leaf = fields.get("frame_id")
+    if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT:
+        yield leaf
+
+
+def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
+    """Returns where an object may have its place, first choice first; None: it depends."""
+    found: list[Point] = []
+    for path in POSITIONS:
+        node: Node | None = Group(fields)
+        for name in path:
+            node = dict(children(node)).get(name) if node and is_object(node) else None
+        if node is None or isinstance(node, Leaf | Nothing):
+            continue
+        if isinstance(node, Items):
+            leaves = [*node.items]
+        elif isinstance(node, Message | Group):
+            axes = dict(children(node))
+            leaves = [axes[axis] for axis in "xyz" if axis in axes]
+        else:
+            return None
+        numbers = [leaf for leaf in leaves if isinstance(leaf, Leaf) and _is_number(leaf)]
+        if len(leaves) == len(numbers) == 3:
+            x, y, z = numbers
+            found.append((x, y, z))
+        elif any(not isinstance(leaf, Leaf) for leaf in leaves):
+            return None
+    return tuple(found)
+
+
+def _is_number(leaf: Leaf) -> bool:
+    return leaf.kind in {Kind.INTEGER, Kind.REAL}
+
+
+# What a table holds
+
+
+def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detections]:
+    """Yields the detections at one place of the messages of a table.
+
+    Without `places` neither places nor frames are read.
+
+    Raises:
+        UnknownShapeError: the messages have to be read.
+    """
+    if isinstance(source, Json):
+        yield from _in_json(values, source)
+        return
+    if isinstance(source, Words):
+        texts = texts_of(values, source.leaf)
+        has = np.array([bool(word) for word in texts.words], np.bool_)
+        among = np.flatnonzero(has[texts.codes]) if texts.words else np.empty(0, np.int64)
+        yield _found(values, source.leaf.level, texts, among, np.full(len(texts), math.nan))
+        return
+    objects = source.scored
+    name, score, error = _named(values, objects)
+    among, size = np.arange(len(name)), len(name)
+    if source.is_best:
+        elements, parent = values.elements(objects.level), objects.level.parent
+        if elements is None or parent is None:
+            raise UnknownShapeError("hypotheses are not held")
+        among, size = _best(name, score, error, elements.owners), values.size(parent) or 0
+    is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
+    among = among[is_named[name.codes[among]]] if name.words else among[:0]
+    if among.size < size and any(
+        found.rows.size
+        for inner in source.otherwise
+        for found in found_in(values, inner, places=False)
+    ):
+        raise UnknownShapeError("some objects are detections, and some have such in them")
+    found = _found(values, objects.level, name, among, score)
+    if places:
+        where = _places(values, source, objects.level, among)
+        frames = _frames(values, objects.level, among, source.frames)
+        found = found._replace(places=where, frames=frames)
+    yield found
+
+
+def texts_of(values: Values, leaf: Leaf) -> Texts:
+    """Returns the texts of a leaf.
+
+    Raises:
+        UnknownShapeError: the table does not hold them.
+    """
+    texts = values.texts(leaf)
+    if texts is None:
+        raise UnknownShapeError(f"{leaf.sources[0]} is not held")
+    return texts
+
+
+def _found(values: Values, level: Level, name: Texts, among: Ints, scores: Floats) -> Detections:
+    """Returns detections at some places of a level, by their rows, without a place."""
+    _, rows = placed(values, level, among, (), surely=True)
+    labels = Texts(name.codes[among], name.words)
+    return Detections(rows, labels, scores[among], _nowhere(among.size), _no_frames(among.size))
+
+
+def _nowhere(count: int) -> Floats:
+    return np.full((count, 3), math.nan)
+
+
+def _no_frames(count: int) -> Texts:
+    return Texts(np.zeros(count, np.uint32), ("",))
+
+
+def _may_hold(values: Values, source: Source) -> bool:
+    """Returns whether there may be a detection at one place of the messages."""
+    if isinstance(source, Json):
+        zone = values.zone(source.leaf)
+        if zone is not None and not may_be_rewritten(zone):
+            return False
+        texts = values.texts(source.leaf)
+        return texts is None or any(word[:1] in {"[", "{"} for word in texts.words)
+    level = source.leaf.level if isinstance(source, Words) else source.scored.level
+    return values.size(level) != 0
+
+
+def _in_json(values: Values, source: Json) -> Iterator[Detections]:
+    """Yields the detections in texts that are JSON, each of which is parsed once."""
+    zone = values.zone(source.leaf)
+    if zone is not None and not may_be_rewritten(zone):
+        return
+    texts = texts_of(values, source.leaf)
+    known = [_parsed(word, source.depth) for word in texts.words]
+    counts = np.array([*map(len, known)], np.int64)
+    if not counts.any():
+        return
+    among = np.flatnonzero(counts[texts.codes])
+    once = detections_by(known)
+    first, counts = np.searchsorted(once.rows, texts.codes[among]), counts[texts.codes[among]]
+    of = np.repeat(among, counts)
+    nth = np.arange(of.size) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    _, rows = placed(values, source.leaf.level, of, (), surely=True)
+    around = _frames(values, source.leaf.level, of, source.frames)
+    yield Detections(
+        rows,
+        Texts(once.labels.codes[nth], once.labels.words),
+        once.scores[nth],
+        once.places[nth],
+        _or_else(Texts(once.frames.codes[nth], once.frames.words), around),
+    )
+
+
+def _parsed(word: str, depth: int) -> tuple[Detection, ...]:
+    if word[:1] not in {"[", "{"}:
+        return ()
+    value: JsonValue = word
+    for _ in range(MAX_DEPTH - depth):
+        value = {"": value}
+    return detections_of(value)
+
+
+def _named(values: Values, objects: Scored) -> tuple[Texts, Floats, float]:
+    """Returns the name of each of some objects, blank where it has none, its score, and the error.
+
+    Raises:
+        UnknownShapeError: names or scores are not held.
+    """
+    columns, score = [texts_of(values, leaf) for leaf in objects.labels], objects.score(values)
+    if score is None:
+        raise UnknownShapeError("scores are not held")
+    name = columns[0]
+    for other in columns[1:]:
+        name = _or_else(name, other, blank=True)
+    return name, *score
+
+
+def _or_else(one: Texts, other: Texts, *, blank: bool = False) -> Texts:
+    """Returns each of some texts, or another where it is empty (or `blank`)."""
+    is_none = [not (word.strip() if blank else word) for word in one.words]
+    if not any(is_none):
+        return one
+    codes = np.where(np.array(is_none)[one.codes], other.codes + len(one.words), one.codes)
+    return Texts(codes.astype(np.uint32), (*one.words, *other.words))
+
+
+def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
+    """Returns the first of the hypotheses of the highest score, for each detection.
+
+    Raises:
+        UnknownShapeError: they were rounded, so that another may be the best.
+    """
+    rank = np.where(np.isnan(score), -np.inf, score)
+    order = np.lexsort((-rank, owners))
+    begins = np.diff(owners[order], prepend=-1) != 0
+    best: Ints = order[begins]
+    if error:
+        follows = np.flatnonzero(begins[:-1] & ~begins[1:])
+        one, two = order[follows], order[follows + 1]
+        with np.errstate(invalid="ignore"):  # infinity less infinity
+            is_close = rank[one] - rank[two] <= 2 * error
+        if (is_close & (name.codes[one] != name.codes[two])).any():
+            raise UnknownShapeError("another hypothesis may be the best")
+    return best
+
+
+def _places(values: Values, source: Labels, level: Level, among: Ints) -> Floats:
+    """Returns the first valid point of each detection (N x 3); NaN where it has none."""
+    if source.points is None or source.best_points is None:
+        raise UnknownShapeError("points are of another shape in each message")
+    found = _nowhere(among.size)
+    for leaves in (*source.best_points, *source.points):
+        at = _owners(values, level, among, leaves[0].level)
+        columns = [values.numbers(leaf) for leaf in leaves]
+        numbers = [column.values[at] for column in columns if column is not None]
+        if len(numbers) < len(leaves):
+            raise UnknownShapeError("points are not held")
+        point = np.stack(numbers, axis=1).astype(np.float64)
+        # All zeros means that nobody filled it in.
+        is_one = np.isfinite(point).all(axis=1) & point.any(axis=1)
+        found = np.where((is_one & np.isnan(found[:, 0]))[:, None], point, found)
+    return found
+
+
+def _frames(values: Values, level: Level, among: Ints, leaves: Sequence[Leaf]) -> Texts:
+    """Returns the frame of each detection: what the innermost object around it names."""
+    found = _no_frames(among.size)
+    for leaf in leaves:
+        texts = texts_of(values, leaf)
+        at = texts.codes[_owners(values, level, among, leaf.level)]
+        found = _or_else(Texts(at, texts.words), found)
+    return found
+
+
+def _owners(values: Values, level: Level, among: Ints, around: Level) -> Ints:
+    """Returns, of some elements of a level, the elements or rows around them."""
+    while level != around:
+        elements = values.elements(level)
+        if elements is None or level.parent is None:
+            raise UnknownShapeError("elements are not held")
+        among, level = elements.owners[among], level.parent
+    return among
+
+
+def _kind_at(definition: Definition, *path: str) -> str | Definition:
+    """Returns what a field is; empty where there is no such field, or an array."""
+    kind: str | Definition = definition
+    for name in path:
+        fields = kind.fields if isinstance(kind, Definition) else ()
+        kind = next((each.kind for each in fields if each.name == name and each.length is None), "")
+    return kind
+
+
+def _own_frame(definition: Definition) -> tuple[Leaf, ...]:
+    """Returns the frame in a message's own header, if it has one."""
+    if _kind_at(definition, "header", "frame_id") not in {"string", "wstring"}:
+        return ()
+    return (Leaf(ROWS, ("header.frame_id",), Kind.TEXT),)
+
+
+def _with_frames(values: Values, found: Detections, own: tuple[Leaf, ...]) -> Detections:
+    """Returns detections with the frame of their message where they name none."""
+    if not own or found.frames.words.count("") == 0:
+        return found
+    return found._replace(frames=_or_else(found.frames, _frames(values, ROWS, found.rows, own)))
+
+
+def _stamps(values: Values, definition: Definition) -> Ints | None:
+    kind = _kind_at(definition, "header", "stamp")
+    if not isinstance(kind, Definition) or kind.type != _STAMP:
+        return None
+    stamps = values.numeric(ROWS, "header.stamp")
+    if stamps is None:
+        raise UnknownShapeError("stamps are not held")
+    return stamps.astype(np.int64)

@@ -1,0 +1,606 @@
+"""Sights: what detectors saw in a slice of the clock, and from where, as small tables of integers.
+
+A *spot* is where a detector saw one label: the mean of detections that lie together, never two of
+one message. A *look* is a cell of the robot's pose (`CELL_MM`, `CELL_DECIDEG`) from which a
+detector published, whether it saw anything or not. A *hit* counts how often a spot was seen in a
+look. So it is known what was not seen, too.
+
+Lengths are in mm, angles in tenths of a degree, times in ns of log time, scores in thousandths:
+integers, so that sums do not depend on their order. A slice is ten seconds of the clock, so that
+sights do not depend on how a history is cut into bags: the sum over an hour would not show whether
+a thing was missed before or after it was last seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import combinations, groupby
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.things.places import distinct_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ros2_memory.columns.table import Texts
+
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
+Flags: TypeAlias = NDArray[np.bool_]
+
+CELL_MM: Final = 250
+CELL_DECIDEG: Final = 100
+_CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG)
+SCORE_BINS: Final = 20
+"""Scores are counted in bins of 0.05, what lies above 1 in the last one."""
+SLICE_NS: Final = 10 * NS_PER_S
+
+_GATE_SQUARED: Final = 750.0**2
+"""A detection farther from a spot is of another thing: 30 cm of noise, two and a half times."""
+_SAME_SQUARED: Final = 500.0**2
+"""Spots that grew this near to each other were one, unless messages have both."""
+_TOGETHER_SHARE: Final = 0.05
+_BESIDE_MM: Final = 600
+"""Another label this near in the same message is not this one under a wrong name."""
+_MAX_SPOTS: Final = 64
+_MAX_LABELS: Final = 512
+_MAX_LABEL_CHARS: Final = 120
+_MAX_COMPARED: Final = 32
+_MAX_AWAY_M: Final = 1e6
+_MAX_SCORE: Final = 1e6
+_NS_PER_US: Final = 1_000
+_TOGETHER_MESSAGES: Final = 3
+
+
+class Spot(IntEnum):
+    """Columns of `Sights.spots`.
+
+    `DEV` is the root mean square distance of the detections in the plane; `BEST` is -1 without
+    scores; `TOGETHER` is how many of the label at least three messages had at once, or all had.
+    """
+
+    SLICE = 0
+    TOPIC = 1
+    LABEL = 2
+    N = 3
+    X = 4
+    Y = 5
+    Z = 6
+    DEV = 7
+    FIRST = 8
+    LAST = 9
+    BEST = 10
+    TOGETHER = 11
+
+
+class Look(IntEnum):
+    """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages."""
+
+    SLICE = 0
+    TOPIC = 1
+    X = 2
+    Y = 3
+    YAW = 4
+    N = 5
+    FIRST = 6
+    LAST = 7
+
+
+class Hit(IntEnum):
+    """Columns of `Sights.hits`: how many messages of a look have a detection of a spot."""
+
+    SPOT = 0
+    LOOK = 1
+    N = 2
+
+
+class Score(IntEnum):
+    """Columns of `Sights.scores`: how many detections of a spot have a score in a bin."""
+
+    SPOT = 0
+    BIN = 1
+    N = 2
+
+
+class Beside(IntEnum):
+    """Columns of `Sights.beside`: detections of a spot that had another label beside them."""
+
+    SPOT = 0
+    LABEL = 1
+    N = 2
+
+
+class Unplaced(IntEnum):
+    """Columns of `Sights.unplaced`: detections of a label without a place."""
+
+    SLICE = 0
+    TOPIC = 1
+    LABEL = 2
+    N = 3
+    FIRST = 4
+    LAST = 5
+
+
+class Fix(IntEnum):
+    """Columns of `Sights.fixes`: where odometry was in the map, and how exactly that was known.
+
+    `SIGMA` is what the localiser says, for a point `AHEAD_MM` before the robot; -1 if it does not.
+    """
+
+    SLICE = 0
+    TIME = 1
+    X = 2
+    Y = 3
+    YAW = 4
+    SIGMA = 5
+
+
+AHEAD_MM: Final = 2_000
+"""Things are about so far away: so much do errors of heading weigh."""
+_TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
+_WITH_SLICES: Final = (0, 1, 5, 6)
+"""The tables whose rows are of a slice, which column 0 numbers."""
+
+
+class Seen(NamedTuple):
+    """What the messages of a detector have, in order of log time, in one frame.
+
+    Attributes:
+        times: log times of the messages (ns).
+        robot: x, y (m) and yaw (rad) of the robot at each (M x 3); NaN where that is not known.
+        rows: of each detection its message, ascending.
+        labels: their names.
+        places: N x 3 (m); NaN where that is not known.
+        scores: NaN where there is none.
+    """
+
+    times: Ints
+    robot: Floats
+    rows: Ints
+    labels: Texts
+    places: Floats
+    scores: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sights:
+    """What detectors saw in some slices: column 0 of most tables is the slice.
+
+    From `sights_of` it is the slice of the clock; `joined` numbers those of all from 0 to `slices`.
+    """
+
+    topics: tuple[str, ...]
+    labels: tuple[str, ...]
+    tables: tuple[Ints, ...]
+    slices: int = 0
+
+    @property
+    def spots(self) -> Ints:
+        """Where labels were seen (`Spot`)."""
+        return self.tables[0]
+
+    @property
+    def looks(self) -> Ints:
+        """From where detectors published (`Look`)."""
+        return self.tables[1]
+
+    @property
+    def hits(self) -> Ints:
+        """How often a spot was seen in a look (`Hit`)."""
+        return self.tables[2]
+
+    @property
+    def scores(self) -> Ints:
+        """The scores of spots (`Score`)."""
+        return self.tables[3]
+
+    @property
+    def beside(self) -> Ints:
+        """Which other labels were beside a spot in the same message (`Beside`)."""
+        return self.tables[4]
+
+    @property
+    def unplaced(self) -> Ints:
+        """Detections without a place (`Unplaced`)."""
+        return self.tables[5]
+
+    @property
+    def fixes(self) -> Ints:
+        """Where odometry was in the map (`Fix`)."""
+        return self.tables[6]
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 1_000 + sum(table.nbytes for table in self.tables)
+
+
+def no_sights() -> Sights:
+    """Returns the sights where no detector published."""
+    return Sights((), (), tuple(np.zeros((0, len(columns)), np.int64) for columns in _TABLES))
+
+
+class _Detections(NamedTuple):
+    """Detections in whole millimetres, ascending by message; what is not placed has zeros."""
+
+    message: Ints
+    slice: Ints
+    label: Ints
+    x: Ints
+    y: Ints
+    z: Ints
+    score: Floats
+    is_placed: Flags
+
+    def at(self, among: Ints | Flags) -> _Detections:
+        """Returns some of them."""
+        return _Detections(*(column[among] for column in self))
+
+
+def sights_of(topic: str, seen: Seen) -> Sights:
+    """Returns the sights of the messages of one topic."""
+    slices = seen.times // SLICE_NS
+    look, looks = _looks(seen, slices)
+    found, labels = _detections(seen, slices)
+    group, together = _groups(found)
+    near = np.flatnonzero(found.is_placed)
+    near = near[np.argsort(group[near], kind="stable")]
+    cluster = np.full(len(found.message), -1, np.int64)
+    cluster[near] = _clusters(group[near], found.message[near], found.x[near], found.y[near])
+    lost, kept = found.at(cluster < 0), found.at(cluster >= 0)
+    _, spot = distinct_rows((group[cluster >= 0], cluster[cluster >= 0]))
+    scored = ~np.isnan(kept.score)
+    which, other = _beside(kept)
+    tables = (
+        _spots(kept, spot, seen.times, together[group[cluster >= 0]]),
+        looks,
+        _tallied(spot, look[kept.message]),
+        _tallied(spot[scored], _bins(kept.score[scored])),
+        _tallied(spot[which], other),
+        _unplaced(lost, seen.times),
+        np.zeros((0, len(Fix)), np.int64),
+    )
+    return Sights((topic,), labels, tables)
+
+
+def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
+    """Returns where odometry was in the map at some log times.
+
+    Args:
+        times: ns.
+        poses: x, y (m) and yaw (rad) at each.
+        sigma_m: what the localiser says; NaN where it does not.
+    """
+    said = np.where(np.isnan(sigma_m), -1, np.rint(np.minimum(sigma_m, _MAX_AWAY_M) * 1000))
+    x, y, yaw = poses.T
+    columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), said)
+    nothing = no_sights()
+    table = np.stack(columns, axis=1).astype(np.int64).reshape(-1, len(Fix))
+    return Sights((), (), (*nothing.tables[:-1], table))
+
+
+def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
+    """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
+    known = np.flatnonzero(np.isfinite(seen.robot).all(axis=1))
+    x, y, yaw = seen.robot[known].T
+    columns = (_mm(x), _mm(y), _decideg(yaw) % 3600)
+    cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
+    _, number = distinct_rows((slices[known], *cells))
+    look = np.full(len(seen.times), -1, np.int64)
+    look[known] = number
+    by = _Groups.of(number)
+    means = [by.sums(column) // by.sizes for column in columns]
+    first, last = by.ends(_rounded(seen.times[known]))
+    slices = slices[known][by.firsts]
+    topic = np.zeros(len(slices), np.int64)
+    return look, np.stack((slices, topic, *means, by.sizes, first, last), axis=1)
+
+
+def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
+    """Returns the detections, and the names of their labels."""
+    names = sorted({word[:_MAX_LABEL_CHARS] for word in seen.labels.words})
+    number = {name: nth for nth, name in enumerate(names)}
+    codes = [number[word[:_MAX_LABEL_CHARS]] for word in seen.labels.words]
+    label = np.array(codes, np.int64)[seen.labels.codes]
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(seen.places) < _MAX_AWAY_M).all(axis=1)
+    x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
+    found = _Detections(seen.rows, slices[seen.rows], label, x, y, z, seen.scores, near)
+    if len(names) > _MAX_LABELS:
+        rows, nth = distinct_rows((found.slice, label))
+        begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
+        before = np.repeat(begins, np.diff(begins, append=len(rows)))
+        found = found.at((np.arange(len(rows)) - before < _MAX_LABELS)[nth])
+    return found, tuple(names)
+
+
+def _groups(found: _Detections) -> tuple[Ints, Ints]:
+    """Returns the slice and label of each detection, numbered, and how many are seen at once.
+
+    That is how many of the label at least three messages of the slice have, or all.
+    """
+    _, group = distinct_rows((found.slice, found.label))
+    rows, nth = distinct_rows((group, found.message))
+    counts = np.bincount(nth, minlength=len(rows))
+    order = np.lexsort((-counts, rows[:, 0]))
+    begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
+    sizes = np.diff(begins, append=len(rows))
+    together: Ints = counts[order][begins + np.minimum(sizes, _TOGETHER_MESSAGES) - 1]
+    return group, together
+
+
+def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
+    """Returns the spot of each detection within its group; -1 where it has too many.
+
+    Detections are ordered by group, and by message. Each is of the nearest spot, no two of a
+    message of one. Mostly a group is one spot: all lie near the mean of those before.
+    """
+    begins = np.flatnonzero(np.diff(group, prepend=-1))
+    start = np.repeat(begins, np.diff(begins, append=len(group)))
+    nth = np.arange(len(group)) - start
+    away = np.zeros(len(group))
+    for column in (x, y):
+        off = column - column[start]
+        before = np.cumsum(off) - off
+        away += (off - (before - before[start]) / np.maximum(nth, 1)) ** 2
+    is_hard = (nth > 0) & (away > _GATE_SQUARED)
+    is_hard[1:] |= (group[1:] == group[:-1]) & (message[1:] == message[:-1])
+    found = np.zeros(len(group), np.int64)
+    for which in np.unique(group[is_hard]).tolist():
+        begin, end = np.searchsorted(group, (which, which + 1)).tolist()
+        some = slice(begin, end)
+        places = [*zip(x[some].tolist(), y[some].tolist(), strict=True)]
+        found[some] = _grown(message[some].tolist(), places)
+    return found
+
+
+class _Growing:
+    """A spot while it grows; `x` and `y` are its mean (mm)."""
+
+    __slots__ = ("n", "sum_x", "sum_y", "x", "y")
+
+    def __init__(self) -> None:
+        self.n = self.sum_x = self.sum_y = 0
+        self.x = self.y = 0.0
+
+    def add(self, n: int, sum_x: int, sum_y: int) -> None:
+        """Adds so many detections."""
+        self.n, self.sum_x, self.sum_y = self.n + n, self.sum_x + sum_x, self.sum_y + sum_y
+        self.x, self.y = self.sum_x / self.n, self.sum_y / self.n
+
+    def squared_to(self, x: float, y: float) -> float:
+        """Returns the squared distance of a place."""
+        dx, dy = self.x - x, self.y - y
+        return dx * dx + dy * dy
+
+
+def _grown(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
+    """Returns the spot of each detection of one label, which are ordered by message."""
+    spots: list[_Growing] = []
+    together: dict[tuple[int, int], int] = {}
+    found: list[int] = []
+    for _, some in groupby(range(len(messages)), key=messages.__getitem__):
+        chosen = _assigned(spots, [places[nth] for nth in some])
+        found += chosen
+        for pair in combinations(sorted(spot for spot in chosen if spot >= 0), 2):
+            together[pair] = together.get(pair, 0) + 1
+    into = _merged(spots, together)
+    return [spot if spot < 0 else into[spot] for spot in found]
+
+
+def _assigned(spots: list[_Growing], places: Sequence[tuple[int, int]]) -> list[int]:
+    """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
+    pairs = sorted(
+        (squared, nth, which)
+        for nth, place in enumerate(places)
+        for which, spot in enumerate(spots)
+        if (squared := spot.squared_to(*place)) <= _GATE_SQUARED
+    )
+    taken: dict[int, int] = {}
+    for _, nth, which in pairs:
+        if nth not in taken and which not in taken.values():
+            taken[nth] = which
+    chosen = []
+    for nth, place in enumerate(places):
+        which = taken.get(nth, -1)
+        if which < 0 and len(spots) < _MAX_SPOTS:
+            which = len(spots)
+            spots.append(_Growing())
+        if which >= 0:
+            spots[which].add(1, *place)
+        chosen.append(which)
+    return chosen
+
+
+def _merged(spots: Sequence[_Growing], together: Mapping[tuple[int, int], int]) -> list[int]:
+    """Returns into which spot each goes: those that lie together, and no messages have both of."""
+    into = [*range(len(spots))]
+    for one, other in combinations(range(len(spots)), 2):
+        if into[one] != one or into[other] != other:
+            continue
+        a, b = spots[one], spots[other]
+        both = together.get((one, other), 0)
+        if both <= _TOGETHER_SHARE * min(a.n, b.n) and a.squared_to(b.x, b.y) < _SAME_SQUARED:
+            a.add(b.n, b.sum_x, b.sum_y)
+            into[other] = one
+    return into
+
+
+def _spots(found: _Detections, spot: Ints, times: Ints, together: Ints) -> Ints:
+    by = _Groups.of(spot)
+    n, of = by.sizes, by.firsts
+    x, y, z = (by.sums(column) // n for column in (found.x, found.y, found.z))
+    # From the first of each: squares of far places are more than 63 bits.
+    dx, dy = (column - column[of][spot] for column in (found.x, found.y))
+    spread = n * by.sums(dx * dx + dy * dy) - by.sums(dx) ** 2 - by.sums(dy) ** 2
+    dev = np.sqrt(np.maximum(spread, 0)).astype(np.int64) // n
+    first, last = by.ends(_rounded(times[found.message]))
+    score = np.where(np.isnan(found.score), -1, _thousandths(found.score))
+    best = by.ends(score)[1]
+    topic = np.zeros(len(n), np.int64)
+    columns = (n, x, y, z, dev, first, last, best, together[of])
+    return np.stack((found.slice[of], topic, found.label[of], *columns), axis=1)
+
+
+def _unplaced(lost: _Detections, times: Ints) -> Ints:
+    rows, group = distinct_rows((lost.slice, lost.label))
+    by = _Groups.of(group)
+    first, last = by.ends(_rounded(times[lost.message]))
+    topic = np.zeros(len(rows), np.int64)
+    return np.stack((rows[:, 0], topic, rows[:, 1], by.sizes, first, last), axis=1)
+
+
+def _beside(found: _Detections) -> tuple[Ints, Ints]:
+    """Returns detections and another label that is beside each, each pair once."""
+    counts = np.bincount(found.message)
+    few = np.flatnonzero(counts[found.message] <= _MAX_COMPARED)
+    ones, others = [few[:0]], [few[:0]]
+    for step in range(1, int(counts.max(initial=0))):
+        a, b = few[:-step], few[step:]
+        near = found.message[a] == found.message[b]
+        if not near.any():
+            break
+        near &= found.label[a] != found.label[b]
+        for column in (found.x, found.y):
+            near &= np.abs(column[a] - column[b]) < _BESIDE_MM
+        ones += [a[near], b[near]]
+        others += [b[near], a[near]]
+    rows, _ = distinct_rows((np.concatenate(ones), found.label[np.concatenate(others)]))
+    return rows[:, 0], rows[:, 1]
+
+
+def _tallied(one: Ints, other: Ints) -> Ints:
+    """Returns the distinct pairs, and how often there is each."""
+    rows, nth = distinct_rows((one, other))
+    return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
+
+
+class _Groups(NamedTuple):
+    """Rows by their group, numbered from 0 without a gap.
+
+    Attributes:
+        order: the rows by group, those of one in their order.
+        begins: where each group begins in it.
+        sizes: how many rows each has.
+    """
+
+    order: Ints
+    begins: Ints
+    sizes: Ints
+
+    @classmethod
+    def of(cls, group: Ints) -> _Groups:
+        """Returns the groups of rows."""
+        sizes = np.bincount(group).astype(np.int64)
+        return cls(np.argsort(group, kind="stable"), np.cumsum(sizes) - sizes, sizes)
+
+    @property
+    def firsts(self) -> Ints:
+        """The first row of each group."""
+        return self.order[self.begins]
+
+    def sums(self, values: Ints) -> Ints:
+        """Returns the sum of each group."""
+        return np.add.reduceat(values[self.order], self.begins) if len(values) else values
+
+    def ends(self, values: Ints) -> tuple[Ints, Ints]:
+        """Returns the least and the greatest of each group."""
+        ordered = values[self.order]
+        if not len(values):
+            return ordered, ordered
+        return np.minimum.reduceat(ordered, self.begins), np.maximum.reduceat(ordered, self.begins)
+
+
+def _mm(metres: Floats) -> Ints:
+    return np.rint(metres * 1000).astype(np.int64)
+
+
+def _decideg(radians: Floats) -> Ints:
+    return np.rint(np.degrees(radians) * 10).astype(np.int64)
+
+
+def _thousandths(scores: Floats) -> Ints:
+    """Returns scores in thousandths: float32 has 0.7 as 0.69999999."""
+    return np.rint(np.clip(np.nan_to_num(scores), 0.0, _MAX_SCORE) * 1000).astype(np.int64)
+
+
+def _bins(scores: Floats) -> Ints:
+    return np.minimum(_thousandths(scores) * SCORE_BINS // 1000, SCORE_BINS - 1)
+
+
+def _rounded(times: Ints) -> Ints:
+    """Rounds up to 1 us: a message is at or before the time that is said of it."""
+    return -(-times // _NS_PER_US) * _NS_PER_US
+
+
+def joined(parts: Sequence[Sights], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:
+    """Returns the sights of all parts, with one table of names, and the epoch of each slice.
+
+    Slices are numbered in order of time. Those of one time and another epoch (the coordinate system
+    of a part) are different ones.
+    """
+    epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
+    topics = sorted({name for part in parts for name in part.topics})
+    labels = sorted({name for part in parts for name in part.labels})
+    moved = _renumbered(parts, topics, labels)
+    keys = []
+    for at in _WITH_SLICES:
+        of = np.repeat(epoch, np.array([len(part.tables[at]) for part in parts], np.int64))
+        keys.append(np.column_stack((moved[at][:, 0], of)))
+    every = np.concatenate(keys)
+    rows, number = distinct_rows((every[:, 0], every[:, 1]))
+    ends = np.cumsum([len(own) for own in keys])[:-1]
+    for at, slices in zip(_WITH_SLICES, np.split(number, ends), strict=True):
+        moved[at][:, 0] = slices
+    spots, looks, hits, scores, beside, unplaced, fixes = moved
+    spot_order = np.lexsort((spots[:, Spot.LABEL], spots[:, Spot.TOPIC], spots[:, Spot.SLICE]))
+    look_order = np.lexsort((looks[:, Look.TOPIC], looks[:, Look.SLICE]))
+    for table in (hits, scores, beside):
+        table[:, 0] = _places_of(spot_order)[table[:, 0]]
+    hits[:, Hit.LOOK] = np.append(_places_of(look_order), [-1])[hits[:, Hit.LOOK]]
+    tables = (
+        spots[spot_order],
+        looks[look_order],
+        *(table[np.lexsort(table.T[1::-1])] for table in (hits, scores, beside, unplaced)),
+        np.unique(fixes, axis=0),
+    )
+    return Sights(tuple(topics), tuple(labels), tables, len(rows)), rows[:, 1]
+
+
+def _renumbered(
+    parts: Sequence[Sights], topics: Sequence[str], labels: Sequence[str]
+) -> list[Ints]:
+    """Returns the tables of all parts, with numbers of topics, labels, spots and looks of all."""
+    topic_of = {name: nth for nth, name in enumerate(topics)}
+    label_of = {name: nth for nth, name in enumerate(labels)}
+    gathered: list[list[Ints]] = [[columns] for columns in no_sights().tables]
+    spots = looks = 0
+    for part in parts:
+        topic = np.array([topic_of[name] for name in part.topics], np.int64)
+        label = np.array([label_of[name] for name in part.labels], np.int64)
+        copies = [table.copy() for table in part.tables]
+        spot, look, hit, score, beside, unplaced, _ = copies
+        for table in (spot, look, unplaced):
+            table[:, 1] = topic[table[:, 1]]
+        for table in (spot, unplaced):
+            table[:, Spot.LABEL] = label[table[:, Spot.LABEL]]
+        hit[:, Hit.LOOK] += np.where(hit[:, Hit.LOOK] < 0, 0, looks)
+        for table in (hit, score, beside):
+            table[:, 0] += spots
+        beside[:, Beside.LABEL] = label[beside[:, Beside.LABEL]]
+        for tables, table in zip(gathered, copies, strict=True):
+            tables.append(table)
+        spots, looks = spots + len(spot), looks + len(look)
+    return [np.concatenate(tables) for tables in gathered]
+
+
+def _places_of(order: Ints) -> Ints:
+    """Returns where each row goes in an order."""
+    places = np.empty(len(order), np.int64)
+    places[order] = np.arange(len(order))
+    return places

@@ -1,0 +1,60 @@
+"""Sights of messages that a test writes down one by one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ros2_memory.columns.table import Texts
+from ros2_memory.things.sights import Seen, joined, no_sights, sights_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import Vector3
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.things.sights import Sights
+
+
+class PlacedDetection(NamedTuple):
+    """A detection in the frame of the sights (m)."""
+
+    label: str
+    place: Vector3 | None
+    score: float | None = None
+
+
+class Message(NamedTuple):
+    """A message of a detector: when, from where (x, y, yaw), and what it has."""
+
+    topic: str
+    time: Ns
+    robot: tuple[float, float, float] | None
+    things: Sequence[PlacedDetection]
+
+
+def sights_of_messages(messages: Sequence[Message]) -> Sights:
+    """The sights of messages of one topic in order of time."""
+    return sights_of(messages[0].topic, seen_in(messages)) if messages else no_sights()
+
+
+def seen_in(messages: Sequence[Message]) -> Seen:
+    """Messages of one topic as arrays."""
+    nowhere = (math.nan, math.nan, math.nan)
+    every = [(row, one) for row, message in enumerate(messages) for one in message.things]
+    scores = [math.nan if one.score is None else one.score for _, one in every]
+    return Seen(
+        np.array([message.time for message in messages], np.int64),
+        np.array([message.robot or nowhere for message in messages], np.float64).reshape(-1, 3),
+        np.array([row for row, _ in every], np.int64),
+        Texts.of([one.label for _, one in every]),
+        np.array([one.place or nowhere for _, one in every], np.float64).reshape(-1, 3),
+        np.array(scores, np.float64),
+    )
+
+
+def whole(parts: Sequence[Sights]) -> Sights:
+    """The sights of all parts, which are in one coordinate system."""
+    return joined(parts)[0]

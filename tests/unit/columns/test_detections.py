@@ -1,0 +1,108 @@
+"""What columns say that messages detect: the same as each decoded message."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.columns.detections import DetectionColumns, detections_by
+from ros2_memory.messages.detections import detections_of
+from tests.support.drawn_tables import drawn_tables, stored
+from tests.support.examples import examples
+from tests.support.memories import shipped_extractor
+from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.columns.detections import Detections
+    from ros2_memory.columns.table import Table
+    from ros2_memory.messages.detections import Detection
+    from tests.support.drawn_tables import Drawn
+
+EXTRACTOR = shipped_extractor()
+SETTLED = (
+    "std_msgs/msg/String",
+    "vision_msgs/msg/Detection2DArray",
+    "vision_msgs/msg/Detection3DArray",
+    "ros2_vision_interfaces/msg/VisionDetectionArray",
+    "ros2_vision_interfaces/msg/StampedString",
+    "own_msgs/msg/Label",
+)
+
+
+def detections_in(message: object, type_name: str) -> list[Detection]:
+    frame = EXTRACTOR.frame(message)
+    found = detections_of(EXTRACTOR.exact(message, type_name))
+    return [one if one.frame_id else one._replace(frame_id=frame) for one in found]
+
+
+def listed(found: Detections, digits: int) -> list[tuple[int | str, ...]]:
+    """Detections in an order that does not depend on where in a message they are."""
+    columns = (
+        found.rows.tolist(),
+        found.labels.values(),
+        found.frames.values(),
+        found.scores.tolist(),
+        found.places.tolist(),
+    )
+    rows = []
+    for row, label, frame, score, place in zip(*columns, strict=True):
+        # What is rounded to zero is not filled in. As texts, so that NaN is NaN.
+        is_somewhere = max(map(abs, place)) >= 10.0**-digits
+        where = [f"{axis:.{digits}g}" for axis in place] if is_somewhere else []
+        rows.append((row, label, frame if where else "", f"{score:.{digits}g}", *where))
+    return sorted(rows)
+
+
+def compared(table: Table, messages: Sequence[object], digits: int = 12) -> bool:
+    """Checks what the columns settle; returns whether they do."""
+    type_name = table.channel.type
+    expected = detections_by([detections_in(each, type_name) for each in messages])
+    columns = DetectionColumns(EXTRACTOR)
+    found = columns.of(table)
+    assert columns.may_hold(table) or not expected.rows.size
+    if found is None:
+        return False
+    assert listed(found.detections, digits) == listed(expected, digits)
+    stamps = [getattr(getattr(each, "header", None), "stamp", None) for each in messages]
+    if found.stamps is not None:
+        read = [each.sec * 10**9 + each.nanosec for each in stamps if each is not None]
+        assert found.stamps.tolist() == read
+    return True
+
+
+@settings(max_examples=examples(150), deadline=None)
+@given(drawn_tables())
+def test_columns_detect_what_drawn_messages_detect(drawn: Drawn) -> None:
+    compared(drawn.table, drawn.messages)
+
+
+@settings(max_examples=examples(80), deadline=None)
+@given(drawn_tables(SETTLED))
+def test_detections_of_common_types_need_no_reading(drawn: Drawn) -> None:
+    is_settled = compared(drawn.table, drawn.messages)
+    # An object without a name may hold detections.
+    every = [detections_in(each, drawn.type) for each in drawn.messages]
+    assert is_settled or any(every)
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(drawn_tables(SETTLED), st.sampled_from([0.0, 1e-6]))
+def test_stored_columns_detect_the_same_but_for_rounding(drawn: Drawn, step: float) -> None:
+    compared(stored(drawn.table, step), drawn.messages, digits=4)
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [
+        pytest.param("recorded", marks=needs_recorded),
+        pytest.param("real", marks=needs_real),
+    ],
+)
+def test_columns_of_shared_bags_detect_what_their_messages_detect(folder: str) -> None:
+    for table, messages in shared_samples(folder):
+        compared(table, messages)
