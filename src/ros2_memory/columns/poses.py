@@ -6,21 +6,19 @@ The same as `SchemaExtractor.pose` and `twist` give for each message, rounded al
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
+from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.shown import UnknownShapeError
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY
-from ros2_memory.columns.table import Texts, joined_texts
+from ros2_memory.columns.table import Texts
 from ros2_memory.extract import FRAME, HEADINGS, POSE_FRAMES, UNMAPPED, PlanarPose
 from ros2_memory.messages.fields import Route
 from ros2_memory.storage.base import SEQUENCE, Definition
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from ros2_memory.columns.steps import Step
@@ -37,78 +35,6 @@ _ABOUT_UNIT: Final = 1e-2
 _MOST_STEPPED: Final = 1e9
 """Larger numbers of metres are no places, nor does the store round them."""
 _TEXTS: Final = frozenset({"string", "wstring"})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Poses:
-    """Poses of the messages of a topic, in order of log time.
-
-    Attributes:
-        times: log times (ns).
-        positions: x, y and z (m) of each, as a row; NaN and infinities as the message has them.
-        turns: unit quaternions x, y, z, w, as rows; NaN where there is no orientation.
-        frames: of each; empty where it is not known.
-        speeds: the linear speed (m/s) that each message states; NaN where it states none.
-    """
-
-    times: IntArray
-    positions: Vectors
-    turns: Vectors
-    frames: Texts
-    speeds: Floats
-
-    def __len__(self) -> int:
-        """Returns the number of poses."""
-        return self.times.size
-
-    def rows(self, which: IntArray) -> Poses:
-        """Returns some of them, in the order given."""
-        return Poses(
-            self.times[which],
-            self.positions[which],
-            self.turns[which],
-            Texts(self.frames.codes[which], self.frames.words),
-            self.speeds[which],
-        )
-
-    def between(self, start: int, stop: int) -> Poses:
-        """Returns those from a log time on, before another (ns)."""
-        first, end = np.searchsorted(self.times, (start, stop)).tolist()
-        if end - first == len(self):
-            return self
-        return Poses(
-            self.times[first:end],
-            self.positions[first:end],
-            self.turns[first:end],
-            Texts(self.frames.codes[first:end], self.frames.words),
-            self.speeds[first:end],
-        )
-
-
-NO_POSES: Final = Poses(
-    np.empty(0, np.int64),
-    np.empty((0, 3)),
-    np.empty((0, 4)),
-    Texts(np.empty(0, np.uint32), ()),
-    np.empty(0),
-)
-
-
-def joined_poses(parts: Sequence[Poses]) -> Poses:
-    """Returns poses as one, in order of log time, ties in the order of the parts."""
-    parts = [part for part in parts if len(part)]
-    if len(parts) < 2:
-        return parts[0] if parts else NO_POSES
-    whole = Poses(
-        np.concatenate([part.times for part in parts]),
-        np.concatenate([part.positions for part in parts]),
-        np.concatenate([part.turns for part in parts]),
-        joined_texts([part.frames for part in parts]),
-        np.concatenate([part.speeds for part in parts]),
-    )
-    if (whole.times[1:] >= whole.times[:-1]).all():
-        return whole
-    return whole.rows(np.argsort(whole.times, kind="stable"))
 
 
 class PoseColumns:
@@ -345,7 +271,7 @@ def _read(rows: _Rows, columns: _Columns, times: IntArray) -> Poses:
         for path in columns.velocity[1:]:
             speeds = np.hypot(speeds, rows.floats(path, VELOCITY))
     turns, frames = _turns(rows, columns, times.size), _frames(rows, columns, times.size)
-    return Poses(times, positions, turns, frames, speeds)
+    return Poses(times, positions, turns, Frames(frames.codes, frames.words), speeds)
 
 
 def _turns(rows: _Rows, columns: _Columns, count: int) -> Vectors:

@@ -269,14 +269,9 @@ def _joined_column(parts: Sequence[Column]) -> Column:
     texts = [part for part in parts if isinstance(part, Texts)]
     if len(texts) < len(parts):
         return np.concatenate([part for part in parts if not isinstance(part, Texts)])
-    return joined_texts(texts)
-
-
-def joined_texts(parts: Sequence[Texts]) -> Texts:
-    """Returns the strings of columns, of which there is one at least, as one column."""
     known: dict[str, int] = {}
     codes = []
-    for part in parts:
+    for part in texts:
         new = [known.setdefault(word, len(known)) for word in part.words]
         codes.append(np.array(new, np.uint32)[part.codes])
     return Texts(np.concatenate(codes), tuple(known))

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.columns.poses import NoPoseError, PoseColumns, Poses, joined_poses, rounded
+from ros2_memory.analysis.poses import Frames, Poses, joined_poses
+from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
@@ -95,11 +96,12 @@ def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
     unknown = (math.nan,) * 4
     turns = [unknown if pose.orientation is None else pose.orientation for _, pose, _ in rows]
     places = np.array([pose.position for _, pose, _ in rows], np.float64).reshape(-1, 3)
+    frames = Texts.of([pose.frame_id for _, pose, _ in rows])
     return Poses(
         np.array([time for time, *_ in rows], np.int64),
         rounded(places, METRES),
         np.array(turns, np.float64).reshape(-1, 4),
-        Texts.of([pose.frame_id for _, pose, _ in rows]),
+        Frames(frames.codes, frames.words),
         np.array([math.nan if speed is None else speed for *_, speed in rows], np.float64),
     )
 

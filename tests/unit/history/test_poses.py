@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from ros2_memory.columns.poses import joined_poses
+from ros2_memory.analysis.poses import joined_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -25,7 +25,7 @@ from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.columns.poses import Poses
+    from ros2_memory.analysis.poses import Poses
     from ros2_memory.history.context import Memory
 
 S = 10**9
