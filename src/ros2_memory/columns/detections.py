@@ -64,6 +64,19 @@ class Detections(NamedTuple):
     places: Floats
     frames: Texts
 
+    def at(self, rows: Ints) -> Detections:
+        """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
+        place = np.searchsorted(rows, self.rows)
+        kept = place < rows.size
+        kept[kept] = rows[place[kept]] == self.rows[kept]
+        return Detections(
+            place[kept],
+            Texts(self.labels.codes[kept], self.labels.words),
+            self.scores[kept],
+            self.places[kept],
+            Texts(self.frames.codes[kept], self.frames.words),
+        )
+
 
 class Found(NamedTuple):
     """The detections of some messages.

@@ -1,0 +1,98 @@
+"""The detections of a topic as arrays, from its columns, else from its messages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.transform_tree import AGREEMENT_NS
+from ros2_memory.columns.detections import DetectionColumns, detections_by
+from ros2_memory.columns.steps import METRES
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.history.scan import messages_of
+from ros2_memory.messages.conversions import nanoseconds
+from ros2_memory.messages.detections import detections_of
+
+if TYPE_CHECKING:
+    from ros2_memory.columns.detections import Detections
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.view import View
+    from ros2_memory.messages.detections import Detection
+    from ros2_memory.storage.base import IntArray
+
+
+class Detected(NamedTuple):
+    """Messages of one topic in order of log time, and the detections in them.
+
+    Attributes:
+        log_times: of the messages (ns).
+        times: in the clock of the transforms, as far as is known: of their stamps where these agree
+            with the log times, else those.
+        found: by the place of their message; places are rounded to 0.1 mm, as the store has them.
+    """
+
+    log_times: IntArray
+    times: IntArray
+    found: Detections
+
+
+class DetectionRows:
+    """Reads the detections of rows by their columns, else by their messages.
+
+    Args:
+        view: has the bags.
+    """
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        self._columns = DetectionColumns(view.memory.extractor)
+
+    def may_hold(self, table: Table) -> bool:
+        """Returns whether some message of a table may hold a detection."""
+        return self._columns.may_hold(table)
+
+    def of(self, rows: Rows) -> Detected:
+        """Returns the detections of some rows; messages that cannot be decoded are left out."""
+        known = self._columns.of(rows.table)
+        if known is None:
+            return self._decoded(rows)
+        found, stamps = known
+        if rows.index is not None:
+            found = found.at(rows.index)
+            stamps = None if stamps is None else stamps[rows.index]
+        return _detected(rows.times, stamps, found)
+
+    def _decoded(self, rows: Rows) -> Detected:
+        read = [one for found in messages_of(self._view, rows) for one in self._one(found)]
+        # Those of a part come bag after bag, in the order in which bags were stored.
+        read.sort(key=lambda one: one[0])
+        log_times, stamps = (np.array([one[nth] for one in read], np.int64) for nth in (0, 1))
+        return _detected(log_times, stamps, detections_by([one[2] for one in read]))
+
+    def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
+        """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
+        extractor = self._view.memory.extractor
+        try:
+            message = self._view.memory.reader.decode(found.record)
+        except UndecodableError:
+            return []
+        frame = extractor.frame(message)
+        stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
+        detections = [
+            one if one.frame_id else one._replace(frame_id=frame)
+            for one in detections_of(extractor.exact(message, found.record.channel.type))
+        ]
+        return [(found.time, found.time if stamp is None else stamp, detections)]
+
+
+def _detected(log_times: IntArray, stamps: IntArray | None, found: Detections) -> Detected:
+    times = log_times
+    if stamps is not None:
+        # A stamp of another clock cannot be compared with those of transforms.
+        times = np.where(np.abs(stamps - log_times) <= AGREEMENT_NS, stamps, log_times)
+    places = np.rint(found.places * METRES.per_unit) / METRES.per_unit
+    return Detected(log_times, times, found._replace(places=places))
