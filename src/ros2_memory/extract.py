@@ -83,7 +83,7 @@ class Extracted:
 
 
 @dataclass(frozen=True, slots=True)
-class _PointPose:
+class PointPose:
     """Reads a pose from a point and a rotation; PX4 writes them as arrays, if `arrays`."""
 
     position: Route
@@ -91,6 +91,7 @@ class _PointPose:
     arrays: bool = False
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
+        """Returns position and rotation in a message; None where it has no position."""
         found, turned = self.position.of(message), self.orientation.of(message)
         position, turn = xyz(found), rotation(turned)
         if self.arrays:
@@ -100,7 +101,7 @@ class _PointPose:
 
 
 @dataclass(frozen=True, slots=True)
-class _PlanarPose:
+class PlanarPose:
     """Reads a pose from x, y, perhaps z (m; 0 without one) and a heading (rad)."""
 
     x: Route
@@ -109,6 +110,7 @@ class _PlanarPose:
     heading: Route
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
+        """Returns position and rotation in a message; None where it has no position."""
         x, y = number(self.x.of(message)), number(self.y.of(message))
         if x is None or y is None:
             return None
@@ -119,11 +121,11 @@ class _PlanarPose:
 
 
 @dataclass(frozen=True, slots=True)
-class _Plan:
+class Plan:
     """The compiled schema map of one type. Poses and twists are tried in order."""
 
     fields: Mapping[str, Segments]
-    poses: tuple[_PointPose | _PlanarPose, ...]
+    poses: tuple[PointPose | PlanarPose, ...]
     twists: tuple[tuple[Route, Route], ...]
     geodetic: tuple[Route, Route, Route] | None = None
     pose_frame: Route | None = None
@@ -131,11 +133,11 @@ class _Plan:
 
 
 _NOWHERE: Final = Route("")
-_HEADINGS: Final = ("theta", "yaw", "heading")
-_UNMAPPED: Final = _Plan(
+HEADINGS: Final = ("theta", "yaw", "heading")
+UNMAPPED: Final = Plan(
     fields={},
     poses=tuple(
-        _PointPose(Route(*prefix, "position"), Route(*prefix, "orientation"))
+        PointPose(Route(*prefix, "position"), Route(*prefix, "orientation"))
         for prefix in (("pose", "pose"), ("pose",), ())
     ),
     twists=tuple(
@@ -144,7 +146,7 @@ _UNMAPPED: Final = _Plan(
     ),
 )
 """For a type that is not in the schema map."""
-_FRAME: Final = Route("header", "frame_id")
+FRAME: Final = Route("header", "frame_id")
 _CHILD_FRAME: Final = Route("child_frame_id")
 _STAMP: Final = Route("header", "stamp")
 _TRANSFORMS: Final = Route("transforms")
@@ -155,8 +157,8 @@ _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
 POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
 """Names of the schema map under which an array of three numbers is shown as x, y and z."""
-_POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
-_VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 3: "body FRD"}
+POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
+_VELOCITY_FRAMES: Final = {**POSE_FRAMES, 3: "body FRD"}
 """The constants of px4_msgs/msg/VehicleOdometry."""
 
 
@@ -218,7 +220,7 @@ class SchemaExtractor:
         nodes = {path: self._find(message, type_name, path) for path in fields}
         for path, node in nodes.items():
             if node is ABSENT:
-                plan = self._plan(type_name)
+                plan = self.plan(type_name)
                 raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
         limit, squeeze = self.limit, 1
         while True:
@@ -252,24 +254,24 @@ class SchemaExtractor:
         `pose.pose.position`, `pose.position` or `position`, or by `x`, `y` and a heading.
         Coordinates are those of the message, NaN included.
         """
-        plan = self._plan(type_name)
+        plan = self.plan(type_name)
         for route in plan.poses:
             found = route.of(message)
             if found is not None:
-                px4_frame = _px4_frame(plan.pose_frame, message, _POSE_FRAMES)
-                return Pose(*found, _text(_FRAME.of(message)) or px4_frame)
-        return _planar_pose(message) if plan is _UNMAPPED else None
+                px4_frame = _px4_frame(plan.pose_frame, message, POSE_FRAMES)
+                return Pose(*found, _text(FRAME.of(message)) or px4_frame)
+        return _planar_pose(message) if plan is UNMAPPED else None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:
         """Returns the position on the Earth of a message; None where it has none."""
-        routes = self._plan(type_name).geodetic
+        routes = self.plan(type_name).geodetic
         if routes is None:
             return None
         latitude, longitude, altitude = (number(route.of(message)) for route in routes)
         if latitude is None or longitude is None:
             return None
         above = math.nan if altitude is None else altitude
-        return Geodetic(latitude, longitude, above, _text(_FRAME.of(message)))
+        return Geodetic(latitude, longitude, above, _text(FRAME.of(message)))
 
     def own_path(self, path: str, type_name: str) -> str:
         """Returns a full path in a message as one in its extracted value.
@@ -277,7 +279,7 @@ class SchemaExtractor:
         Such as `position.x` for `pose.pose.position.x` of an odometry. A path that no mapped field
         leads to, or that begins with one of their names, is returned as it is.
         """
-        fields, segments = self._plan(type_name).fields, tuple(path.split("."))
+        fields, segments = self.plan(type_name).fields, tuple(path.split("."))
         if segments[0] in fields:
             return path
         leading = [
@@ -292,21 +294,21 @@ class SchemaExtractor:
 
     def fields_of(self, type_name: str) -> Mapping[str, Segments]:
         """Returns the fields that the schema map names, with their paths; none if it has none."""
-        return self._plan(type_name).fields
+        return self.plan(type_name).fields
 
     def is_mapped(self, type_name: str) -> bool:
         """Returns whether the schema map lists a type; what any other carries its messages show."""
-        return self._plan(type_name) is not _UNMAPPED
+        return self.plan(type_name) is not UNMAPPED
 
     def kinds_of(self, type_name: str) -> frozenset[str]:
         """Returns what messages of a mapped type have: `position`, `velocity`, `geodetic`."""
-        plan = self._plan(type_name)
-        if plan is _UNMAPPED:
+        plan = self.plan(type_name)
+        if plan is UNMAPPED:
             return frozenset()
         has = {
             # Not a point without an orientation, such as one that somebody clicked.
             "position": any(
-                isinstance(route, _PlanarPose) or route.orientation is not _NOWHERE
+                isinstance(route, PlanarPose) or route.orientation is not _NOWHERE
                 for route in plan.poses
             ),
             "velocity": bool(plan.twists),
@@ -321,21 +323,21 @@ class SchemaExtractor:
         map, by vectors at `twist.twist` or `twist`. It is expressed in the child frame where the
         message names one (nav_msgs/Odometry), otherwise in the header's frame.
         """
-        plan = self._plan(type_name)
+        plan = self.plan(type_name)
         for linear, angular in plan.twists:
             found, turning = linear.of(message), angular.of(message)
             along, about = xyz(found), xyz(turning)
-            if along is None and plan is not _UNMAPPED:
+            if along is None and plan is not UNMAPPED:
                 along, about = _velocity(found, 0), _velocity(turning, 2)
             if along is not None and about is not None:
-                frame = _text(_CHILD_FRAME.of(message)) or _text(_FRAME.of(message))
+                frame = _text(_CHILD_FRAME.of(message)) or _text(FRAME.of(message))
                 px4_frame = _px4_frame(plan.velocity_frame, message, _VELOCITY_FRAMES)
                 return Twist(along, about, frame or px4_frame)
         return None
 
     def frame(self, message: object) -> str:
         """Returns the frame in a message's header; empty where it has none."""
-        return _text(_FRAME.of(message))
+        return _text(FRAME.of(message))
 
     def transforms(
         self, message: object, log_time: Ns, *, static: bool
@@ -351,14 +353,15 @@ class SchemaExtractor:
         edges = (_edge(one, log_time, static=static) for one in listed)
         return tuple(edge for edge in edges if edge is not None)
 
-    def _plan(self, type_name: str) -> _Plan:
+    def plan(self, type_name: str) -> Plan:
+        """Returns the compiled schema map of a type; `UNMAPPED` where it is not in the map."""
         plan = self._plans.get(type_name)
         if plan is None and type_name.count("/") == 1:  # as recorders before 2019 wrote it
             plan = self._plans.get(type_name.replace("/", "/msg/"))
-        return _UNMAPPED if plan is None else plan
+        return UNMAPPED if plan is None else plan
 
     def _whole(self, rendering: ExactJson, message: object, type_name: str) -> JsonValue:
-        plan = self._plan(type_name)
+        plan = self.plan(type_name)
         nodes = [(name, _converted(name, _at(message, path))) for name, path in plan.fields.items()]
         absent = [name for name, node in nodes if node is ABSENT]
         for name in absent:
@@ -369,7 +372,7 @@ class SchemaExtractor:
 
     def _find(self, message: object, type_name: str, path: str) -> object:
         """Returns what is at one of `fields` in a message, or `ABSENT`."""
-        plan = self._plan(type_name)
+        plan = self.plan(type_name)
         segments = tuple(path.split("."))
         mapped = plan.fields.get(segments[0])
         if mapped is not None:
@@ -379,7 +382,7 @@ class SchemaExtractor:
         return _plain(_at(message, segments)) if found is ABSENT else found
 
 
-def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:
+def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
     paths: dict[str, Segments] = {}
     for name, path in fields.items():
         segments = parse_path(path)
@@ -395,7 +398,7 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:
 
     has_twist = paths.keys() >= {"linear_velocity", "angular_velocity"}
     has_geodetic = paths.keys() >= {"latitude", "longitude"}
-    return _Plan(
+    return Plan(
         fields=paths,
         poses=_poses(paths.keys(), route),
         twists=((route("linear_velocity"), route("angular_velocity")),) if has_twist else (),
@@ -409,25 +412,25 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:
 
 def _poses(
     names: Collection[str], route: Callable[[str], Route]
-) -> tuple[_PointPose | _PlanarPose, ...]:
+) -> tuple[PointPose | PlanarPose, ...]:
     if "position" in names:
-        return (_PointPose(route("position"), route("orientation"), arrays=True),)
+        return (PointPose(route("position"), route("orientation"), arrays=True),)
     if "translation" in names and "rotation" in names:
-        return (_PointPose(route("translation"), route("rotation")),)
+        return (PointPose(route("translation"), route("rotation")),)
     if "x" in names and "y" in names:
-        heading = next((name for name in _HEADINGS if name in names), "heading")
-        return (_PlanarPose(route("x"), route("y"), route("z"), route(heading)),)
+        heading = next((name for name in HEADINGS if name in names), "heading")
+        return (PlanarPose(route("x"), route("y"), route("z"), route(heading)),)
     return ()
 
 
 def _planar_pose(message: object) -> Pose | None:
     """Returns the pose of a message that has x, y and a heading (rad) as fields of its own."""
     names = names_of(message) if not isinstance(message, list) else ()
-    heading = next((name for name in _HEADINGS if name in names), None)
+    heading = next((name for name in HEADINGS if name in names), None)
     if heading is None:
         return None
-    found = _PlanarPose(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
-    return None if found is None else Pose(*found, _text(_FRAME.of(message)))
+    found = PlanarPose(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
+    return None if found is None else Pose(*found, _text(FRAME.of(message)))
 
 
 def _px4_rotation(node: object) -> Quaternion | None:
@@ -503,7 +506,7 @@ def _plain(node: object) -> object:
     return node if numbers is None else dict(zip("xyzw", numbers, strict=True))
 
 
-def _no_such_field(type_name: str, path: str, plan: _Plan, message: object) -> str:
+def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> str:
     names = names_of(message)
     known = listed(names, at_most=_LISTED_NAMES)
     if not plan.fields:
@@ -522,7 +525,7 @@ def _text(node: object) -> str:
 
 
 def _edge(node: object, log_time: Ns, *, static: bool) -> StampedTransform | None:
-    parent = _text(_FRAME.of(node)).removeprefix("/")
+    parent = _text(FRAME.of(node)).removeprefix("/")
     child = _text(_CHILD_FRAME.of(node)).removeprefix("/")
     stamp = nanoseconds(_STAMP.of(node))
     translation, turn = xyz(_TRANSLATION.of(node)), rotation(_ROTATION.of(node))

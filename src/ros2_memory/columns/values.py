@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, Texts, Zone
+from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.messages.conversions import ANGLES, channels_of, euler_of
 
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 _EXACT_BELOW: Final = 2**53
 """Whole numbers below this are floats."""
 _UNIT_TOLERANCE: Final = 1e-12
-_GIMBAL_LOCK_SINE: Final = 1 - 1e-14
 _ROUNDING_DEG: Final = 1e-9
 """More than numpy's arcsine and arctangent differ from those of the mathematical library."""
 _TURN_ERRORS: Final = 8.0
@@ -312,7 +312,7 @@ def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
             for whole, part in zip((x, y, z, w), parts, strict=True)
         )
         sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
-        locked = np.abs(sine) > _GIMBAL_LOCK_SINE
+        locked = np.abs(sine) > GIMBAL_LOCK_SINE
         both = 2 * np.arctan2(z, w)
         both -= math.tau * np.rint(both / math.tau)
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))

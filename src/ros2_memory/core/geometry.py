@@ -26,7 +26,7 @@ Clock: TypeAlias = "tuple[Sequence[float], Numbers]"
 
 IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
-_GIMBAL_LOCK_SINE: Final = 1 - 1e-14
+GIMBAL_LOCK_SINE: Final = 1 - 1e-14
 """Beyond this sine of pitch, roll and yaw share one axis to within 1.5e-7 rad."""
 
 _PARALLEL_COSINE: Final = 1 - 1e-10
@@ -72,7 +72,7 @@ def rpy(q: Quaternion) -> tuple[float, float, float]:
     x, y, z, w = q
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
     pitch = math.asin(sine)
-    if abs(sine) > _GIMBAL_LOCK_SINE:
+    if abs(sine) > GIMBAL_LOCK_SINE:
         return 0.0, pitch, math.remainder(2 * math.atan2(z, w), math.tau)
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

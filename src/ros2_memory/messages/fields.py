@@ -137,13 +137,17 @@ def _each(
 
 
 class Route:
-    """A path without lists in it, compiled to an `attrgetter`, which is fast for messages."""
+    """A path without lists in it, compiled to an `attrgetter`, which is fast for messages.
 
-    __slots__ = ("_fast", "_segments")
+    Attributes:
+        segments: the names of the fields.
+    """
+
+    __slots__ = ("_fast", "segments")
 
     def __init__(self, *segments: str) -> None:
         self._fast = attrgetter(".".join(segments))
-        self._segments = segments
+        self.segments = segments
 
     def of(self, message: object) -> object:
         """Returns what is at the path, of whatever kind; ABSENT or null where there is nothing."""
@@ -151,5 +155,5 @@ class Route:
             found: object = self._fast(message)
         # JSON objects, and attributes that rosbags renamed.
         except AttributeError:
-            found = descend(message, self._segments)
+            found = descend(message, self.segments)
         return found

@@ -1,0 +1,127 @@
+"""The poses of a topic as arrays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.storage.base import IntArray
+
+    Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+    Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
+
+
+class Frames(NamedTuple):
+    """The frames of poses: `words[code]` for each; there may be words that no pose has."""
+
+    codes: np.ndarray[tuple[int], np.dtype[np.uint32]]
+    words: tuple[str, ...]
+
+    def values(self) -> list[str]:
+        """Returns the frame of each pose."""
+        return [self.words[code] for code in self.codes.tolist()]
+
+    def names(self) -> tuple[str, ...]:
+        """Returns the frames that poses have, each once, in order of appearance."""
+        used, first = np.unique(self.codes, return_index=True)
+        return tuple(self.words[code] for code in used[np.argsort(first)].tolist())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Poses of the messages of a topic, in order of log time.
+
+    Attributes:
+        times: log times (ns).
+        positions: x, y and z (m) of each, as a row; NaN and infinities as the message has them.
+        turns: unit quaternions x, y, z, w, as rows; NaN where there is no orientation.
+        frames: of each; empty where it is not known.
+        speeds: the linear speed (m/s) that each message states; NaN where it states none.
+    """
+
+    times: IntArray
+    positions: Vectors
+    turns: Vectors
+    frames: Frames
+    speeds: Floats
+
+    def __len__(self) -> int:
+        """Returns the number of poses."""
+        return self.times.size
+
+    def rows(self, which: IntArray) -> Poses:
+        """Returns some of them, in the order given."""
+        return Poses(
+            self.times[which],
+            self.positions[which],
+            self.turns[which],
+            Frames(self.frames.codes[which], self.frames.words),
+            self.speeds[which],
+        )
+
+    def between(self, start: int, stop: int) -> Poses:
+        """Returns those from a log time on, before another (ns)."""
+        first, end = np.searchsorted(self.times, (start, stop)).tolist()
+        if end - first == len(self):
+            return self
+        return Poses(
+            self.times[first:end],
+            self.positions[first:end],
+            self.turns[first:end],
+            Frames(self.frames.codes[first:end], self.frames.words),
+            self.speeds[first:end],
+        )
+
+
+NO_POSES: Final = Poses(
+    np.empty(0, np.int64),
+    np.empty((0, 3)),
+    np.empty((0, 4)),
+    Frames(np.empty(0, np.uint32), ()),
+    np.empty(0),
+)
+
+
+def joined_poses(parts: Sequence[Poses]) -> Poses:
+    """Returns poses as one, in order of log time, ties in the order of the parts."""
+    parts = [part for part in parts if len(part)]
+    if len(parts) < 2:
+        return parts[0] if parts else NO_POSES
+    whole = Poses(
+        np.concatenate([part.times for part in parts]),
+        np.concatenate([part.positions for part in parts]),
+        np.concatenate([part.turns for part in parts]),
+        _joined_frames([part.frames for part in parts]),
+        np.concatenate([part.speeds for part in parts]),
+    )
+    if (whole.times[1:] >= whole.times[:-1]).all():
+        return whole
+    return whole.rows(np.argsort(whole.times, kind="stable"))
+
+
+def _joined_frames(parts: Sequence[Frames]) -> Frames:
+    known: dict[str, int] = {}
+    codes = []
+    for part in parts:
+        new = [known.setdefault(word, len(known)) for word in part.words]
+        codes.append(np.array(new, np.uint32)[part.codes])
+    return Frames(np.concatenate(codes), tuple(known))
+
+
+def headings(turns: Vectors) -> Floats:
+    """Returns the heading about z (rad) of unit quaternions, as `geometry.yaw` has it; or NaN."""
+    x, y, z, w = turns.T
+    sine = 2 * (w * y - z * x)
+    plain = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    # At gimbal lock only the sum of roll and heading is known.
+    both = 2 * np.arctan2(z, w)
+    both -= math.tau * np.rint(both / math.tau)
+    return np.where(np.abs(sine) > GIMBAL_LOCK_SINE, both, plain)

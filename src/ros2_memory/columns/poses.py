@@ -1,0 +1,316 @@
+"""The poses of a table, from its columns alone.
+
+The same as `SchemaExtractor.pose` and `twist` give for each message, rounded alike everywhere: to
+0.1 mm and what the store keeps of rotations. So nothing depends on what is stored.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
+
+import numpy as np
+
+from ros2_memory.analysis.poses import Frames, Poses
+from ros2_memory.columns.shown import UnknownShapeError
+from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY
+from ros2_memory.columns.table import Texts
+from ros2_memory.extract import FRAME, HEADINGS, POSE_FRAMES, UNMAPPED, PlanarPose
+from ros2_memory.messages.fields import Route
+from ros2_memory.storage.base import SEQUENCE, Definition
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.steps import Step
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Floats
+    from ros2_memory.extract import Plan, PointPose, SchemaExtractor
+    from ros2_memory.messages.fields import Segments
+    from ros2_memory.storage.base import IntArray
+
+    Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
+
+_UNIT_TOLERANCE: Final = 1e-12
+_ABOUT_UNIT: Final = 1e-2
+_MOST_STEPPED: Final = 1e9
+"""Larger numbers of metres are no places, nor does the store round them."""
+_TEXTS: Final = frozenset({"string", "wstring"})
+
+
+class PoseColumns:
+    """Reads the poses of tables; remembers which columns of a type they are.
+
+    Args:
+        extractor: has the schema map.
+    """
+
+    def __init__(self, extractor: SchemaExtractor) -> None:
+        self._extractor = extractor
+        self._known: dict[tuple[Definition, str], _Columns | None] = {}
+
+    def of(self, table: Table, times: IntArray, index: IntArray | None) -> Poses | None:
+        """Returns the poses of some rows of a table; None where their messages have to be read.
+
+        Args:
+            table: of messages of one type.
+            times: the log times of these rows.
+            index: their positions in the table; None for all.
+
+        Raises:
+            NoPoseError: messages of this type have no pose.
+        """
+        if table.definition is None or "" in table.left_out:
+            return None
+        key = (table.definition, table.channel.type)
+        try:
+            if key not in self._known:
+                plan = self._extractor.plan(table.channel.type)
+                self._known[key] = _columns_of(plan, table.definition)
+            columns = self._known[key]
+            if columns is None:
+                raise NoPoseError
+            return _read(_Rows(table, index), columns, times)
+        except UnknownShapeError:
+            return None
+
+
+class NoPoseError(Exception):
+    """Messages of a type have no pose."""
+
+
+class _Columns(NamedTuple):
+    """Which columns a pose is in, by their dot-paths.
+
+    Attributes:
+        axes: of x, y and, unless it is 0, z.
+        turn: of x, y, z, w; or of a heading (rad); or none.
+        frame: of the frame in the header; empty without one.
+        numbered_frame: of PX4's number of the frame; empty without one.
+        velocity: of the linear velocity's one to three components; or none.
+    """
+
+    axes: tuple[str, ...]
+    turn: tuple[str, ...]
+    frame: str
+    numbered_frame: str
+    velocity: tuple[str, ...]
+
+
+class _Field(NamedTuple):
+    path: str
+    kind: str | Definition
+    length: int | None
+
+    @property
+    def is_number(self) -> bool:
+        return self.length is None and self._has_numbers
+
+    @property
+    def _has_numbers(self) -> bool:
+        return isinstance(self.kind, str) and self.kind != "bool" and self.kind not in _TEXTS
+
+    def parts(self, names: str) -> tuple[str, ...]:
+        """Returns the paths of its fields with these names; none unless all are numbers."""
+        if self.length is not None or not isinstance(self.kind, Definition):
+            return ()
+        found = [_field(self.kind, (name,)) for name in names]
+        paths = tuple(f"{self.path}.{part.path}" for part in found if part and part.is_number)
+        return paths if len(paths) == len(names) else ()
+
+    def elements(self, count: int) -> tuple[str, ...]:
+        """Returns the paths of its elements; none unless it is an array of so many numbers.
+
+        Raises:
+            UnknownShapeError: it has another length in each message.
+        """
+        if self.length == SEQUENCE and self._has_numbers:
+            raise UnknownShapeError(f"{self.path} has another length in each message")
+        if self.length != count or not self._has_numbers:
+            return ()
+        return tuple(f"{self.path}.{nth}" for nth in range(count))
+
+
+def _field(definition: Definition, path: Segments) -> _Field | None:
+    """Returns the field at a path; None where there is none.
+
+    Raises:
+        UnknownShapeError: the path leads through a list.
+    """
+    inside: Definition | None = definition
+    for nth, name in enumerate(path, 1):
+        found = (
+            next((each for each in inside.fields if each.name == name), None) if inside else None
+        )
+        if found is None:
+            return None
+        if nth == len(path):
+            return _Field(".".join(path), found.kind, found.length)
+        if found.length is not None:
+            raise UnknownShapeError(f"{'.'.join(path)} leads through a list")
+        inside = found.kind if isinstance(found.kind, Definition) else None
+    return None
+
+
+def _columns_of(plan: Plan, definition: Definition) -> _Columns | None:
+    """Returns where poses are in messages of a type; None where they have none."""
+    found: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+    routes = [*plan.poses]
+    if plan is UNMAPPED:
+        names = [each.name for each in definition.fields]
+        heading = next((name for name in HEADINGS if name in names), None)
+        if heading is not None:
+            routes.append(PlanarPose(*map(Route, ("x", "y", "z", heading))))
+    for route in routes:
+        if isinstance(route, PlanarPose):
+            found = _planar(route, definition)
+        else:
+            found = _point(route, definition)
+        if found is not None:
+            break
+    if found is None:
+        return None
+    frame = _field(definition, FRAME.segments)
+    named = frame is not None and frame.length is None and frame.kind in _TEXTS
+    numbered = plan.pose_frame and _field(definition, plan.pose_frame.segments)
+    return _Columns(
+        *found,
+        frame.path if frame is not None and named else "",
+        numbered.path if numbered and numbered.is_number else "",
+        _velocity(plan, definition),
+    )
+
+
+def _point(
+    route: PointPose, definition: Definition
+) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
+    place, turned = (
+        _field(definition, each.segments) for each in (route.position, route.orientation)
+    )
+    axes = place.parts("xyz") if place else ()
+    turn = turned.parts("xyzw") if turned else ()
+    if route.arrays:
+        axes = axes or (place.elements(3) if place else ())
+        # PX4 writes w first.
+        elements = turned.elements(4) if turned and not turn else ()
+        turn = turn or (*elements[1:], *elements[:1])
+    return (axes, turn) if axes else None
+
+
+def _planar(
+    route: PlanarPose, definition: Definition
+) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
+    x, y, z, heading = (
+        each.path if each and each.is_number else ""
+        for each in (
+            _field(definition, axis.segments) for axis in (route.x, route.y, route.z, route.heading)
+        )
+    )
+    if not x or not y:
+        return None
+    return (x, y, z) if z else (x, y), (heading,) if heading else ()
+
+
+def _velocity(plan: Plan, definition: Definition) -> tuple[str, ...]:
+    for linear, angular in plan.twists:
+        along, about = (_field(definition, each.segments) for each in (linear, angular))
+        if along is None or about is None:
+            continue
+        found, turning = along.parts("xyz"), about.parts("xyz")
+        if not found and plan is not UNMAPPED:
+            found, turning = (
+                (each.path,) if each.is_number else each.elements(3) for each in (along, about)
+            )
+        if found and turning:
+            return found
+    return ()
+
+
+class _Rows:
+    """Some rows of a table."""
+
+    def __init__(self, table: Table, index: IntArray | None) -> None:
+        self._table = table
+        self._index = index
+
+    def floats(self, path: str, step: Step) -> Floats:
+        """Returns a column of numbers, rounded.
+
+        Raises:
+            UnknownShapeError: the table does not hold it.
+        """
+        column = self._table.columns.get(path)
+        if column is None or isinstance(column, Texts):
+            raise UnknownShapeError(f"{path} is not held")
+        values = cast("Floats", column if self._index is None else column[self._index])
+        return rounded(values.astype(np.float64), step)
+
+    def texts(self, path: str) -> Texts:
+        """Returns a column of texts; raises as `floats`."""
+        column = self._table.columns.get(path)
+        if not isinstance(column, Texts):
+            raise UnknownShapeError(f"{path} is not held")
+        return column if self._index is None else column.rows(self._index)
+
+
+def rounded(values: NDArray[np.float64], step: Step) -> NDArray[np.float64]:
+    """Returns numbers as the nearest multiples of a step; those for which it is too fine, as is."""
+    if not step.per_unit:
+        return values
+    with np.errstate(all="ignore"):
+        whole = np.rint(values * step.per_unit) / step.per_unit
+        return np.where(np.abs(values) < _MOST_STEPPED, whole, values)
+
+
+def _read(rows: _Rows, columns: _Columns, times: IntArray) -> Poses:
+    positions = np.zeros((times.size, 3))
+    for axis, path in enumerate(columns.axes):
+        positions[:, axis] = rows.floats(path, METRES)
+    speeds = np.full(times.size, np.nan)
+    if columns.velocity:
+        speeds = np.abs(rows.floats(columns.velocity[0], VELOCITY))
+        for path in columns.velocity[1:]:
+            speeds = np.hypot(speeds, rows.floats(path, VELOCITY))
+    turns, frames = _turns(rows, columns, times.size), _frames(rows, columns, times.size)
+    return Poses(times, positions, turns, Frames(frames.codes, frames.words), speeds)
+
+
+def _turns(rows: _Rows, columns: _Columns, count: int) -> Vectors:
+    turns = np.full((count, 4), np.nan)
+    if len(columns.turn) == 1:
+        halves = rows.floats(columns.turn[0], RADIANS) / 2
+        known = np.isfinite(halves)
+        turns[known, :2] = 0.0
+        turns[known, 2], turns[known, 3] = np.sin(halves[known]), np.cos(halves[known])
+    elif columns.turn:
+        for part, path in enumerate(columns.turn):
+            turns[:, part] = rows.floats(path, EXACT)
+        turns = _at_unit_length(turns)
+    return turns
+
+
+def _at_unit_length(turns: Vectors) -> Vectors:
+    """Returns quaternions (as rows) at unit length; NaN where they are zero or not finite.
+
+    Rounded where that is their length already: of others rounding would change the rotation more.
+    """
+    with np.errstate(all="ignore"):
+        off = np.abs((turns * turns).sum(axis=1) - 1)
+        turns = np.where((off < _ABOUT_UNIT)[:, None], rounded(turns, QUATERNION), turns)
+        largest = np.abs(turns).max(axis=1, initial=0.0)
+        is_turn = np.isfinite(largest) & (largest > 0)
+        scaled = turns / largest[:, None]
+        scaled /= np.sqrt((scaled * scaled).sum(axis=1))[:, None]
+        is_unit = np.abs((turns * turns).sum(axis=1) - 1) < _UNIT_TOLERANCE
+        return np.where(is_unit[:, None], turns, np.where(is_turn[:, None], scaled, np.nan))
+
+
+def _frames(rows: _Rows, columns: _Columns, count: int) -> Texts:
+    """Returns the frames: those of the headers, and PX4's where these are empty."""
+    frames = Texts(np.zeros(count, np.uint32), ("",) if count else ())
+    if columns.frame:
+        frames = rows.texts(columns.frame)
+    if not columns.numbered_frame or all(frames.words):
+        return frames
+    numbers = rows.floats(columns.numbered_frame, METRES).astype(np.int64)
+    own = [POSE_FRAMES.get(number, "") for number in numbers.tolist()]
+    return Texts.of([named or other for named, other in zip(frames.values(), own, strict=True)])
