@@ -22,7 +22,7 @@ from ros2_memory.messages.detections import Detection, detections_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.analysis.bag_frames import BagFrames, Times
+    from ros2_memory.analysis.frames import Frames, Times
     from ros2_memory.catalogue.map_digest import PlacedPoses
     from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
@@ -258,7 +258,7 @@ def _sigma_ahead(covariance: object) -> float | None:
     return math.sqrt(variance) if variance >= 0 and math.isfinite(variance) else None
 
 
-def _places(of_topic: _Topic, times: Times, frames: BagFrames) -> list[list[Vector3 | None]]:
+def _places(of_topic: _Topic, times: Times, frames: Frames) -> list[list[Vector3 | None]]:
     """Returns the places of all detections in the target frame; None where that is not known."""
     places: list[list[Vector3 | None]] = [[None] * len(each) for each in of_topic.detections]
     by_frame: dict[str, list[tuple[int, int, Vector3]]] = {}

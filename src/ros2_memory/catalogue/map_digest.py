@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlia
 
 import numpy as np
 
-from ros2_memory.analysis.bag_frames import BagFrames, TransformColumns, multiply
+from ros2_memory.analysis.frames import (
+    Edge,
+    Frames,
+    edges_of,
+    joined_edges,
+    multiply,
+    unit_quaternions,
+)
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
@@ -26,7 +33,7 @@ from ros2_memory.analysis.motion.robot_track import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.bag_frames import Floats, Mask, Rotations, Times
+    from ros2_memory.analysis.frames import Edges, Floats, Mask, Rotations, Times
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
@@ -119,7 +126,7 @@ class PlacedPoses:
         own: the frame of the poses themselves.
     """
 
-    frames: BagFrames
+    frames: Frames
     own: str
     times: Times
     x: Floats
@@ -161,6 +168,34 @@ class SightsSource(Protocol):
 
     def digest(self, robot: PlacedPoses) -> bytes:
         """Returns the digest; `robot.frames` places any frame, `robot.at` the robot itself."""
+
+
+class TransformColumns:
+    """Collects moving transforms as columns, by parent and child."""
+
+    def __init__(self) -> None:
+        self._blocks: list[Edges] = []
+        self._single: list[StampedTransform] = []
+
+    def add(self, each: StampedTransform) -> None:
+        """Takes one transform; invalid ones are left out."""
+        self._single.append(each)
+
+    def add_rows(
+        self, edge: tuple[str, str], stamps: Times, log_times: Times, numbers: Floats
+    ) -> None:
+        """Takes transforms of one parent and child: rows of x, y, z, and qx, qy, qz, qw."""
+        # tf2 refuses what is not finite, and rotations that are not unit quaternions.
+        fine = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 3:]).max(axis=1) > 0)
+        rotation = unit_quaternions(numbers[fine, 3:])
+        parent, child = (name.lstrip("/") for name in edge)
+        if parent and child and parent != child:
+            made = Edge(stamps[fine], log_times[fine], numbers[fine, :3], rotation)
+            self._blocks.append({(parent, child): made})
+
+    def edges(self) -> Edges:
+        """Returns the valid transforms by parent and child."""
+        return joined_edges([*self._blocks, edges_of(self._single)])
 
 
 class MapCollector:
@@ -229,9 +264,9 @@ class MapCollector:
         clock = self._settings.tf_clock
         target = self._settings.map_frame or own
 
-        def frames_to(frame: str) -> BagFrames:
+        def frames_to(frame: str) -> Frames:
             chosen = None if clock == "auto" else clock
-            return BagFrames(statics.transforms, self._moving, frame, chosen)
+            return Frames(statics.transforms, self._moving.edges(), frame, chosen)
 
         frames = frames_to(target)
         leads = own and (own == target or frames.reaches(own))

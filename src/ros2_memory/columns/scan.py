@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from ros2_memory.columns.pack import Packed
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.table import Column, Table
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.columns.transforms import Pair, StaticRun
+    from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
@@ -157,6 +158,9 @@ class Scanner:
     Attributes:
         censuses: by topic, span and bags, what is stored of each type and what of it counts.
         events: by part, what happened in it; of parts of which all rows count.
+        pairs: by part, the parents and children of its transforms.
+        static_runs: by part, when its static transforms change.
+        statics: by session and topics, the static transforms of a timeline.
     """
 
     def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
@@ -167,6 +171,9 @@ class Scanner:
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
+        self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
+        self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
+        self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of a topic in a window.

@@ -9,6 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
+from ros2_memory.analysis.frames import static_at, static_changes
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
@@ -36,8 +37,6 @@ from ros2_memory.history.transforms import (
     graph_of,
     moving_in,
     sessions_of,
-    static_at,
-    static_changes,
     static_transforms,
 )
 

@@ -25,10 +25,10 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.timeline import Timeline
@@ -49,6 +49,11 @@ class Sessions:
         view: one call's view of the memory. Two sessions that hold the topic of the robot's own
             poses (`View.pose_topic`) at once are two robots.
         children: returns the child frames of all transforms of a session.
+
+    Attributes:
+        chosen: for a session with one that may lend to it and two frames, whose transforms hold.
+        statics: the static transforms of sessions, as far as they are known.
+        linked: frames that are known to be connected in a session, or in some.
     """
 
     def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
@@ -66,6 +71,8 @@ class Sessions:
         self._joined = self._chains()
         self._poses = [*self._spans_of((view.pose_topic,)).items()]
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
+        self.statics: dict[Session, Sequence[StampedTransform]] = {}
+        self.linked: set[tuple[tuple[str, str], Session | None]] = set()
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
         self._recordings: dict[tuple[Session, tuple[str, ...]], dict[Path, tuple[Ns, Ns]]] = {}

@@ -6,17 +6,25 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import accumulate, islice
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
-from weakref import WeakKeyDictionary
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
+from ros2_memory.analysis.frames import static_at
 from ros2_memory.analysis.transform_tree import (
     TF_CACHE_NS,
     FrameEdge,
     FrameGraph,
     TfClock,
     agreeing_clock,
+)
+from ros2_memory.columns.transforms import (
+    Pair,
+    StaticRun,
+    pairs_in,
+    stamped_between,
+    static_runs,
 )
 from ros2_memory.core.errors import (
     NoDataError,
@@ -26,10 +34,8 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import alike
 from ros2_memory.core.model import StampedTransform, TimeWindow
-from ros2_memory.core.spans import united
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
-    AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
     NS_PER_MS,
@@ -45,19 +51,20 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
+from ros2_memory.history.scan import messages_of, scan
 from ros2_memory.history.sessions import Sessions, components
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, Transform
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.core.model import Transform
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Segment
-    from ros2_memory.index.timeline import Timeline
-    from ros2_memory.storage.base import Schema
+    from ros2_memory.storage.base import IntArray
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read; the last is the length of tf2's cache."""
@@ -77,31 +84,7 @@ _BORROWED: Final = Reason(
 _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
 
 
-_Connection: TypeAlias = "tuple[tuple[str, str], tuple[str, ...], tuple[str, ...], Session | None]"
-_CONNECTED: Final[WeakKeyDictionary[Timeline, set[_Connection]]] = WeakKeyDictionary()
-_STATIC: Final[
-    WeakKeyDictionary[Timeline, dict[tuple[Session, tuple[str, ...]], Sequence[StampedTransform]]]
-] = WeakKeyDictionary()
-"""Frames that are connected by what some topics recorded, static ones first, in a session."""
-
-
-class _StaticRead(NamedTuple):
-    """Static transforms as far as they were read: in so many bags, or in all."""
-
-    found: tuple[StampedTransform, ...] = ()
-    bags: int = 0
-    is_whole: bool = False
-
-
-_NOTHING_READ: Final = _StaticRead()
-_StaticKey: TypeAlias = "tuple[tuple[str, ...], frozenset[str], Session | None, tuple[Ns, Ns, str]]"
-_STATIC_READ: Final[WeakKeyDictionary[Segment | Timeline, dict[_StaticKey, _StaticRead]]] = (
-    WeakKeyDictionary()
-)
-_MOST_KEPT: Final = 64
-"""Sessions of a segment whose static transforms stay in memory; most segments have one."""
-_BAGS_AT_ONCE: Final = 16
-"""Bags of which all static transforms are read before any are kept."""
+_STAMPS: Final = "transforms.header.stamp"
 
 
 class FoundTransform(NamedTuple):
@@ -237,24 +220,72 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     """Returns the static transforms of a session, in log-time order.
 
     One that is equal to the one before of its child is left out: each split may have all again.
+    So few messages are read: those by whose columns something is new.
 
     Raises:
-        QueryTimeoutError: the call's time is over; what was read is kept for the next call.
+        QueryTimeoutError: the call's time is over.
     """
     topics = _recorded(view, view.memory.limits.tf_static_topics)
-    known = _STATIC.setdefault(view.snapshot.timeline, {})
-    if (among, topics) in known:
-        return known[among, topics]
+    sessions, timeline, scanner = sessions_of(view), view.snapshot.timeline, view.memory.columns
+    known = sessions.statics.get(among)
+    if known is not None:
+        return known
+    key = (among, topics)
+    kept = None if scanner is None else scanner.statics.get(key)
+    if kept is not None and kept[0] is timeline:
+        sessions.statics[among] = kept[1]
+        return kept[1]
     before = view.notes.added
-    chosen = {str(path): path for path in sessions_of(view).recordings_of(among, topics)}
-    found: list[StampedTransform] = []
-    for run in _runs_with(view, topics):
-        found += _static_in(view, topics, among, chosen, run)
-    found = _changes(found)
+    found = [each for topic in topics for each in _received(view, topic, among)]
+    found.sort(key=lambda one: one.log_time)
+    static = _changes(found)
+    sessions.statics[among] = static
     # What was noted must be noted in each answer.
-    if view.notes.added == before and not view.call.used_active:
-        known[among, topics] = found
-    return found
+    if scanner is not None and view.notes.added == before and not view.call.used_active:
+        scanner.statics.put(key, (timeline, static), 1000 + 600 * len(static))
+    return static
+
+
+def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransform]:
+    """Yields the static transforms of a topic that differ from those before in their recording."""
+    sessions = sessions_of(view)
+    latest: dict[Path, tuple[Ns, dict[str, StaticRun]]] = {}
+    for rows in scan(view, topic, TimeWindow.everything(), copies=True):
+        if sessions.holds_carried(rows.recording):
+            for found in messages_of(view, rows):
+                if sessions.has(among, found):
+                    yield from decoded_transforms(view, found)
+        elif sessions.folder(rows.recording) in among:
+            last, state = latest.get(rows.recording, (MIN_NS, {}))
+            if rows.first <= last:  # of several types, whose tables lie side by side
+                state = {}
+            fresh = _fresh(view, rows, state)
+            for found in messages_of(view, rows if fresh is None else rows.some(fresh)):
+                yield from decoded_transforms(view, found)
+            latest[rows.recording] = max(rows.last, last), state
+
+
+def _fresh(view: View, rows: Rows, state: dict[str, StaticRun]) -> IntArray | None:
+    """Returns the positions of rows in which a static transform is new; None: of all.
+
+    `state` has the latest one of each child, and is brought up to the end of the rows.
+    """
+    scanner, part = view.memory.columns, rows.part
+    runs = None if scanner is None or part is None else scanner.static_runs.get(part)
+    if runs is None:
+        runs = static_runs(rows.table, rows.times, rows.index)
+        if runs is None:
+            state.clear()
+            return None
+        if scanner is not None and part is not None:
+            scanner.static_runs.put(part, runs, 100 + 300 * len(runs))
+    new: set[Ns] = set()
+    for run in runs:
+        before = state.get(run.child)
+        if before is None or (before.parent, before.numbers) != (run.parent, run.numbers):
+            new.add(run.time)
+        state[run.child] = run
+    return np.flatnonzero(np.isin(rows.times, [*new])) if new else np.empty(0, np.int64)
 
 
 def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
@@ -268,133 +299,6 @@ def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
             latest[child] = each
             found.append(each)
     return found
-
-
-def _runs_with(view: View, topics: Sequence[str]) -> Iterator[Sequence[Segment]]:
-    """Yields the segments that hold topics, in order; those together whose messages interleave."""
-    held = [
-        (segment, [segment.spans[topic] for topic in topics if topic in segment.spans])
-        for segment in view.snapshot.timeline.segments
-    ]
-    held = [(segment, spans) for segment, spans in held if spans]
-    reaches = [*accumulate((max(last for _, last in spans) for _, spans in held), max)]
-    firsts = [min(spans)[0] for _, spans in reversed(held)]
-    earliest_from = [*accumulate(firsts, min)][::-1]
-    run: list[Segment] = []
-    for nth, (segment, _) in enumerate(held):
-        if run and earliest_from[nth] > reaches[nth - 1]:
-            yield run
-            run = []
-        run.append(segment)
-    if run:
-        yield run
-
-
-def _static_in(
-    view: View,
-    topics: tuple[str, ...],
-    among: Session,
-    chosen: Mapping[str, Path],
-    run: Sequence[Segment],
-) -> Sequence[StampedTransform]:
-    """Returns the static transforms of a session in some segments, as `static_transforms` does.
-
-    Kept as far as they are read, while the segments stay: without a catalogue, those of a week take
-    longer to read than a call may. `chosen` are the session's recordings by folder.
-
-    Raises:
-        QueryTimeoutError: the call's time is over.
-    """
-    folders = chosen.keys() & frozenset[str]().union(*(each.folders for each in run))
-    if not folders:
-        return ()
-    carries = any(sessions_of(view).holds_carried(chosen[each]) for each in folders)
-    kept = _STATIC_READ.setdefault(run[0] if len(run) == 1 else view.snapshot.timeline, {})
-    key = (topics, frozenset(folders), among if carries else None, run[0].first)
-    read = kept.get(key, _NOTHING_READ)
-    if read.is_whole:
-        return read.found
-    spans = [each.spans[topic] for each in run for topic in topics if topic in each.spans]
-    window = TimeWindow(min(first for first, _ in spans), max(last for _, last in spans) + 1)
-    bags = _bags_of(view, topics, window, among)
-    is_sure = True
-    for stop in _cuts(bags, read.bags):
-        part = bags[read.bags : stop]
-        before = view.notes.added
-        with view.notes.isolated():
-            try:
-                found = _once_decoded(view, _merged(view, topics, part, window, among))
-            except QueryTimeoutError as error:
-                how_far = f"static transforms are read up to {unix_text(part[0].first)} so far"
-                raise QueryTimeoutError(
-                    f"{error}; {how_far}, and kept: ask again to go on from there"
-                ) from error
-            is_sure &= view.notes.complete and view.notes.added == before
-        read = _StaticRead((*read.found, *_changes(found)), stop, is_whole=stop == len(bags))
-        if is_sure and not view.call.used_active:
-            if key not in kept and len(kept) >= _MOST_KEPT:
-                kept.clear()
-            kept[key] = read
-    return read.found
-
-
-def _cuts(bags: Sequence[BagSpan], begin: int) -> Iterator[int]:
-    """Yields where bags are cut, from one on: after some each, where no message interleaves."""
-    reach, last = MIN_NS, begin
-    for nth in range(begin, len(bags)):
-        if nth - last >= _BAGS_AT_ONCE and bags[nth].first > reach:
-            yield nth
-            last = nth
-        reach = max(reach, bags[nth].last)
-    yield len(bags)
-
-
-def _once_decoded(view: View, messages: Iterable[StoredMessage]) -> list[StampedTransform]:
-    """Returns the transforms of messages but for repetitions; the same bytes are decoded once."""
-    decoded: dict[tuple[Schema, str, bytes], tuple[StampedTransform, ...]] = {}
-    latest: dict[str, StampedTransform] = {}
-    found: list[StampedTransform] = []
-    for message in messages:
-        channel = message.record.channel
-        key = (channel.schema, channel.encoding, message.record.payload)
-        if key not in decoded:
-            decoded[key] = _decoded(view, message)
-        for each in decoded[key]:
-            child = each.child.lstrip("/")
-            if latest.get(child) is not each:
-                latest[child] = each
-                found.append(replace(each, log_time=message.time))
-    return found
-
-
-def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
-    """Returns, of static transforms in log-time order, the newest of each child at a moment.
-
-    A static transform holds at all times of its session. So where all of a child were received
-    later, the first of them holds.
-    """
-    newest: dict[str, StampedTransform] = {}
-    for each in static:
-        child = each.child.lstrip("/")
-        if child not in newest or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
-            newest[child] = each
-    return list(newest.values())
-
-
-def static_changes(static: Sequence[StampedTransform]) -> list[Ns]:
-    """Returns the log times at which a child's static transform differs from the one before."""
-    changes: dict[Ns, None] = {}
-    latest: dict[str, StampedTransform] = {}
-    for each in static:
-        child = each.child.lstrip("/")
-        before = latest.get(child)
-        if before is not None and not (
-            before.parent.lstrip("/") == each.parent.lstrip("/")
-            and alike(before.transform, each.transform)
-        ):
-            changes[each.log_time] = None
-        latest[child] = each
-    return [*changes]
 
 
 def sessions_of(view: View) -> Sessions:
@@ -447,70 +351,47 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     return tuple(FrameEdge(parent, child, is_static) for (parent, child), is_static in named)
 
 
-def _pairs(
-    view: View,
-    topics: Iterable[str],
-    window: TimeWindow | None = None,
-    among: Session | None = None,
-) -> set[tuple[str, str]]:
-    """Returns the pairs of these topics: from the catalogue, or from bags that it has none of.
-
-    With a window, those of the bags that have something of a topic in it; with `among`, those of a
-    session's bags.
-    """
-    recorded = _recorded(view, topics)
-    pairs, unknown = _known_pairs(view, recorded, window, among)
-    for span in united(unknown):
-        for each in _transforms(view, recorded, TimeWindow(*span), among):
-            pairs.add((each.parent, each.child))
-    return pairs
+def _pairs(view: View, topics: Iterable[str], among: Session | None = None) -> set[Pair]:
+    """Returns the pairs of these topics; with `among` those that a session received."""
+    everything = TimeWindow.everything()
+    every = (
+        pairs
+        for topic in _recorded(view, topics)
+        for pairs in _pairs_in(view, topic, everything, among)
+    )
+    return set[Pair]().union(*every)
 
 
-def _known_pairs(
-    view: View, recorded: Iterable[str], window: TimeWindow | None, among: Session | None
-) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
-    """Returns the pairs that the catalogue has, and the times of the bags that it has none of."""
-    pairs: set[tuple[str, str]] = set()
-    unknown: list[tuple[Ns, Ns]] = []
-    for topic in recorded:
-        for segment in view.snapshot.timeline.segments:
-            known, spans = _stored_pairs(
-                view, segment, topic, window or TimeWindow.everything(), among
-            )
-            pairs |= known
-            unknown += spans
-    return pairs, unknown
+def _pairs_in(
+    view: View, topic: str, window: TimeWindow, among: Session | None
+) -> Iterator[frozenset[Pair]]:
+    """Yields the pairs of a topic in a window, table by table, those of the newest first."""
+    sessions, scanner = sessions_of(view) if among is not None else None, view.memory.columns
+    for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
+        is_mixed = False
+        if sessions is not None and among is not None:
+            is_mixed = sessions.holds_carried(rows.recording)
+            if not is_mixed and sessions.folder(rows.recording) not in among:
+                continue
+        part = None if scanner is None or is_mixed else rows.part
+        pairs = None if scanner is None or part is None else scanner.pairs.get(part)
+        if pairs is None:
+            pairs = None if is_mixed else pairs_in(rows.table, rows.index)
+            if pairs is None:
+                found = messages_of(view, rows)
+                if is_mixed and sessions is not None and among is not None:
+                    found = (each for each in found if sessions.has(among, each))
+                read = (one for each in found for one in decoded_transforms(view, each))
+                pairs = frozenset((one.parent, one.child) for one in read)
+            if scanner is not None and part is not None:
+                scanner.pairs.put(part, pairs, 200 + 200 * len(pairs))
+        yield pairs
 
 
 def _is_edge(pair: tuple[str, str]) -> bool:
     """Whether tf2 takes a parent and a child for an edge of the tree."""
     parent, child = (name.lstrip("/") for name in pair)
     return bool(parent and child) and parent != child
-
-
-def _stored_pairs(
-    view: View, segment: Segment, topic: str, window: TimeWindow, among: Session | None
-) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
-    """Returns the pairs that the catalogue has of a segment, and the times of bags it lacks."""
-    notes = view.bags.digests_of(segment) if topic in segment.spans else None
-    if notes is not None and among is None and window.covers(*segment.spans[topic]):
-        every = notes.pairs(topic)
-        if every is not None:
-            return set(every), []
-    numbers = {} if notes is None else notes.numbers
-    edges = {} if notes is None else notes.edges(topic)
-    known: set[tuple[str, str]] = set()
-    rest: list[tuple[Ns, Ns]] = []
-    for bag, first, last in segment.extents(topic):
-        is_of_session = among is None or sessions_of(view).folder(bag.recording) in among
-        if is_of_session and window.overlaps(first, last):
-            edge = edges.get(numbers.get(bag.file, 0))
-            mixed = among is not None and sessions_of(view).is_carried(bag)
-            if edge is None or mixed:
-                rest.append((first, last + 1))
-            else:
-                known.update(edge.pairs)
-    return known, rest
 
 
 def _explained(
@@ -569,42 +450,29 @@ def connects(
     window: TimeWindow | None = None,
     among: Session | None = None,
 ) -> bool:
-    """Does as `connected`; reads the newest bags without a digest first, until they do.
+    """Does as `connected`; looks at the newest transforms first, until they do.
 
     Raises:
         QueryTimeoutError: the call's time is over before that is known.
     """
-    limits = view.memory.limits
-    known_to = _CONNECTED.setdefault(view.snapshot.timeline, set())
-    asked = (frames, limits.tf_static_topics, limits.tf_topics, among)
-    if asked in known_to:
+    limits, known = view.memory.limits, sessions_of(view).linked
+    if (frames, among) in known:
         return True
-    pairs: set[tuple[str, str]] = set()
-    unread: list[tuple[Ns, Ns, tuple[str, ...]]] = []
-    asked_of = [
-        (recorded, topic, within or TimeWindow.everything())
+    pairs: set[Pair] = set()
+    everything = TimeWindow.everything()
+    every = [
+        _pairs_in(view, topic, within or everything, among)
         for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window))
-        for recorded in (_recorded(view, topics),)
-        for topic in recorded
+        for topic in _recorded(view, topics)
     ]
-    for segment in view.snapshot.timeline.segments:
-        before = len(pairs)
-        for recorded, topic, within in asked_of:
-            known, unknown = _stored_pairs(view, segment, topic, within, among)
-            pairs |= known
-            unread += [(stop, start, recorded) for start, stop in unknown]
-        # One segment is mostly enough, and a week has dozens.
-        if len(pairs) > before and _link(pairs, frames):
-            if window is None:
-                known_to.add(asked)
-            return True
-    for stop, start, recorded in sorted({*unread}, reverse=True):
-        view.bags.check_deadline()
-        read = _transforms(view, recorded, TimeWindow(start, stop), among)
-        found = {(each.parent, each.child) for each in read}
-        if not found <= pairs:
-            pairs |= found
+    # Of all topics in turn: mostly the newest table of each is enough.
+    for found in zip_longest(*every, fillvalue=frozenset[Pair]()):
+        fresh = frozenset[Pair]().union(*found)
+        if not fresh <= pairs:
+            pairs |= fresh
             if _link(pairs, frames):
+                if window is None:
+                    known.add((frames, among))
                 return True
     return False
 
@@ -643,34 +511,24 @@ def _near_failure(failure: NoDataError, at: Ns) -> NoDataError:
 
 
 def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransform]:
-    """Yields the moving transforms stamped around a moment, wherever in log time they are.
+    """Yields the moving transforms stamped around a moment, wherever in log time they are."""
+    sessions = sessions_of(view)
+    earliest, latest = at - TF_CACHE_NS, at + TF_CACHE_NS
 
-    A bag is read only where the stamps of its first and last message reach as far as the moment.
-    """
-    topics = _recorded(view, view.memory.limits.tf_topics)
-    everything = TimeWindow.everything()
-    for span in _bags_of(view, topics, everything, among):
-        ends = _stamps_at_ends(view, span.bag, topics)
-        if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
-            for found in view.bags.track_sources(view.bags.read(span.bag, topics, everything)):
-                yield from _decoded(view, found)
+    def may_match(table: Table) -> bool:
+        zone = table.zone(_STAMPS)
+        return zone is None or (zone.low <= latest and zone.high >= earliest)
 
-
-def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]:
-    """Returns the stamps in a bag's first and last message, in any order."""
-    entry = view.bags.entry(bag) if len(topics) == 1 else None
-    edges = None if entry is None else entry[0].edges(topics[0]).get(entry[1])
-    if edges is not None:
-        return [each for each in (edges.first_stamp, edges.last_stamp) if each is not None]
-    everything = TimeWindow.everything()
-    return [
-        transform.stamp
-        for newest_first in (False, True)
-        for found in view.bags.track_sources(
-            islice(view.bags.read(bag, topics, everything, newest_first=newest_first), 1)
-        )
-        for transform in _decoded(view, found)
-    ]
+    for topic in _recorded(view, view.memory.limits.tf_topics):
+        everything = TimeWindow.everything()
+        for rows in scan(view, topic, everything, copies=True, may_match=may_match):
+            is_mixed = sessions.holds_carried(rows.recording)
+            if not is_mixed and sessions.folder(rows.recording) not in among:
+                continue
+            near = stamped_between(rows.table, rows.index, earliest, latest)
+            for found in messages_of(view, rows if near is None else rows.some(near)):
+                if not is_mixed or sessions.has(among, found):
+                    yield from decoded_transforms(view, found)
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
@@ -683,7 +541,7 @@ def _transforms(
 ) -> Iterator[StampedTransform]:
     """Yields the transforms in a window, in order; with duplicates, where it is of one session."""
     for each in _messages(view, topics, window, among):
-        yield from _decoded(view, each)
+        yield from decoded_transforms(view, each)
 
 
 def _messages(
@@ -725,7 +583,8 @@ def _bags_of(
     return [each for each in bags if each.bag.recording in chosen]
 
 
-def _decoded(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
+def decoded_transforms(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
+    """Returns the transforms of a message; none, with a note, where it cannot be decoded."""
     is_static = found.record.channel.topic in view.memory.limits.tf_static_topics
     with view.call.stages.timed("extract"):
         try:

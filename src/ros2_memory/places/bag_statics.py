@@ -13,11 +13,12 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
 
+from ros2_memory.analysis.frames import static_at, static_changes
 from ros2_memory.catalogue.map_digest import Statics, statics_of
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import StampedTransform, TimeWindow
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
-from ros2_memory.history.transforms import sessions_of, static_at, static_changes
+from ros2_memory.history.transforms import sessions_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence

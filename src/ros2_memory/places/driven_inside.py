@@ -45,7 +45,7 @@ from ros2_memory.results import DrivenInside
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.bag_frames import Floats, Mask, Times
+    from ros2_memory.analysis.frames import Floats, Mask, Times
     from ros2_memory.analysis.motion.odometry import PoseDigest, Vertex
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import JsonValue, TimeWindow

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.frames import static_at, static_changes
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import alike, invert, transform_point
 from ros2_memory.core.model import TimeWindow, Transform
@@ -27,8 +28,6 @@ from ros2_memory.history.transforms import (
     lending_to,
     moving_in,
     sessions_of,
-    static_at,
-    static_changes,
     static_transforms,
 )
 

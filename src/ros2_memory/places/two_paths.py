@@ -16,7 +16,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from ros2_memory.analysis.bag_frames import Floats, Times
+    from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Region

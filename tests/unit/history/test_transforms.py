@@ -6,15 +6,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory import queries
-from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline
+from ros2_memory.analysis.frames import static_at
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS
 from ros2_memory.history.context import Call
-from ros2_memory.history.transforms import sessions_of, static_at, static_transforms
+from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import AtTime, View
 from ros2_memory.insights.sightings import find_matches
 from tests.support.bags import Msg, detections, tf, transform, write_mcap
@@ -81,35 +80,13 @@ def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) ->
         ]
 
     assert place() == 1.0
-    assert asked(reader, "/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
+    # Of the others the columns say that nothing is new.
+    assert asked(reader, "/tf_static") == {"rec_0.mcap"}
     reader.asked.clear()
     assert place() == 1.0
     assert asked(reader, "/tf_static") == set()
     bag(tmp_path, 3, [static(2, "eye", 2.0)])
     assert place() == 2.0
-
-
-def test_static_transforms_that_take_longer_than_a_call_are_read_on_by_the_next(
-    tmp_path: Path,
-) -> None:
-    for second in range(40):
-        bag(tmp_path, second, [static(second, "eye", float(second // 10))])
-    reader = NotingReader()
-    memory = memory_of(tmp_path, reader=reader)
-    memory.index.refresh()
-
-    def place(reads: int) -> float:
-        reader.asked.clear()
-        spent = Deadline(1.0, 1.0, lambda: 2.0 if len(reader.asked) >= reads else 0.0)
-        found = queries.transform(
-            memory, Call(deadline=spent), "base_link", "eye", AtTime(T0 / 1e9 + 25.0)
-        )
-        return found.transform.translation[0]
-
-    with pytest.raises(QueryTimeoutError, match=r"are read up to .* kept: ask again"):
-        place(reads=20)
-    assert place(reads=30) == 2.0
-    assert asked(reader, "/tf_static") == {f"rec_{second}.mcap" for second in range(16, 40)}
 
 
 def test_where_no_transform_leads_to_the_map_a_sighting_reads_those_around_it_alone(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.bag_frames import Floats, Mask, Times
+    from ros2_memory.analysis.frames import Floats, Mask, Times
 
 TOLERANCE_M: Final = 0.05
 TOLERANCE_RAD: Final = 0.15

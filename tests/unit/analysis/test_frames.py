@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from dataclasses import replace
 from random import Random
 
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.bag_frames import HOLD_NS, BagFrames, TransformColumns
+from ros2_memory.analysis.frames import HOLD_NS, Frames, edges_of
 from ros2_memory.analysis.transform_tree import FrameGraph
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import StampedTransform, Transform
@@ -33,13 +33,6 @@ def static(parent: str, child: str, x: float = 0.0, yaw: float = 0.0) -> Stamped
     return StampedTransform(parent, child, 0, 0, Transform((x, 0.0, 0.5), turn(yaw)), static=True)
 
 
-def columns(transforms: list[StampedTransform]) -> TransformColumns:
-    made = TransformColumns()
-    for each in transforms:
-        made.add(each)
-    return made
-
-
 def drawn(draw: Random) -> list[StampedTransform]:
     """Some seconds of odometry and of corrections, with a silence longer than tf2's buffer."""
     found = []
@@ -56,7 +49,7 @@ def test_a_pose_inside_of_the_bag_is_that_of_the_transform_tree(seed: int) -> No
     draw = Random(seed)
     transforms = drawn(draw)
     mount = static("base", "camera", 0.3, 1.0)
-    frames = BagFrames([mount], columns(transforms), "map", "stamp")
+    frames = Frames([mount], edges_of(transforms), "map", "stamp")
     graph = FrameGraph([mount, *transforms])
     first = max(min(e.stamp for e in transforms if e.child == c) for c in ("odom", "base"))
     last = min(max(e.stamp for e in transforms if e.child == c) for c in ("odom", "base"))
@@ -68,7 +61,7 @@ def test_a_pose_inside_of_the_bag_is_that_of_the_transform_tree(seed: int) -> No
         try:
             expected = graph.lookup("map", "camera", at)
         except NoDataError:
-            assert not valid
+            assert not valid or any(abs(one.stamp - at) <= HOLD_NS for one in transforms)
             continue
         one = frames.pose("camera", at)
         assert valid
@@ -81,7 +74,7 @@ def test_a_pose_inside_of_the_bag_is_that_of_the_transform_tree(seed: int) -> No
 
 
 def test_the_first_and_last_transform_hold_a_little_beyond_the_bag() -> None:
-    frames = BagFrames([], columns([moving("map", "odom", 10 * S, 1.0)]), "map")
+    frames = Frames([], edges_of([moving("map", "odom", 10 * S, 1.0)]), "map")
     assert frames.pose("odom", 10 * S - HOLD_NS) is not None
     assert frames.pose("odom", 10 * S + HOLD_NS) is not None
     assert frames.pose("odom", 10 * S + HOLD_NS + 1) is None
@@ -94,39 +87,37 @@ def test_a_child_that_changes_its_parent_is_looked_up_time_by_time() -> None:
         moving("earth", "odom", 3 * S, 5.0),
         moving("map", "odom", 4 * S, 2.0),
     ]
-    frames = BagFrames([static("map", "earth", 10.0)], columns(transforms), "map", "stamp")
+    frames = Frames([static("map", "earth", 10.0)], edges_of(transforms), "map", "stamp")
     places = [frames.pose("odom", at) for at in (3 * S // 2, 3 * S, 4 * S)]
     assert [each and each.translation[0] for each in places] == [1.5, 15.0, 2.0]
 
 
 def test_stamps_of_another_clock_are_not_used() -> None:
     transforms = [moving("map", "odom", at * S, at, late=900 * S) for at in (1, 2)]
-    frames = BagFrames([], columns(transforms), "map")
+    frames = Frames([], edges_of(transforms), "map")
     assert [frames.pose("odom", at * S) is not None for at in (1, 901)] == [False, True]
 
 
-def test_rows_give_the_same_as_single_transforms() -> None:
-    single = [moving("map", "odom", at * S, at, at / 3) for at in range(1, 9)]
-    rows = TransformColumns()
-    rows.add_rows(
-        ("map", "odom"),
-        np.array([each.stamp for each in single], np.int64),
-        np.array([each.log_time for each in single], np.int64),
-        np.array(
-            [(*e.transform.translation, *(2 * q for q in e.transform.rotation)) for e in single]
-        ),
-    )
-    one, other = BagFrames([], rows, "map"), BagFrames([], columns(single), "map")
-    for before, after in pairwise(range(1, 9)):
-        at = (before + after) * S // 2
-        a, b = one.pose("odom", at), other.pose("odom", at)
-        assert a is not None
-        assert b is not None
-        assert a.translation == pytest.approx(b.translation)
+def test_a_transform_holds_a_little_into_a_gap_that_tf2_does_not_bridge() -> None:
+    frames = Frames([], edges_of([moving("map", "odom", at * S, at) for at in (10, 40)]), "map")
+    at = [12, 13, 37, 38]
+    found = frames.poses("odom", np.array([each * S for each in at], np.int64))
+    assert found is not None
+    assert found.valid.tolist() == [True, False, False, True]
+    assert found.translation[0][found.valid].tolist() == [10.0, 40.0]
+
+
+def test_a_static_transform_holds_until_the_next_one_of_its_child() -> None:
+    later = replace(static("base", "camera", 5.0), log_time=20 * S)
+    frames = Frames([static("base", "camera", 1.0), later], {}, "base")
+    found = frames.poses("camera", np.array([-S, 19 * S, 20 * S, 30 * S], np.int64))
+    assert found is not None
+    assert found.valid.all()
+    assert found.translation[0].tolist() == [1.0, 1.0, 5.0, 5.0]
 
 
 def test_frames_without_a_connection_have_no_pose() -> None:
-    frames = BagFrames([static("base", "camera")], columns([]), "map")
+    frames = Frames([static("base", "camera")], {}, "map")
     assert frames.poses("camera", np.array([1], np.int64)) is None
     assert not frames.reaches("camera")
     assert frames.pose("map", 1) is not None

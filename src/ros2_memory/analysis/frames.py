@@ -1,9 +1,8 @@
-"""The frames of one bag: where each is in a target frame, at many times at once.
+"""The frames of a stretch of time: where each is in a target frame, at many times at once.
 
-Only the moving transforms of the bag itself are used, and the static ones of its session, by the
-rules of `transform_tree`. At both ends of the bag the first and the last transform of a frame are
-valid for `HOLD_NS` longer: localisers date transforms up to a second ahead, and the neighbouring
-bag has the others. So what is computed of a bag depends on nothing but that bag.
+By the rules of `transform_tree`, over the transforms of one session as arrays. Where a frame has no
+transform for longer than tf2 remembers, the last one before and the first one after are valid for
+`HOLD_NS`: localisers date transforms up to a second ahead, and a robot's last second is no secret.
 
 Chains whose frames keep one parent each, as nearly all do, are computed as arrays; any other is
 looked up time by time.
@@ -13,6 +12,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -20,12 +20,12 @@ import numpy as np
 
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS, TF_CACHE_NS, FrameGraph, TfClock
 from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.geometry import IDENTITY, normalised
+from ros2_memory.core.geometry import IDENTITY, alike, normalised
 from ros2_memory.core.model import StampedTransform, Transform
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from typing import Literal
 
     from numpy.typing import NDArray
@@ -39,7 +39,7 @@ Vectors: TypeAlias = "tuple[Floats, Floats, Floats]"
 Rotations: TypeAlias = "tuple[Floats, Floats, Floats, Floats]"
 
 HOLD_NS: Final[Ns] = 2 * NS_PER_S
-"""How long the first and last transform of a frame in a bag are valid beyond it."""
+"""How long a transform of a frame is valid beyond the times between which it is known."""
 
 _PARALLEL_COSINE: Final = 1 - 1e-10
 
@@ -56,65 +56,62 @@ class Poses(NamedTuple):
         return _add(_rotate(self.rotation, points), self.translation)
 
 
-@dataclass(slots=True)
-class _Block:
-    """Transforms of one parent and child."""
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """Transforms of one child in one parent, in the order in which they were received.
+
+    Attributes:
+        stamps: of their headers (ns).
+        log_times: ns.
+        translation: metres, N x 3.
+        rotation: unit quaternions (x, y, z, w), N x 4.
+    """
 
     stamps: Times
     log_times: Times
     translation: Floats
     rotation: Floats
 
-
-class TransformColumns:
-    """Collects moving transforms as columns, by parent and child."""
-
-    def __init__(self) -> None:
-        self._blocks: dict[tuple[str, str], list[_Block]] = defaultdict(list)
-        self._single: dict[tuple[str, str], list[StampedTransform]] = defaultdict(list)
-
-    def add(self, each: StampedTransform) -> None:
-        """Takes one transform; invalid ones are left out."""
-        self._single[each.parent.lstrip("/"), each.child.lstrip("/")].append(each)
-
-    def add_rows(
-        self, edge: tuple[str, str], stamps: Times, log_times: Times, numbers: Floats
-    ) -> None:
-        """Takes transforms of one parent and child: rows of x, y, z, and qx, qy, qz, qw."""
-        # tf2 refuses what is not finite, and rotations that are not unit quaternions.
-        fine = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, 3:]).max(axis=1) > 0)
-        rotation = _normalised(numbers[fine, 3:])
-        parent, child = edge
-        self._blocks[parent.lstrip("/"), child.lstrip("/")].append(
-            _Block(stamps[fine], log_times[fine], numbers[fine, :3], rotation)
+    @classmethod
+    def of(cls, transforms: Sequence[StampedTransform]) -> Edge:
+        """Returns transforms of one edge, of which there is at least one, as arrays."""
+        return cls(
+            np.array([each.stamp for each in transforms], np.int64),
+            np.array([each.log_time for each in transforms], np.int64),
+            np.array([each.transform.translation for each in transforms], np.float64),
+            np.array([each.transform.rotation for each in transforms], np.float64),
         )
 
-    def edges(self) -> dict[tuple[str, str], _Block]:
-        """Returns the valid transforms by parent and child."""
-        found: dict[tuple[str, str], _Block] = {}
-        for edge in self._blocks.keys() | self._single.keys():
-            if not all(edge) or edge[0] == edge[1]:
-                continue
-            blocks = [*self._blocks.get(edge, ()), *_block_of(self._single.get(edge, ()))]
-            if blocks:
-                found[edge] = _Block(
-                    np.concatenate([each.stamps for each in blocks]),
-                    np.concatenate([each.log_times for each in blocks]),
-                    np.concatenate([each.translation for each in blocks]),
-                    np.concatenate([each.rotation for each in blocks]),
-                )
-        return found
+
+Edges: TypeAlias = "Mapping[tuple[str, str], Edge]"
+"""Transforms by parent and child, whose names have no leading slash."""
 
 
-def _block_of(transforms: Sequence[StampedTransform]) -> Iterable[_Block]:
-    if not transforms:
-        return
-    yield _Block(
-        np.array([each.stamp for each in transforms], np.int64),
-        np.array([each.log_time for each in transforms], np.int64),
-        np.array([each.transform.translation for each in transforms], np.float64),
-        np.array([each.transform.rotation for each in transforms], np.float64),
-    )
+def edges_of(transforms: Iterable[StampedTransform]) -> dict[tuple[str, str], Edge]:
+    """Returns transforms by their edges."""
+    found: dict[tuple[str, str], list[StampedTransform]] = defaultdict(list)
+    for one in transforms:
+        found[one.parent.lstrip("/"), one.child.lstrip("/")].append(one)
+    return {pair: Edge.of(some) for pair, some in found.items() if all(pair) and pair[0] != pair[1]}
+
+
+def joined_edges(parts: Sequence[Edges]) -> Edges:
+    """Returns the transforms of several tables, each edge in the order of the tables."""
+    if len(parts) == 1:
+        return parts[0]
+    found: dict[tuple[str, str], list[Edge]] = defaultdict(list)
+    for part in parts:
+        for pair, edge in part.items():
+            found[pair].append(edge)
+    return {
+        pair: Edge(
+            np.concatenate([one.stamps for one in some]),
+            np.concatenate([one.log_times for one in some]),
+            np.concatenate([one.translation for one in some]),
+            np.concatenate([one.rotation for one in some]),
+        )
+        for pair, some in found.items()
+    }
 
 
 @dataclass(slots=True)
@@ -137,22 +134,23 @@ class _History:
         ratio = np.where(start == stop, 0.0, (times - start) / span)
         exact = start == times
         inside = (after > before) & (stop - start <= TF_CACHE_NS)
-        ends = (before == after) & (np.abs(times - start) <= HOLD_NS)
-        ratio = np.where(exact | ~inside, 0.0, ratio)
+        near = np.abs(times - start) <= np.abs(stop - times)
+        held = np.minimum(np.abs(times - start), np.abs(stop - times)) <= HOLD_NS
+        ratio = np.where(exact | ~inside, np.where(near | exact, 0.0, 1.0), ratio)
         a, b = self.translation[before], self.translation[after]
         moved = a + (b - a) * ratio[:, None]
         turned = _slerp(self.rotation[before], self.rotation[after], ratio)
-        valid = exact | inside | ends
+        valid = exact | inside | held
         poses = Poses(_columns3(moved), _columns4(turned), valid)
         return poses if self.static is None else _filled(poses, self.static)
 
 
-class BagFrames:
-    """Looks frames up in a target frame by the transforms of one bag.
+class Frames:
+    """Looks frames up in a target frame by the transforms of one session.
 
     Args:
-        static: the static transforms in force.
-        moving: the bag's own.
+        static: its static transforms in log-time order; each holds until the next one of its child.
+        moving: the moving ones of the times that are asked about, and of what they need around.
         target: the frame in which the others are looked up.
         clock: which time of the transforms counts; None: as `agreeing_clock` finds.
     """
@@ -160,13 +158,68 @@ class BagFrames:
     def __init__(
         self,
         static: Sequence[StampedTransform],
-        moving: TransformColumns,
+        moving: Edges,
         target: str,
         clock: TfClock | None = None,
     ) -> None:
         self.target = target.lstrip("/")
-        self._edges = moving.edges()
-        self._clock: TfClock = clock or _agreeing(self._edges.values())
+        chosen: TfClock = clock or _agreeing(moving.values())
+        self._changes = static_changes(static)
+        self._periods = [
+            _Period(static_at(static, since), moving, self.target, chosen)
+            for since in (MIN_NS, *self._changes)
+        ]
+
+    def reaches(self, frame: str) -> bool:
+        """Returns whether transforms connect a frame with the target, at whatever time."""
+        return any(period.reaches(frame.lstrip("/")) for period in self._periods)
+
+    def pose(self, frame: str, time: Ns) -> Transform | None:
+        """Returns the pose of a frame in the target at one time; None where it is not known."""
+        found = self.poses(frame, np.array([time], np.int64))
+        if found is None or not found.valid[0]:
+            return None
+        x, y, z = (float(part[0]) for part in found.translation)
+        qx, qy, qz, qw = (float(part[0]) for part in found.rotation)
+        return Transform((x, y, z), (qx, qy, qz, qw))
+
+    def poses(self, frame: str, times: Times) -> Poses | None:
+        """Returns the poses of a frame in the target at some times.
+
+        None where no transform connects them at any time.
+        """
+        name = frame.lstrip("/")
+        if not self._changes:
+            return self._periods[0].poses(name, times)
+        found: Poses | None = None
+        numbers = np.searchsorted(self._changes, times + AT_OR_BEFORE_SLACK_NS, side="right")
+        for number in np.unique(numbers).tolist():
+            then = np.flatnonzero(numbers == number)
+            part = self._periods[number].poses(name, times[then])
+            if part is None:
+                continue
+            if found is None:
+                nowhere = _identity(len(times))
+                found = Poses(nowhere.translation, nowhere.rotation, ~nowhere.valid)
+            for whole, some in zip(
+                (*found.translation, *found.rotation),
+                (*part.translation, *part.rotation),
+                strict=True,
+            ):
+                whole[then] = some
+            found.valid[then] = part.valid
+        return found
+
+
+class _Period:
+    """Frames while no static transform changes."""
+
+    def __init__(
+        self, static: Sequence[StampedTransform], moving: Edges, target: str, clock: TfClock
+    ) -> None:
+        self.target = target
+        self._edges = moving
+        self._clock = clock
         self._static = {
             each.child.lstrip("/"): each for each in static if normalised(each.transform.rotation)
         }
@@ -190,23 +243,10 @@ class BagFrames:
             fresh = beside[waiting.pop()] - reached
             reached |= fresh
             waiting += fresh
-        return frame.lstrip("/") in reached
+        return frame in reached
 
-    def pose(self, frame: str, time: Ns) -> Transform | None:
-        """Returns the pose of a frame in the target at one time; None where it is not known."""
-        found = self.poses(frame, np.array([time], np.int64))
-        if found is None or not found.valid[0]:
-            return None
-        x, y, z = (float(each[0]) for each in found.translation)
-        qx, qy, qz, qw = (float(each[0]) for each in found.rotation)
-        return Transform((x, y, z), (qx, qy, qz, qw))
-
-    def poses(self, frame: str, times: Times) -> Poses | None:
-        """Returns the poses of a frame in the target at some times.
-
-        None where no transform connects them at any time.
-        """
-        name = frame.lstrip("/")
+    def poses(self, name: str, times: Times) -> Poses | None:
+        """Returns the poses of a frame at some times; None where nothing ever connects them."""
         if name == self.target:
             return _identity(len(times))
         if not self.reaches(name):
@@ -272,7 +312,7 @@ class BagFrames:
         )
 
 
-def _history(block: _Block, clock: TfClock, static: Transform | None) -> _History:
+def _history(block: Edge, clock: TfClock, static: Transform | None) -> _History:
     times = block.stamps if clock == "stamp" else block.log_times
     order = np.lexsort((np.arange(len(times)), block.log_times, times))
     # Of several for one time the last received counts.
@@ -282,7 +322,7 @@ def _history(block: _Block, clock: TfClock, static: Transform | None) -> _Histor
     return _History(times[chosen], block.translation[chosen], block.rotation[chosen], static)
 
 
-def _rows(edge: tuple[str, str], block: _Block) -> Iterable[StampedTransform]:
+def _rows(edge: tuple[str, str], block: Edge) -> Iterable[StampedTransform]:
     """Yields the transforms of a block one by one."""
     columns = (block.stamps, block.log_times, block.translation, block.rotation)
     for stamp, log_time, (x, y, z), (qx, qy, qz, qw) in zip(
@@ -294,25 +334,25 @@ def _rows(edge: tuple[str, str], block: _Block) -> Iterable[StampedTransform]:
 
 
 def _with_held_ends(rows: Sequence[StampedTransform], clock: TfClock) -> list[StampedTransform]:
-    """Returns transforms, and the first and last of each child `HOLD_NS` farther out as well."""
+    """Returns transforms, and those at the ends of what is known `HOLD_NS` farther out as well."""
     by_child: dict[str, list[StampedTransform]] = defaultdict(list)
-    for each in rows:
-        by_child[each.child].append(each)
+    for row in rows:
+        by_child[row.child].append(row)
     time = attrgetter("stamp" if clock == "stamp" else "log_time")
-    return [
-        *rows,
-        *(
-            replace(end, stamp=end.stamp + off, log_time=end.log_time + off)
-            for of_child in by_child.values()
-            for end, off in (
-                (min(of_child, key=time), -HOLD_NS),
-                (max(of_child, key=time), HOLD_NS),
-            )
-        ),
-    ]
+    held: list[StampedTransform] = []
+    for some in by_child.values():
+        some.sort(key=time)
+        ends = [(some[0], -HOLD_NS), (some[-1], HOLD_NS)]
+        for before, after in pairwise(some):
+            if time(after) - time(before) > TF_CACHE_NS:
+                ends += [(before, HOLD_NS), (after, -HOLD_NS)]
+        held += [
+            replace(end, stamp=end.stamp + off, log_time=end.log_time + off) for end, off in ends
+        ]
+    return [*rows, *held]
 
 
-def _agreeing(blocks: Iterable[_Block]) -> Literal["stamp", "log"]:
+def _agreeing(blocks: Iterable[Edge]) -> Literal["stamp", "log"]:
     """Returns the clock as `agreeing_clock` does."""
     off = [np.abs(block.log_times - block.stamps) for block in blocks]
     every = np.concatenate(off) if off else np.zeros(0, np.int64)
@@ -322,7 +362,37 @@ def _agreeing(blocks: Iterable[_Block]) -> Literal["stamp", "log"]:
     return "stamp" if int(np.partition(every, middle)[middle]) <= AGREEMENT_NS else "log"
 
 
-def _normalised(rotations: Floats) -> Floats:
+def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
+    """Returns, of static transforms in log-time order, the newest of each child at a moment.
+
+    A static transform holds at all times of its session. So where all of a child were received
+    later, the first of them holds.
+    """
+    newest: dict[str, StampedTransform] = {}
+    for each in static:
+        child = each.child.lstrip("/")
+        if child not in newest or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
+            newest[child] = each
+    return list(newest.values())
+
+
+def static_changes(static: Sequence[StampedTransform]) -> list[Ns]:
+    """Returns the log times at which a child's static transform differs from the one before."""
+    changes: dict[Ns, None] = {}
+    latest: dict[str, StampedTransform] = {}
+    for each in static:
+        child = each.child.lstrip("/")
+        before = latest.get(child)
+        if before is not None and not (
+            before.parent.lstrip("/") == each.parent.lstrip("/")
+            and alike(before.transform, each.transform)
+        ):
+            changes[each.log_time] = None
+        latest[child] = each
+    return [*changes]
+
+
+def unit_quaternions(rotations: Floats) -> Floats:
     """Returns unit quaternions; those that are of unit length within 1e-12 are left as they are."""
     x, y, z, w = rotations.T
     off = np.abs(x * x + y * y + z * z + w * w - 1) >= 1e-12

@@ -1,0 +1,179 @@
+"""The transforms of a topic from its columns: as `SchemaExtractor.transforms` gives them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.frames import Edge, unit_quaternions
+from ros2_memory.columns.steps import METRES, QUATERNION
+from ros2_memory.columns.table import Texts
+
+if TYPE_CHECKING:
+    from ros2_memory.analysis.frames import Edges, Floats
+    from ros2_memory.columns.steps import Step
+    from ros2_memory.columns.table import Elements, Table
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import IntArray
+
+Pair = tuple[str, str]
+
+_LIST: Final = "transforms"
+_PARENT: Final = "header.frame_id"
+_CHILD: Final = "child_frame_id"
+_STAMP: Final = "header.stamp"
+_TRANSLATION: Final = tuple(f"transform.translation.{axis}" for axis in "xyz")
+_ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
+
+
+class _Names(NamedTuple):
+    """The edges of the transforms of a table: `pairs[codes]`; -1 where there is none."""
+
+    pairs: list[Pair]
+    codes: IntArray
+
+
+def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Edges | None:
+    """Returns the transforms in some rows of a table; None where only its messages have them.
+
+    Numbers are rounded as the store rounds them, so they are the same from a part and from a bag.
+
+    Args:
+        table: the table.
+        times: log times (ns) of the rows.
+        index: the positions of the rows, ascending; None: all.
+    """
+    found = _elements(table)
+    if found is None:
+        return None
+    owners, some = found.owners, None
+    if index is not None:
+        wanted = np.zeros(len(table), np.bool_)
+        wanted[index] = True
+        some = np.flatnonzero(wanted[owners])
+        owners = np.searchsorted(index, owners[some])
+    pairs, codes = _names(found)
+    translation = _numbers(found, _TRANSLATION, METRES)
+    rotation = _numbers(found, _ROTATION, QUATERNION)
+    stamps = np.asarray(found.columns[_STAMP], np.int64)
+    if some is not None:
+        codes, stamps = codes[some], stamps[some]
+        translation, rotation = translation[some], rotation[some]
+    # tf2 refuses what is not finite, and rotations that are not unit quaternions.
+    fine = (codes >= 0) & np.isfinite(translation).all(axis=1)
+    fine &= np.isfinite(rotation).all(axis=1) & (rotation != 0).any(axis=1)
+    edges: dict[Pair, Edge] = {}
+    for nth, pair in enumerate(pairs):
+        here = np.flatnonzero(fine & (codes == nth))
+        if here.size:
+            turned = unit_quaternions(rotation[here])
+            edges[pair] = Edge(stamps[here], times[owners[here]], translation[here], turned)
+    return edges
+
+
+def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | None:
+    """Returns the parents and children of the transforms in some rows of a table.
+
+    From their names alone, where no number is invalid. None where only the messages have them.
+    """
+    found = _elements(table)
+    if found is None:
+        return None
+    if index is not None:
+        edges = edges_in(table, np.zeros(index.size, np.int64), index)
+        return None if edges is None else frozenset(edges)
+    zones = [table.zone(f"{_LIST}.{path}") for path in (*_TRANSLATION, *_ROTATION)]
+    if any(zone is None or zone.nulls or math.isinf(zone.high - zone.low) for zone in zones):
+        edges = edges_in(table, np.zeros(len(table), np.int64))
+        return None if edges is None else frozenset(edges)
+    pairs, _ = _names(found)
+    return frozenset(pairs)
+
+
+class StaticRun(NamedTuple):
+    """A transform of a child from a log time (ns) on; equal ones that follow are left out."""
+
+    time: Ns
+    parent: str
+    child: str
+    numbers: tuple[float, ...]
+
+
+def static_runs(table: Table, times: IntArray, index: IntArray | None) -> list[StaticRun] | None:
+    """Returns when the transforms of each child change in some rows of a table, in order.
+
+    None where only the messages have them. The arguments are as for `edges_in`.
+    """
+    edges = edges_in(table, times, index)
+    if edges is None:
+        return None
+    runs: list[StaticRun] = []
+    for child in dict.fromkeys(child for _, child in edges):
+        of_child = [(parent, edge) for (parent, one), edge in edges.items() if one == child]
+        for parent, edge in of_child:
+            numbers = np.column_stack((edge.translation, edge.rotation))
+            new = np.append([True], (numbers[1:] != numbers[:-1]).any(axis=1))
+            if len(of_child) > 1:  # they may alternate
+                new[:] = True
+            where = np.flatnonzero(new)
+            runs += [
+                StaticRun(time, parent, child, tuple(row))
+                for time, row in zip(
+                    edge.log_times[where].tolist(), numbers[where].tolist(), strict=True
+                )
+            ]
+    return sorted(runs)
+
+
+def stamped_between(
+    table: Table, index: IntArray | None, earliest: Ns, latest: Ns
+) -> IntArray | None:
+    """Returns the positions, among some rows (None: all), with a transform stamped in a span.
+
+    None where only the messages have them.
+    """
+    found = _elements(table)
+    if found is None:
+        return None
+    stamps = np.asarray(found.columns[_STAMP], np.int64)
+    rows = np.unique(found.owners[(stamps >= earliest) & (stamps <= latest)])
+    return rows if index is None else np.flatnonzero(np.isin(index, rows))
+
+
+def _elements(table: Table) -> Elements | None:
+    """Returns the transforms of a table, with all columns that they need; None without."""
+    found = table.elements.get(_LIST)
+    if found is None or any(not path or path.startswith(_LIST) for path in table.left_out):
+        return None
+    held = found.columns.keys()
+    needed = {_PARENT, _CHILD, _STAMP, *_TRANSLATION, *_ROTATION}
+    return found if needed <= held else None
+
+
+def _names(found: Elements) -> _Names:
+    """Returns the edges that occur, in the order of their names."""
+    parents, children = found.columns[_PARENT], found.columns[_CHILD]
+    if not isinstance(parents, Texts) or not isinstance(children, Texts):
+        return _Names([], np.full(len(found), -1))
+    several = max(len(children.words), 1)
+    used, codes = np.unique(
+        parents.codes.astype(np.int64) * several + children.codes, return_inverse=True
+    )
+    pairs: list[Pair] = []
+    numbers: list[int] = []
+    for code in used.tolist():
+        parent = parents.words[code // several].removeprefix("/")
+        child = children.words[code % several].removeprefix("/")
+        is_edge = bool(child) and parent != child
+        if is_edge and (parent, child) not in pairs:
+            pairs.append((parent, child))
+        numbers.append(pairs.index((parent, child)) if is_edge else -1)
+    return _Names(pairs, np.array(numbers, np.int64)[codes])
+
+
+def _numbers(found: Elements, paths: tuple[str, ...], step: Step) -> Floats:
+    columns = [np.asarray(found.columns[path], np.float64) for path in paths]
+    rounded: Floats = np.rint(np.stack(columns, axis=1) * step.per_unit) / step.per_unit
+    return rounded

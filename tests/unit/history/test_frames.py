@@ -1,0 +1,133 @@
+"""Transforms from columns are those that the messages hold, stored or not, however they are cut."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.frames import edges_of
+from ros2_memory.columns.transforms import pairs_in, stamped_between
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.history.frames import frames_over, transform_rows
+from ros2_memory.history.scan import scan
+from ros2_memory.history.transforms import sessions_of
+from ros2_memory.history.view import View
+from tests.support.bags import Msg, tf, transform, write_mcap
+from tests.support.column_worlds import EVERYTHING, World
+from tests.support.examples import examples
+
+if TYPE_CHECKING:
+    from ros2_memory.history.sessions import Session
+
+S = 10**9
+T0 = 1_784_000_000 * S
+SECONDS = 40
+
+
+def message(second: int) -> Msg:
+    """A robot whose map moves, and edges that tf2 refuses."""
+    at = T0 + second * S
+    edges = [
+        transform(at + 5, "map", "odom", (second / 3, 0.0, 0.0), second / 50),
+        transform(at, "/odom", "base", (math.pi * second, -second / 7, 0.0), second / 7),
+    ]
+    if second % 5 == 0:
+        edges += [
+            transform(at, "base", "base", (1.0, 0.0, 0.0)),
+            transform(at, "base", "gone", (math.nan, 0.0, 0.0)),
+        ]
+    return tf(at, *edges[second % 2 :])
+
+
+def world(folder: Path, cuts: list[int]) -> World:
+    mounts = {0: 1.0, 25: 2.0}
+    for number, (begin, end) in enumerate(pairwise([0, *sorted({*cuts}), SECONDS])):
+        messages = [message(second) for second in range(begin, end)]
+        # Each split has the static transforms again, as some recorders write them.
+        x = max((at, x) for at, x in mounts.items() if at <= begin)[1]
+        at = T0 + begin * S
+        mount = transform(T0, "base", "camera", (x, 0.0, 0.0))
+        messages.append(tf(at, mount, topic="/tf_static"))
+        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+    return World.of(folder)
+
+
+def session_of(view: View) -> Session:
+    [session] = {sessions_of(view).of(path) for path in view.snapshot.timeline.recordings("/tf")}
+    return session
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_columns_hold_the_transforms_of_the_messages(tmp_path: Path, stored: bool) -> None:
+    made = world(tmp_path, [13, 30])
+    if stored:
+        assert made.fill() == 3
+    view = View(made.memory, Call())
+    expected = edges_of(
+        edge
+        for found in view.stream.messages(["/tf"], EVERYTHING)
+        for edge in made.memory.extractor.transforms(
+            made.memory.reader.decode(found.record), found.time, static=False
+        )
+    )
+    found = [edges for _, edges in transform_rows(view, "/tf", EVERYTHING, session_of(view))]
+    assert {pair for edges in found for pair in edges} == expected.keys()
+    for pair, whole in expected.items():
+        parts = [edges[pair] for edges in found if pair in edges]
+        assert [at for edge in parts for at in edge.stamps.tolist()] == whole.stamps.tolist()
+        assert [at for edge in parts for at in edge.log_times.tolist()] == whole.log_times.tolist()
+        translation = np.concatenate([edge.translation for edge in parts])
+        rotation = np.concatenate([edge.rotation for edge in parts])
+        assert translation == pytest.approx(whole.translation, abs=6e-5)
+        assert rotation == pytest.approx(whole.rotation, abs=6e-5)
+
+
+def test_some_rows_of_a_table_have_their_own_pairs_and_stamps(tmp_path: Path) -> None:
+    made = world(tmp_path, [])
+    made.fill()
+    view = View(made.memory, Call())
+    [rows] = scan(view, "/tf", TimeWindow(T0 + 11 * S, T0 + 12 * S))
+    assert pairs_in(rows.table, rows.index) == {("odom", "base")}
+    assert pairs_in(rows.table) == {("map", "odom"), ("odom", "base")}
+    near = stamped_between(rows.table, None, T0 + 12 * S + 5, T0 + 12 * S + 5)
+    assert near is not None
+    assert near.tolist() == [12]
+
+
+@settings(max_examples=examples(15), deadline=None)
+@given(cuts=st.lists(st.integers(26, SECONDS - 1), max_size=4), stored=st.booleans())
+def test_frames_are_the_same_however_a_history_is_cut_and_whatever_is_stored(
+    cuts: list[int], stored: bool
+) -> None:
+    times = np.arange(T0 + 10 * S, T0 + 38 * S, S // 3)
+    window = TimeWindow(int(times[0]), int(times[-1]) + 1)
+    found = []
+    for some in ([25], [25, *cuts]):
+        with TemporaryDirectory() as name:
+            made = world(Path(name), some)
+            if stored and some == [25]:
+                made.fill()
+            view = View(made.memory, Call())
+            poses = frames_over(view, session_of(view), window, "map").poses("camera", times)
+            assert poses is not None
+            assert poses.valid.all()
+            found.append(np.stack([*poses.translation, *poses.rotation]))
+    assert (found[0] == found[1]).all()
+
+
+def test_static_transforms_that_change_inside_a_window_hold_from_then_on(tmp_path: Path) -> None:
+    view = View(world(tmp_path, [25, 30]).memory, Call())
+    window = TimeWindow(T0 + 10 * S, T0 + 38 * S)
+    times = np.array([T0 + 24 * S, T0 + 25 * S, T0 + 31 * S], np.int64)
+    poses = frames_over(view, session_of(view), window, "base").poses("camera", times)
+    assert poses is not None
+    assert poses.translation[0].tolist() == [1.0, 2.0, 2.0]
