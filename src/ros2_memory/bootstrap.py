@@ -547,7 +547,6 @@ def build_filling(settings: Settings, memory: Memory) -> Filling | None:
 
 def build_digester(memory: Memory) -> Digester:
     """Returns what digests the bags of a memory."""
-    from ros2_memory.catalogue.detector_sights import DetectorSights
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.places.map_digests import map_settings
 
@@ -557,7 +556,6 @@ def build_digester(memory: Memory) -> Digester:
         memory.extractor,
         limits.max_plausible_speed_mps,
         map_settings(limits),
-        partial(DetectorSights, memory.reader, memory.extractor),
     )
 
 

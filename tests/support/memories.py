@@ -6,14 +6,13 @@ import json
 import time
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
 
-from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
@@ -111,7 +110,6 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
         memory.extractor,
         limit,
         map_settings(memory.limits),
-        partial(DetectorSights, memory.reader, memory.extractor),
     )
     statics = BagStatics(View(memory, Call()))
     bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.sights import Seen, joined, no_sights, sights_of
 from ros2_memory.columns.table import Texts
-from ros2_memory.things.sights import Seen, joined, no_sights, sights_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.sights import Sights
     from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.things.sights import Sights
 
 
 class PlacedDetection(NamedTuple):

@@ -17,8 +17,8 @@ from tests.support.sights import Message, PlacedDetection, sights_of_messages
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.analysis.sights import Sights
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.things.sights import Sights
 
 BEGIN_S: Final = 1_700_000_000
 BAG_S: Final = 30

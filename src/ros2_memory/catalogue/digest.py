@@ -16,16 +16,15 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.catalogue.map_digest import MapDigest, SightsSource, Statics
+    from ros2_memory.catalogue.map_digest import MapDigest, Statics
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader
 
-DIGEST_VERSION: Final = 23
+DIGEST_VERSION: Final = 24
 """Version of what is stored of a bag and how; another one has every bag digested again."""
 _ALWAYS_READ_BYTES: Final = 64 << 20
 _MESSAGE_BYTES: Final = 200
@@ -52,7 +51,6 @@ class Digester:
         extractor: gives the values that conditions are tested on.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         map_settings: which topics place the robot.
-        sights: returns what collects the sights of a bag; None where they are not wanted.
     """
 
     def __init__(
@@ -61,11 +59,9 @@ class Digester:
         extractor: SchemaExtractor,
         max_plausible_speed_mps: float,
         map_settings: MapSettings = _DEFAULT_MAP,
-        sights: Callable[[], SightsSource] | None = None,
     ) -> None:
         self._reader = reader
         self._map_settings = map_settings
-        self._sights = sights
         self._extractor = extractor
         self._templates = Templates(reader, extractor)
         self._max_plausible_speed_mps = max_plausible_speed_mps
@@ -81,11 +77,10 @@ class Digester:
         latched: dict[str, bool] = {}
         for each in summary.topics:
             latched[each.topic] = latched.get(each.topic, False) or each.latched
-        sights = None if self._sights is None else self._sights()
         settings = self._map_settings
         if statics.poses is not None:
             settings = replace(settings, pose_topic=statics.poses)
-        in_map = MapCollector(settings, sights)
+        in_map = MapCollector(settings)
         collectors = {
             topic: TopicCollector(
                 topic,

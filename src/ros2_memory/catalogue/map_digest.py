@@ -1,4 +1,4 @@
-"""The digest of one bag in the map: where the robot was, and what it saw there.
+"""The digest of one bag in the map: where the robot was.
 
 Made from the bag's own messages and from the static transforms of its session, which are its
 context: an entry made under others is of no use, so a hash of them is stored with it.
@@ -10,7 +10,7 @@ import hashlib
 import json
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import Record
 
 ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
@@ -91,83 +90,29 @@ class MapDigest:
     """What is stored of a bag about the map.
 
     Attributes:
-        frame_id: of the track and of the sights: the map, or the poses' own frame where transforms
+        frame_id: of the track: the map, or the poses' own frame where transforms
             of the bag lead to no map; empty without a pose.
         statics: the hash of the static transforms that it was made with.
         track: of the robot.
         left_out: how many poses could not be placed.
-        sights: what `SightsSource.digest` returned; empty without a builder.
-        own: the same in the poses' own frame, without sights; None where `frame_id` is that.
+        own: the same in the poses' own frame; None where `frame_id` is that.
     """
 
     frame_id: str
     statics: int
     track: RobotTrack
     left_out: int = 0
-    sights: bytes = b""
     own: MapDigest | None = None
-
-
-class RobotPoses(NamedTuple):
-    """The robot at some times, in the target frame; only meaningful where `valid`."""
-
-    x: Floats
-    y: Floats
-    heading: Floats
-    valid: Mask
 
 
 @dataclass(frozen=True, slots=True)
 class PlacedPoses:
-    """All poses of the robot in one bag that could be placed, in log-time order.
+    """All poses of the robot in one bag that could be placed, in log-time order."""
 
-    Attributes:
-        frames: looks up any frame of the bag.
-        own: the frame of the poses themselves.
-    """
-
-    frames: Frames
-    own: str
     times: Times
     x: Floats
     y: Floats
     heading: Floats
-
-    def at(self, times: Times) -> RobotPoses:
-        """Returns where the robot was at some log times; not valid farther than 1 s from a pose."""
-        if not len(self.times):
-            none = np.full(len(times), np.nan)
-            return RobotPoses(none, none, none, np.zeros(len(times), np.bool_))
-        last = len(self.times) - 1
-        after = np.searchsorted(self.times, times, side="right")
-        before, after = np.clip(after - 1, 0, last), np.clip(after, 0, last)
-        start, stop = self.times[before], self.times[after]
-        ratio = np.clip((times - start) / np.maximum(stop - start, 1), 0.0, 1.0)
-        near = np.minimum(np.abs(times - start), np.abs(stop - times)) <= _NEAR_NS
-        turn = np.remainder(self.heading[after] - self.heading[before] + np.pi, 2 * np.pi) - np.pi
-        return RobotPoses(
-            self.x[before] + (self.x[after] - self.x[before]) * ratio,
-            self.y[before] + (self.y[after] - self.y[before]) * ratio,
-            self.heading[before] + turn * ratio,
-            near & (stop - start <= 2 * _NEAR_NS),
-        )
-
-
-class SightsSource(Protocol):
-    """Collects what detectors saw in one bag, and digests it as bytes that only it can read."""
-
-    def wants(self, topic: str, type_name: str) -> bool:
-        """Returns whether messages of a topic are to be added."""
-
-    def add(self, record: Record, detections: tuple[Detection, ...] | None) -> None:
-        """Takes the next message of a topic, in log-time order by topic.
-
-        `detections` are those in it, without the message's own frame; None where many messages
-        were decoded at once and this one was not: it is decoded where that is needed.
-        """
-
-    def digest(self, robot: PlacedPoses) -> bytes:
-        """Returns the digest; `robot.frames` places any frame, `robot.at` the robot itself."""
 
 
 class TransformColumns:
@@ -203,12 +148,10 @@ class MapCollector:
 
     Args:
         settings: which topics, and which frame is the map.
-        sights: collects what detectors saw; None where that is not wanted.
     """
 
-    def __init__(self, settings: MapSettings, sights: SightsSource | None = None) -> None:
+    def __init__(self, settings: MapSettings) -> None:
         self._settings = settings
-        self.sights = sights
         self._moving = TransformColumns()
         self._times: list[Ns] = []
         self._poses: list[Pose] = []
@@ -250,7 +193,6 @@ class MapCollector:
             statics.key,
             track,
             len(self._times) - len(placed.times),
-            b"" if self.sights is None else self.sights.digest(placed),
             own,
         )
 
@@ -290,11 +232,11 @@ class MapCollector:
             track = track_of(times, x, y, _heading((qx, qy, qz, qw), turned))
             in_own = MapDigest(own, statics.key, track, len(self._times) - len(times))
         if poses is None:
-            return PlacedPoses(frames, own, times[:0], x[:0], y[:0], x[:0]), target, in_own
+            return PlacedPoses(times[:0], x[:0], y[:0], x[:0]), target, in_own
         px, py, _ = poses.points((x, y, z))
         heading = _heading(multiply(poses.rotation, (qx, qy, qz, qw)), turned)
         valid = poses.valid
-        placed = PlacedPoses(frames, own, times[valid], px[valid], py[valid], heading[valid])
+        placed = PlacedPoses(times[valid], px[valid], py[valid], heading[valid])
         return placed, target, in_own
 
 

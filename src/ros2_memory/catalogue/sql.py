@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 TABLES: Final = Tables(
-    version=13,
+    version=14,
     names=(
         "bags",
         "held",
@@ -56,8 +56,7 @@ CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, l
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
-CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
-  sights BLOB NOT NULL);
+CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
   log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
@@ -86,14 +85,12 @@ EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, la
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
 TRACK: Final = "track"
-SIGHTS: Final = "sights"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
     POSES: "held",
     STANDSTILLS: "tales",
     TRACK: "maps",
-    SIGHTS: "maps",
     COUNTS: "bags",
 }
 """The table in whose column of that name what is packed of a kind lies; answers lie elsewhere."""
@@ -254,12 +251,11 @@ def insert_entry(
 
 def _insert_map(connection: sqlite3.Connection, bag: int, digest: MapDigest) -> None:
     connection.execute(
-        "INSERT INTO maps VALUES (?, ?, ?, ?)",
+        "INSERT INTO maps VALUES (?, ?, ?)",
         (
             bag,
             digest.statics,
             packed_by_model(connection, NO_TOPIC, TRACK, encode_map_track(digest)),
-            packed_by_model(connection, NO_TOPIC, SIGHTS, digest.sights),
         ),
     )
 

@@ -32,7 +32,6 @@ from ros2_memory.catalogue.sql import (
     OF_CONFIGS,
     POSES,
     RELATCHED,
-    SIGHTS,
     STANDSTILLS,
     TABLES,
     TRACK,
@@ -240,10 +239,6 @@ class Catalogue(Database):
     def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
         """Returns, by entry, the hash of the static transforms its map digest was made with."""
         return self._of_map(numbers, "x''", lambda rows: [key for _, key in rows])
-
-    def sights(self, numbers: Sequence[int]) -> dict[int, tuple[int, bytes]]:
-        """Returns, by entry, the hash as of `map_keys`, and the bytes of its sights."""
-        return self._of_map(numbers, SIGHTS, lambda rows: [(key, plain) for plain, key in rows])
 
     def _of_map(
         self,

@@ -11,7 +11,6 @@ from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.standstills import StandstillCollector
 from ros2_memory.analysis.motion.trajectory import PoseCollector
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import BagReader, Record
 
 MAX_STORED: Final = 64
@@ -74,14 +72,12 @@ class TopicDigest:
 class _Sample(NamedTuple):
     """What one message contributes to the digest besides its numbers and edges.
 
-    `detections` are present if they were requested, and the
-    message was decoded alone; `pairs` are the frames of its valid transforms then, None if not
+    `pairs` are the frames of its valid transforms where it was decoded alone, None if not
     requested.
     """
 
     pose: Pose | None
     speed_mps: float | None
-    detections: tuple[Detection, ...] | None = None
     pairs: frozenset[tuple[str, str]] | None = frozenset()
 
 
@@ -95,7 +91,7 @@ class TopicCollector:
         templates: of the same reader and extractor.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         latched: whether its messages are stored whole where they are few.
-        in_map: takes the robot's poses, moving transforms and sights of all topics of the bag.
+        in_map: takes the robot's poses and moving transforms of all topics of the bag.
     """
 
     def __init__(
@@ -113,7 +109,6 @@ class TopicCollector:
         self._map = in_map
         self._map_poses = in_map is not None and in_map.has_poses(topic)
         self._map_transforms = in_map is not None and in_map.has_transforms(topic)
-        self._sights: dict[str, bool] = {}
         self._reader = reader
         self._extractor = extractor
         self._templates = templates
@@ -186,7 +181,6 @@ class TopicCollector:
             self._ends = (batch[0] if self._ends is None else self._ends[0], batch[-1])
         map_poses = self._map if self._map_poses else None
         samples = self._decoder.decode(batch)
-        self._add_sights(batch, samples)
         for record, sample in zip(batch, samples, strict=True):
             if isinstance(sample, UndecodableError):
                 self._pairs = self._poses = None
@@ -203,26 +197,6 @@ class TopicCollector:
                 if is_place(pose.position):
                     self._standstills.add(time, pose.position, pose.orientation)
 
-    def _add_sights(
-        self, batch: Sequence[Record], samples: Sequence[_Sample | UndecodableError]
-    ) -> None:
-        """Takes what detectors saw."""
-        to = None if self._map is None else self._map.sights
-        types = {record.channel.schema.name for record in batch}
-        if to is None or not any(map(self._wants_sights, types)):
-            return
-        for record, sample in zip(batch, samples, strict=True):
-            if isinstance(sample, UndecodableError):
-                continue
-            if self._wants_sights(record.channel.schema.name):
-                to.add(record, sample.detections)
-
-    def _wants_sights(self, type_name: str) -> bool:
-        if type_name not in self._sights:
-            to = None if self._map is None else self._map.sights
-            self._sights[type_name] = to is not None and to.wants(self._topic, type_name)
-        return self._sights[type_name]
-
     def _decode(self, record: Record) -> _Sample:
         """Decodes one message; its edges count at once, since their order does not."""
         type_name = record.channel.type
@@ -231,10 +205,7 @@ class TopicCollector:
         if self._pairs is not None or self._map_transforms:
             pairs = self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
-        seen = None
-        if self._wants_sights(type_name):
-            seen = detections_of(self._extractor.exact(message, type_name))
-        return _Sample(*motion, seen, pairs)
+        return _Sample(*motion, pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
         """Takes the valid transforms of a message, and returns their frames."""
@@ -248,8 +219,6 @@ class TopicCollector:
         return pairs
 
     def _template(self, record: Record, sample: _Sample) -> PayloadTemplate | None:
-        if any(each.score is not None for each in sample.detections or ()):
-            return None  # they differ from message to message
         template = self._templates.of(record)
         # A transform that is invalid in this message may be valid in others of the template.
         return template if template is not None and template.pairs == sample.pairs else None

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.sights import Sights
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.pack import Packed
@@ -161,6 +162,9 @@ class Scanner:
         pairs: by part, the parents and children of its transforms.
         static_runs: by part, when its static transforms change.
         statics: by session and topics, the static transforms of a timeline.
+        sights: by session and ten minutes, with all that they follow from, what detectors saw:
+            the frame, the session that it is of, and the tables.
+        things: by settings, what was estimated of all bags of a timeline.
     """
 
     def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
@@ -174,6 +178,8 @@ class Scanner:
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
         self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
+        self.sights: ByteLru[tuple[str, object, tuple[Sights, ...]]] = ByteLru(48 << 20)
+        self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of a topic in a window.

@@ -18,6 +18,7 @@ from ros2_memory.history.scan import messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import Pose, TimeWindow
@@ -65,11 +66,12 @@ def pose_rows(
     *,
     newest_first: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
+    among: Callable[[Path], bool] = lambda _: True,
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 
     Positions are rounded to 0.1 mm, as the store has them. Why messages cannot be decoded is added
-    to `failures` as poses are read. `reached` is as for `scan`.
+    to `failures` as poses are read. `reached` is as for `scan`; `among`: which recordings count.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -77,6 +79,8 @@ def pose_rows(
     reader = _Reader(view, failures)
     together: list[Rows] = []
     for rows in scan(view, topic, window, newest_first=newest_first, reached=reached):
+        if not among(rows.recording):
+            continue
         is_apart = together and (
             rows.last < min(each.first for each in together)
             if newest_first

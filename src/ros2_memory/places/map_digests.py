@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.catalogue.map_digest import SightsSource, Statics
+    from ros2_memory.catalogue.map_digest import Statics
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
@@ -94,21 +94,21 @@ class MapDigests:
 
         return self.statics.remembered(digests, valid)
 
-    def made(self, bag: BagFile, sights: SightsSource | None = None) -> MapDigest:
-        """Returns the digest of a bag, read from it; with sights where a builder is given.
+    def made(self, bag: BagFile) -> MapDigest:
+        """Returns the digest of a bag, read from it.
 
-        What cannot be read of the bag is left out, with a note. Without sights the digests of the
-        bags that were asked for last stay in memory.
+        What cannot be read of the bag is left out, with a note. The digests of the bags that were
+        asked for last stay in memory.
         """
         statics = self.statics.of(bag)
         stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
         key = (*stat, statics.key, self._settings, id(self._view.memory.reader))
-        known = None if sights is not None else _MADE.get(key)
+        known = _MADE.get(key)
         if known is not None:
             return known
-        reader = _MapReader(self._view, self._settings, sights)
+        reader = _MapReader(self._view, self._settings)
         made = reader.digest(bag, statics)
-        if sights is None and reader.is_complete and bag.state is not BagState.ACTIVE:
+        if reader.is_complete and bag.state is not BagState.ACTIVE:
             _MADE.put(key, made)
         return made
 
@@ -116,24 +116,19 @@ class MapDigests:
 class _MapReader:
     """Makes the map digest of a bag as the catalogue's `Digester` does."""
 
-    def __init__(
-        self, view: View, settings: MapSettings, sights: SightsSource | None = None
-    ) -> None:
+    def __init__(self, view: View, settings: MapSettings) -> None:
         self._view = view
         self._settings = settings
-        self._collector = MapCollector(settings, sights)
+        self._collector = MapCollector(settings)
         self._decoders: dict[str, BulkDecoder[Pose | None, PayloadTemplate]] = {}
         self.is_complete = True
 
     def digest(self, bag: BagFile, statics: Statics) -> MapDigest:
         """Returns the digest of all messages of the bag that can be read."""
-        sights, held = self._collector.sights, bag.summary.schema.topics
         topics = {
             each.topic
-            for each in held
-            if self._collector.has_poses(each.topic)
-            or self._collector.has_transforms(each.topic)
-            or (sights is not None and sights.wants(each.topic, each.type))
+            for each in bag.summary.schema.topics
+            if self._collector.has_poses(each.topic) or self._collector.has_transforms(each.topic)
         }
         waiting: dict[str, list[Record]] = {topic: [] for topic in topics}
         before = self._view.notes.added
@@ -163,10 +158,6 @@ class _MapReader:
                 if isinstance(pose, UndecodableError) or pose is None or not to.has_poses(topic):
                     continue
                 to.add_pose(record.log_time, pose)
-        if to.sights is not None:
-            for record in batch:
-                if to.sights.wants(topic, record.channel.type):
-                    to.sights.add(record, None)
 
     def _decode(self, record: Record) -> Pose | None:
         extractor = self._view.memory.extractor

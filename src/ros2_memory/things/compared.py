@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.results import ComparedMover, ComparedThing, ComparedThings, MoverSeen, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.presence import missed_in
-from ros2_memory.things.sights import Spot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S
@@ -21,19 +22,18 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
-from ros2_memory.things.sights import SCORE_BINS, Look, Score, Spot
 from ros2_memory.things.unseen import Asked, notes_on
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
+    from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.where import Where
     from ros2_memory.things.instances import Instance, Mover, PlacedStay
-    from ros2_memory.things.sights import Ints
 
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3

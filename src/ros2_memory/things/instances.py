@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.analysis.sights import SCORE_BINS, Hit, Score, Spot, Unplaced
+from ros2_memory.core.arrays import distinct_rows
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.labels import moves_by_itself
 from ros2_memory.things.localisation import poorly_localised
 from ros2_memory.things.moves import Sightings, stays_in
-from ros2_memory.things.places import GATE_MM, distinct_rows, places_of
+from ros2_memory.things.places import GATE_MM, places_of
 from ros2_memory.things.presence import (
     Cells,
     Stay,
@@ -29,7 +31,6 @@ from ros2_memory.things.presence import (
     in_ranges,
     stays_at,
 )
-from ros2_memory.things.sights import SCORE_BINS, Hit, Score, Spot, Unplaced
 from ros2_memory.things.synonyms import with_synonyms
 
 if TYPE_CHECKING:
@@ -37,11 +38,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.things.labels import Labels
     from ros2_memory.things.presence import Evidence, FieldOfView
-    from ros2_memory.things.sights import Ints, Sights
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]

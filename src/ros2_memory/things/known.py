@@ -1,9 +1,7 @@
 """The things of a memory: estimated from the sights of all its bags, once for each timeline.
 
-Sights come from the catalogue, joined once for each segment of bags; of bags without a valid entry
-they are made from the bags, as the catalogue would have them. So the estimate is the same with the
-catalogue and without; where reading takes too long it begins later, and says so. So it does where
-there are too many sightings: a detector that sees things everywhere has thousands in an hour.
+Where gathering sights takes too long the estimate begins later, and says so. So it does where there
+are too many sightings: a detector that sees things everywhere has thousands in an hour.
 """
 
 from __future__ import annotations
@@ -11,43 +9,26 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from itertools import accumulate
-from threading import Lock
 from typing import TYPE_CHECKING, Final
-from weakref import WeakKeyDictionary
 
-from ros2_memory.catalogue.detector_sights import DetectorSights
+from ros2_memory.analysis.sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.transforms import sessions_of
-from ros2_memory.places.map_digests import MapDigests
-from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things.instances import Estimate, estimate
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.sights import (
-    Sights,
-    decode_joined,
-    decode_sights,
-    joined,
-)
+from ros2_memory.things.seen import Watching
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Hashable, Mapping, Sequence
 
-    from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Deadline, Ns
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Segment
-    from ros2_memory.index.timeline import Timeline
+    from ros2_memory.things.seen import Stretch
 
-_MADE_BYTES: Final = 4 << 20
-_ENTRY_BYTES: Final = 1_000
-_ESTIMATES: Final = 4
 _MOST_SPOTS: Final = 300_000
-"""Places of a label in a bag that are looked at together: a home robot has 50,000 in a week."""
+"""Places of a label in a slice that are looked at together: a home robot has 50,000 in a week."""
 _ESTIMATING_S: Final = 6.0
 _FEWER: Final = 4
 """Where that takes longer, so many times fewer are looked at, from then on."""
@@ -75,32 +56,6 @@ class KnownThings:
     crowded: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """The sights of some bags in order of time; with the frame and the folder of each bag."""
-
-    sights: Sights
-    frames: tuple[str, ...]
-    bags: tuple[BagFile, ...]
-
-
-class _Made:
-    """The sights that were made from bags last, and the estimates. Thread-safe."""
-
-    def __init__(self) -> None:
-        self.sights = ByteLru[bytes](_MADE_BYTES)
-        self.most_spots = ByteLru[int](_ESTIMATES)
-        self._estimates: WeakKeyDictionary[Timeline, ByteLru[KnownThings]] = WeakKeyDictionary()
-        self._lock = Lock()
-
-    def estimates(self, timeline: Timeline) -> ByteLru[KnownThings]:
-        with self._lock:
-            return self._estimates.setdefault(timeline, ByteLru(_ESTIMATES))
-
-
-_CACHE: Final = _Made()
-
-
 def known_things(
     view: View, min_score: float, spellings: Mapping[str, Sequence[str]]
 ) -> KnownThings:
@@ -109,18 +64,19 @@ def known_things(
     Raises:
         QueryTimeoutError: the call's time is over before any bag was read.
     """
-    timeline = view.snapshot.timeline
-    described = tuple(sorted((name, tuple(each)) for name, each in spellings.items()))
-    key = (min_score, described, view.memory.limits.map_frame, id(view.memory.reader))
-    estimates = _CACHE.estimates(timeline)
-    known = estimates.get(key)
-    if known is None:
+    timeline, scanner = view.snapshot.timeline, view.memory.columns
+    described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
+    key = ("things", min_score, described, view.memory.limits.map_frame, view.pose_topic)
+    kept = None if scanner is None else scanner.things.get(key)
+    if kept is not None and kept[0] is timeline and isinstance(kept[1], KnownThings):
+        known = kept[1]
+    else:
         before = view.notes.added
-        known = _Loader(view).load(min_score, Labels(spellings), (id(view.memory.index), *key))
-        active = any(bag.state is BagState.ACTIVE for bag in view.snapshot.bags)
+        known = _Loader(view, key).load(min_score, Labels(spellings))
         is_read = known.since is None or known.crowded
-        if is_read and not active and view.notes.added == before:
-            estimates.put(key, known, 1)
+        is_whole = is_read and not view.call.used_active and view.notes.added == before
+        if scanner is not None and is_whole:
+            scanner.things.put(key, (timeline, known), 1)
     if known.crowded and known.since is not None:
         view.notes.complete = False
         view.notes.add(
@@ -135,17 +91,21 @@ class _TakesTooLongError(Exception):
 
 
 class _Loader:
-    """Gathers the sights of all bags of a view, the newest segment first."""
+    """Gathers the sights of all bags of a view, the newest first.
 
-    def __init__(self, view: View) -> None:
+    Args:
+        view: has the bags.
+        key: tells estimates with other settings apart.
+    """
+
+    def __init__(self, view: View, key: tuple[Hashable, ...]) -> None:
         self._view = view
-        self._maps = MapDigests(view)
-        self._reading: Deadline | None = None
+        self._key = ("most spots", *key)
         self._since: Ns | None = None
 
-    def load(self, min_score: float, labels: Labels, key: tuple[object, ...]) -> KnownThings:
+    def load(self, min_score: float, labels: Labels) -> KnownThings:
         """Returns the things in all that could be read, and compared in time."""
-        most = _CACHE.most_spots.get(key) or _MOST_SPOTS
+        most = self._most_spots
         parts, crowded = self._newest(most)
         if self._since is not None:
             self._view.notes.complete = False
@@ -158,40 +118,56 @@ class _Loader:
             try:
                 found = self._known(parts, min_score, labels, crowded=crowded)
             except _TakesTooLongError:
-                most = max(sum(len(part.sights.spots) for part in parts) // _FEWER, 1)
-                _CACHE.most_spots.put(key, most, 1)
+                most = max(sum(map(_spots, parts)) // _FEWER, 1)
+                self._remember_most(most)
                 parts, crowded = _within(parts, most), True
             else:
                 # It may have been the machine that was slow for a while.
                 if most < _MOST_SPOTS and time.monotonic() - begun_s < _ESTIMATING_S / _QUICK:
-                    _CACHE.most_spots.put(key, min(2 * most, _MOST_SPOTS), 1)
+                    self._remember_most(min(2 * most, _MOST_SPOTS))
                 return found
 
-    def _newest(self, most: int) -> tuple[list[_Part], bool]:
-        """Returns the newest bags, in order, and whether they have so many spots already."""
-        parts: list[_Part] = []
+    @property
+    def _most_spots(self) -> int:
+        scanner = self._view.memory.columns
+        kept = None if scanner is None else scanner.things.get(self._key)
+        return kept[1] if kept is not None and isinstance(kept[1], int) else _MOST_SPOTS
+
+    def _remember_most(self, most: int) -> None:
+        scanner = self._view.memory.columns
+        if scanner is not None:
+            scanner.things.put(self._key, (self._view.snapshot.timeline, most), 1)
+
+    def _newest(self, most: int) -> tuple[list[list[Stretch]], bool]:
+        """Returns the newest stretches, in order, and whether they have so many spots already."""
+        parts: list[list[Stretch]] = []
+        until = self._view.call.partial_after(READING_S)
         spots = 0
-        for segment in reversed(self._view.snapshot.timeline.segments):
-            if spots >= most:
-                return parts[::-1], True
-            self._view.bags.check_deadline()
-            parts.append(self._part(segment))
-            spots += len(parts[-1].sights.spots)
-            if self._since is not None:
-                break
+        try:
+            for part in Watching(self._view).newest_first():
+                if spots >= most:
+                    return parts[::-1], True
+                if parts and until.expired():
+                    self._since = parts[-1][0].start
+                    break
+                parts.append(part)
+                spots += _spots(part)
+        except QueryTimeoutError:
+            if not parts:
+                raise
+            self._since = parts[-1][0].start
         return parts[::-1], False
 
     def _known(
-        self, parts: Sequence[_Part], min_score: float, labels: Labels, *, crowded: bool
+        self, parts: Sequence[Sequence[Stretch]], min_score: float, labels: Labels, *, crowded: bool
     ) -> KnownThings:
-        """Returns the things in some bags.
+        """Returns the things in some stretches.
 
         Raises:
             _TakesTooLongError: that takes longer than an answer may, and fewer would do.
         """
-        frames = [frame for part in parts for frame in part.frames]
-        bags = [bag for part in parts for bag in part.bags]
-        epochs, names = self._epochs(frames, bags)
+        stretches = [stretch for part in parts for stretch in part]
+        epochs, names = self._epochs(stretches)
         until = self._view.call.partial_after(_ESTIMATING_S)
 
         def go_on() -> None:
@@ -200,107 +176,41 @@ class _Loader:
             if len(parts) > 1 and until.expired():
                 raise _TakesTooLongError
 
-        sights = joined(part.sights for part in parts)
-        found = estimate(sights, labels, epochs, min_score, go_on)
+        sights, of_slice = joined(
+            [one for stretch in stretches for one in stretch.sights],
+            [epoch for epoch, each in zip(epochs, stretches, strict=True) for _ in each.sights],
+        )
+        found = estimate(sights, labels, of_slice, min_score, go_on)
         since = self._since
         if crowded:
-            since = max(bags[0].start, MIN_NS if since is None else since)
+            since = max(stretches[0].start, MIN_NS if since is None else since)
         return KnownThings(
             found, labels, names, since, bool(sights.topics) and 0 in epochs, crowded
         )
 
-    def _part(self, segment: Segment) -> _Part:
-        digests = self._view.bags.digests_of(segment)
-        valid = {} if digests is None else self._maps.valid_in(digests, segment)
-        if digests is not None and len(valid) == len(segment.bags):
-            keys = digests.map_keys()
-            state = hash(tuple(keys[number] for number in valid.values()))
-            known = digests
-            return digests.derived(f"things {state}", lambda: self._stored(known, segment, valid))
-        stored = {} if digests is None else digests.catalogue.sights([*valid.values()])
-        return self._read(segment, valid, {each: packed for each, (_, packed) in stored.items()})
+    def _epochs(self, stretches: Sequence[Stretch]) -> tuple[list[int], tuple[str, ...]]:
+        """Returns the epoch of each stretch, and the frame of each epoch.
 
-    def _stored(self, digests: SegmentDigests, segment: Segment, valid: Mapping[str, int]) -> _Part:
-        stored = digests.catalogue.sights([*valid.values()])
-        packed = {number: blob for number, (_, blob) in stored.items()}
-        return self._read(segment, valid, packed)
-
-    def _read(
-        self, segment: Segment, valid: Mapping[str, int], stored: Mapping[int, bytes]
-    ) -> _Part:
-        """Returns the sights of a segment's bags: stored ones decoded, others made."""
-        found: list[tuple[BagFile, bytes]] = []
-        for bag in sorted(segment.bags, key=lambda each: (each.start, each.file), reverse=True):
-            packed = stored.get(valid.get(bag.file, -1))
-            if packed is None:
-                packed = self._made(bag)
-            if packed is None:
-                self._since = found[-1][0].start if found else bag.end
-                break
-            found.append((bag, packed))
-        found.reverse()
-        try:
-            sights, which, frames = decode_joined([packed for _, packed in found])
-        except ValueError:  # a damaged entry
-            sound = {number: packed for number, packed in stored.items() if _is_sound(packed)}
-            if len(sound) == len(stored):
-                raise
-            return self._read(segment, valid, sound)
-        # Bags in which no detector published add nothing, and a week has thousands.
-        return _Part(sights, tuple(frames), tuple(found[nth][0] for nth in which))
-
-    def _made(self, bag: BagFile) -> bytes | None:
-        """Returns the sights of a bag without an entry; None where there is no time to read it."""
-        memory = self._view.memory
-        stat = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, bag.end)
-        key = (*stat, self._maps.statics.of(bag).key, memory.limits.map_frame, id(memory.reader))
-        known = _CACHE.sights.get(key)
-        if known is not None:
-            return known
-        if self._reading is None:
-            self._reading = self._view.call.partial_after(READING_S)
-        if self._reading.expired():
-            return None
-        before = self._view.notes.added
-        try:
-            digest = self._maps.made(bag, DetectorSights(memory.reader, memory.extractor))
-        except QueryTimeoutError:
-            return None
-        if bag.state is not BagState.ACTIVE and self._view.notes.added == before:
-            _CACHE.sights.put(key, digest.sights, len(digest.sights) + _ENTRY_BYTES)
-        return digest.sights
-
-    def _epochs(
-        self, frames: Sequence[str], bags: Sequence[BagFile]
-    ) -> tuple[list[int], tuple[str, ...]]:
-        """Returns the epoch of each bag, and the frame of each epoch.
-
-        All bags in the map are of epoch 0. Odometry starts again in each session.
+        All that is in the map is of epoch 0. Odometry starts again in each session.
         """
         in_map = self._view.memory.limits.map_frame
-        sessions = sessions_of(self._view)
-        known: dict[object, int] = {in_map: 0}
+        known: dict[Hashable, int] = {(in_map, None): 0}
         names = [in_map or ""]
         epochs = []
-        for frame, bag in zip(frames, bags, strict=True):
-            key: object = frame if frame == in_map else (frame, sessions.of(bag.recording))
+        for stretch in stretches:
+            key = (stretch.frame_id, stretch.session)
             if key not in known:
                 known[key] = len(known)
-                names.append(frame)
+                names.append(stretch.frame_id)
             epochs.append(known[key])
         return epochs, tuple(names)
 
 
-def _within(parts: Sequence[_Part], most: int) -> list[_Part]:
+def _spots(part: Sequence[Stretch]) -> int:
+    return sum(len(sights.spots) for stretch in part for sights in stretch.sights)
+
+
+def _within(parts: Sequence[list[Stretch]], most: int) -> list[list[Stretch]]:
     """Returns the newest parts that have at most so many spots, at least one."""
-    spots = accumulate(len(part.sights.spots) for part in reversed(parts))
-    return [*parts[-max(sum(each <= most for each in spots), 1) :]]
-
-
-def _is_sound(packed: bytes) -> bool:
-    """Returns whether stored bytes are sights."""
-    try:
-        decode_sights(packed)
-    except ValueError:
-        return False
-    return True
+    spots = accumulate(_spots(part) for part in reversed(parts))
+    return [*parts[-max(sum(count <= most for count in spots), 1) :]]

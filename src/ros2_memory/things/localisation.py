@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.analysis.sights import AHEAD_MM, Fix, Look, Spot
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.things.sights import AHEAD_MM, Fix, Look, Spot
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.things.sights import Ints, Sights
+    from ros2_memory.analysis.sights import Ints, Sights
 
     Flags = NDArray[np.bool_]
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.things.sights import Ints
+    from ros2_memory.analysis.sights import Ints
 
     Floats = NDArray[np.float64]
 

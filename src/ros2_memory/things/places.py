@@ -7,17 +7,16 @@ far detections overlaps.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from ros2_memory.core.arrays import distinct_rows
 
+if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.things.sights import Ints
+    from ros2_memory.analysis.sights import Ints
 
     Floats = NDArray[np.float64]
 
@@ -35,7 +34,6 @@ _SCATTER_MM: Final = 800
 _FEW: Final = 25.0
 """So few detections, far away, may scatter as widely."""
 _MAX_PLACES: Final = 512
-_MOST_KEYS: Final = 2**62
 _FULL_WEIGHT: Final = 10
 """A spot of more detections weighs no more: all of one bag share its error of localisation."""
 
@@ -109,21 +107,6 @@ def _density(cells: Ints, mass: Floats) -> Floats:
                 # Whole numbers, whose sums do not depend on their order.
                 density += np.where(ordered[at] == near, mass[order[at]], 0.0)
     return density
-
-
-def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """Returns the distinct rows of some columns in order, and the number of each row among them."""
-    lows = [int(each.min(initial=0)) for each in columns]
-    sizes = [int(each.max(initial=0)) - low + 1 for each, low in zip(columns, lows, strict=True)]
-    if math.prod(sizes) >= _MOST_KEYS:
-        rows, number = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
-        return rows, number.reshape(-1)
-    # One number for each row, in the order of the rows: sorting rows takes ten times as long.
-    keys = np.zeros(len(columns[0]), np.int64)
-    for each, low, size in zip(columns, lows, sizes, strict=True):
-        keys = keys * size + (each - low)
-    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
-    return np.stack([each[first] for each in columns], axis=1), number.reshape(-1)
 
 
 def _away_squared(points: Floats, middle: Floats) -> Floats:

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.things.places import distinct_rows
-from ros2_memory.things.sights import CELL_DECIDEG, CELL_MM, Hit, Look
+from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Look
+from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.things.sights import Ints, Sights
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.analysis.sights import Beside, Spot
 from ros2_memory.things.labels import last_word, moves_by_itself
 from ros2_memory.things.moves import visits_of
 from ros2_memory.things.places import places_of
-from ros2_memory.things.sights import Beside, Spot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.things.labels import Labels
-    from ros2_memory.things.sights import Ints, Sights
 
 _FEWEST: Final = 3
 _BESIDE_SHARE: Final = 0.02

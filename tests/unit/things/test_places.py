@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.things.places import distinct_rows
+from ros2_memory.core.arrays import distinct_rows
 
 _NUMBERS = st.integers(-5, 5) | st.integers(-(2**40), 2**40)
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.things.places import distinct_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -293,7 +293,7 @@ def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
     _, number = distinct_rows((slices[known], *cells))
     look = np.full(len(seen.times), -1, np.int64)
     look[known] = number
-    by = _Groups.of(number)
+    by = Groups.of(number)
     means = [by.sums(column) // by.sizes for column in columns]
     first, last = by.ends(_rounded(seen.times[known]))
     slices = slices[known][by.firsts]
@@ -432,7 +432,7 @@ def _merged(spots: Sequence[_Growing], together: Mapping[tuple[int, int], int]) 
 
 
 def _spots(found: _Detections, spot: Ints, times: Ints, together: Ints) -> Ints:
-    by = _Groups.of(spot)
+    by = Groups.of(spot)
     n, of = by.sizes, by.firsts
     x, y, z = (by.sums(column) // n for column in (found.x, found.y, found.z))
     # From the first of each: squares of far places are more than 63 bits.
@@ -449,7 +449,7 @@ def _spots(found: _Detections, spot: Ints, times: Ints, together: Ints) -> Ints:
 
 def _unplaced(lost: _Detections, times: Ints) -> Ints:
     rows, group = distinct_rows((lost.slice, lost.label))
-    by = _Groups.of(group)
+    by = Groups.of(group)
     first, last = by.ends(_rounded(times[lost.message]))
     topic = np.zeros(len(rows), np.int64)
     return np.stack((rows[:, 0], topic, rows[:, 1], by.sizes, first, last), axis=1)
@@ -478,42 +478,6 @@ def _tallied(one: Ints, other: Ints) -> Ints:
     """Returns the distinct pairs, and how often there is each."""
     rows, nth = distinct_rows((one, other))
     return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
-
-
-class _Groups(NamedTuple):
-    """Rows by their group, numbered from 0 without a gap.
-
-    Attributes:
-        order: the rows by group, those of one in their order.
-        begins: where each group begins in it.
-        sizes: how many rows each has.
-    """
-
-    order: Ints
-    begins: Ints
-    sizes: Ints
-
-    @classmethod
-    def of(cls, group: Ints) -> _Groups:
-        """Returns the groups of rows."""
-        sizes = np.bincount(group).astype(np.int64)
-        return cls(np.argsort(group, kind="stable"), np.cumsum(sizes) - sizes, sizes)
-
-    @property
-    def firsts(self) -> Ints:
-        """The first row of each group."""
-        return self.order[self.begins]
-
-    def sums(self, values: Ints) -> Ints:
-        """Returns the sum of each group."""
-        return np.add.reduceat(values[self.order], self.begins) if len(values) else values
-
-    def ends(self, values: Ints) -> tuple[Ints, Ints]:
-        """Returns the least and the greatest of each group."""
-        ordered = values[self.order]
-        if not len(values):
-            return ordered, ordered
-        return np.minimum.reduceat(ordered, self.begins), np.maximum.reduceat(ordered, self.begins)
 
 
 def _mm(metres: Floats) -> Ints:

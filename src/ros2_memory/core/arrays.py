@@ -1,0 +1,67 @@
+"""Groups of rows of arrays."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Ints: TypeAlias = NDArray[np.int64]
+
+_MOST_KEYS: Final = 2**62
+
+
+def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
+    """Returns the distinct rows of some columns in order, and the number of each row among them."""
+    lows = [int(each.min(initial=0)) for each in columns]
+    sizes = [int(each.max(initial=0)) - low + 1 for each, low in zip(columns, lows, strict=True)]
+    if math.prod(sizes) >= _MOST_KEYS:
+        rows, number = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
+        return rows, number.reshape(-1)
+    # One number for each row, in the order of the rows: sorting rows takes ten times as long.
+    keys = np.zeros(len(columns[0]), np.int64)
+    for each, low, size in zip(columns, lows, sizes, strict=True):
+        keys = keys * size + (each - low)
+    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
+    return np.stack([each[first] for each in columns], axis=1), number.reshape(-1)
+
+
+class Groups(NamedTuple):
+    """Rows by their group, numbered from 0 without a gap.
+
+    Attributes:
+        order: the rows by group, those of one in their order.
+        begins: where each group begins in it.
+        sizes: how many rows each has.
+    """
+
+    order: Ints
+    begins: Ints
+    sizes: Ints
+
+    @classmethod
+    def of(cls, group: Ints) -> Groups:
+        """Returns the groups of rows."""
+        sizes = np.bincount(group).astype(np.int64)
+        return cls(np.argsort(group, kind="stable"), np.cumsum(sizes) - sizes, sizes)
+
+    @property
+    def firsts(self) -> Ints:
+        """The first row of each group."""
+        return self.order[self.begins]
+
+    def sums(self, values: Ints) -> Ints:
+        """Returns the sum of each group."""
+        return np.add.reduceat(values[self.order], self.begins) if len(values) else values
+
+    def ends(self, values: Ints) -> tuple[Ints, Ints]:
+        """Returns the least and the greatest of each group."""
+        ordered = values[self.order]
+        if not len(values):
+            return ordered, ordered
+        return np.minimum.reduceat(ordered, self.begins), np.maximum.reduceat(ordered, self.begins)
