@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS
-from ros2_memory.columns.detections import DetectionColumns, detections_by
+from ros2_memory.columns.detections import DetectionColumns, detections_by, joined_detections
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.history.scan import messages_of
@@ -15,6 +15,8 @@ from ros2_memory.messages.conversions import nanoseconds
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.columns.detections import Detections
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
@@ -38,6 +40,23 @@ class Detected(NamedTuple):
     log_times: IntArray
     times: IntArray
     found: Detections
+
+
+def joined_detected(parts: Sequence[Detected]) -> Detected:
+    """Returns messages of tables of one topic together; `parts` is not empty."""
+    if len(parts) == 1:
+        return parts[0]
+    log_times = np.concatenate([part.log_times for part in parts])
+    order = np.argsort(log_times, kind="stable")
+    position = np.empty(order.size, np.int64)
+    position[order] = np.arange(order.size)
+    begins = np.cumsum([0, *(part.log_times.size for part in parts)]).tolist()
+    found = [
+        part.found._replace(rows=position[part.found.rows + begin])
+        for part, begin in zip(parts, begins[:-1], strict=True)
+    ]
+    times = np.concatenate([part.times for part in parts])[order]
+    return Detected(log_times[order], times, joined_detections(found))
 
 
 class DetectionRows:

@@ -25,7 +25,7 @@ from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, Sights, fixes_
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.detections import DetectionRows
+from ros2_memory.history.detections import DetectionRows, joined_detected
 from ros2_memory.history.frames import frames_over
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import messages_of, scan
@@ -186,20 +186,17 @@ class Watching:
         self, window: TimeWindow, own: Session, among: Session, found: Sequence[tuple[str, Rows]]
     ) -> Stretch:
         by_topic: dict[str, list[Detected]] = defaultdict(list)
-        for topic, rows in found:
+        for topic, rows in sorted(found, key=_place_of):
             by_topic[topic].append(self._rows.of(rows))
         poses = self._poses(own, window)
         target, frames = self._frames(among, window, poses)
-        sights = [
-            sights_of(topic, _seen(each, poses, frames))
-            for topic, parts in by_topic.items()
-            for each in parts
-        ]
+        detected = {topic: joined_detected(parts) for topic, parts in by_topic.items()}
+        sights = [sights_of(topic, _seen(each, poses, frames)) for topic, each in detected.items()]
         in_map = target == self._view.memory.limits.map_frame
         own_frame = poses.frames.words[0] if len(poses) else ""
         if in_map and own_frame:
-            times = [each.log_times for parts in by_topic.values() for each in parts]
-            sights.append(self._fixes(own, own_frame, frames, np.concatenate(times)))
+            times = np.concatenate([each.log_times for each in detected.values()])
+            sights.append(self._fixes(own, own_frame, frames, times))
         return Stretch(window.start, target, None if in_map else own, tuple(sights))
 
     def _poses(self, own: Session, window: TimeWindow) -> Poses:
@@ -319,6 +316,12 @@ def _divided(rows: Rows) -> Iterator[tuple[int, Rows]]:
     numbers = rows.times // STRETCH_NS
     for number in np.unique(numbers).tolist():
         yield number, rows.some(np.flatnonzero(numbers == number))
+
+
+def _place_of(found: tuple[str, Rows]) -> tuple[Ns, Ns, str]:
+    """Returns what orders tables, however they are stored."""
+    _, rows = found
+    return rows.first, rows.last, str(rows.recording)
 
 
 def _identity(bag: BagFile) -> tuple[str, int, int, int | None]:
