@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
@@ -23,12 +22,6 @@ from ros2_memory.analysis.frames import (
     unit_quaternions,
 )
 from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.robot_track import (
-    RobotTrack,
-    decode_tracks,
-    encode_track,
-    track_of,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -45,7 +38,6 @@ ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
 _NEAR_NS: Final[Ns] = 1_000_000_000
 """Between two poses that are farther apart, where the robot was is not known."""
 _FLAT: Final = (0.0, 0.0, 0.0, 1.0)
-_HEAD: Final = struct.Struct("<IHI")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,21 +83,12 @@ class MapDigest:
     """What is stored of a bag about the map.
 
     Attributes:
-        frame_id: of the track and of the sights: the map, or the poses' own frame where transforms
-            of the bag lead to no map; empty without a pose.
         statics: the hash of the static transforms that it was made with.
-        track: of the robot.
-        left_out: how many poses could not be placed.
         sights: what `SightsSource.digest` returned; empty without a builder.
-        own: the same in the poses' own frame, without sights; None where `frame_id` is that.
     """
 
-    frame_id: str
     statics: int
-    track: RobotTrack
-    left_out: int = 0
     sights: bytes = b""
-    own: MapDigest | None = None
 
 
 class RobotPoses(NamedTuple):
@@ -243,22 +226,11 @@ class MapCollector:
 
     def digest(self, statics: Statics) -> MapDigest:
         """Returns the digest of all that was added."""
-        placed, frame_id, own = self._placed(statics)
-        track = track_of(placed.times, placed.x, placed.y, placed.heading)
-        return MapDigest(
-            frame_id,
-            statics.key,
-            track,
-            len(self._times) - len(placed.times),
-            b"" if self.sights is None else self.sights.digest(placed),
-            own,
-        )
+        sights = b"" if self.sights is None else self.sights.digest(self._placed(statics))
+        return MapDigest(statics.key, sights)
 
-    def _placed(self, statics: Statics) -> tuple[PlacedPoses, str, MapDigest | None]:
-        """Returns the poses in the map, or in their own frame; and the name of that frame.
-
-        With them, where they are in the map, the digest of them in their own frame.
-        """
+    def _placed(self, statics: Statics) -> PlacedPoses:
+        """Returns the poses in the map, or in their own frame."""
         # Poses of one topic nearly always have one frame: those of others are left out.
         own = max(self._frames, key=lambda each: self._frames[each], default="")
         clock = self._settings.tf_clock
@@ -285,17 +257,12 @@ class MapCollector:
         x, y, z, qx, qy, qz, qw = numbers.T
         poses = frames.poses(own, times)
         turned = np.array([pose.orientation is not None for _, pose in pairs], np.bool_)
-        in_own: MapDigest | None = None
-        if self._poses and target != own:
-            track = track_of(times, x, y, _heading((qx, qy, qz, qw), turned))
-            in_own = MapDigest(own, statics.key, track, len(self._times) - len(times))
         if poses is None:
-            return PlacedPoses(frames, own, times[:0], x[:0], y[:0], x[:0]), target, in_own
+            return PlacedPoses(frames, own, times[:0], x[:0], y[:0], x[:0])
         px, py, _ = poses.points((x, y, z))
         heading = _heading(multiply(poses.rotation, (qx, qy, qz, qw)), turned)
         valid = poses.valid
-        placed = PlacedPoses(frames, own, times[valid], px[valid], py[valid], heading[valid])
-        return placed, target, in_own
+        return PlacedPoses(frames, own, times[valid], px[valid], py[valid], heading[valid])
 
 
 def _heading(rotations: Rotations, known: Mask) -> Floats:
@@ -303,50 +270,3 @@ def _heading(rotations: Rotations, known: Mask) -> Floats:
     x, y, z, w = rotations
     heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return np.where(known, heading, np.nan)
-
-
-def encode_map_track(digest: MapDigest) -> bytes:
-    """Encodes the tracks of a map digest, with their frames; all else has columns of its own.
-
-    The one in the poses' own frame follows: mostly its times are those of the other, so together
-    they are packed into little more than one of them.
-    """
-    frame = digest.frame_id.encode("utf-8", "surrogatepass")
-    track = encode_track(digest.track)
-    own = b"" if digest.own is None else encode_map_track(digest.own)
-    return b"".join((_HEAD.pack(digest.left_out, len(frame), len(track)), frame, track, own))
-
-
-def decode_map_tracks(stored: Sequence[tuple[bytes, int]], *, own: bool = False) -> list[MapDigest]:
-    """Decodes map digests, with nothing but their tracks; with `own` in the poses' own frame.
-
-    Each comes with the hash of its statics.
-
-    Raises:
-        ValueError: some of the bytes are not valid.
-    """
-    heads, frames, packed = [], [], []
-    for each, _ in stored:
-        head, frame, track, rest = _split(each)
-        if own and rest:
-            head, frame, track, _ = _split(rest)
-        heads.append(head)
-        frames.append(frame.decode("utf-8", "surrogatepass"))
-        packed.append(track)
-    rows = zip(frames, stored, decode_tracks(packed), heads, strict=True)
-    return [MapDigest(frame, statics, track, left) for frame, (_, statics), track, left in rows]
-
-
-def _split(packed: bytes) -> tuple[int, bytes, bytes, bytes]:
-    """Returns how many poses could not be placed, the frame, the track and what follows.
-
-    Raises:
-        ValueError: the bytes are no map digest.
-    """
-    try:
-        left_out, frame_size, track_size = _HEAD.unpack_from(packed)
-    except struct.error as error:
-        raise ValueError(f"not a map digest: {error}") from error
-    begin = _HEAD.size + frame_size
-    end = begin + track_size
-    return left_out, packed[_HEAD.size : begin], packed[begin:end], packed[end:]

@@ -16,7 +16,6 @@ from ros2_memory.catalogue.codec import (
     encode_schema,
     encode_standstills,
 )
-from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 from ros2_memory.columns.database import ROW_ID_BITS, Tables
 
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 TABLES: Final = Tables(
-    version=13,
+    version=14,
     names=(
         "bags",
         "held",
@@ -56,7 +55,7 @@ CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, l
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
-CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL,
+CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL,
   sights BLOB NOT NULL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
@@ -85,14 +84,12 @@ STANDSTILLS: Final = "rests"
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
-TRACK: Final = "track"
 SIGHTS: Final = "sights"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
     POSES: "held",
     STANDSTILLS: "tales",
-    TRACK: "maps",
     SIGHTS: "maps",
     COUNTS: "bags",
 }
@@ -254,11 +251,10 @@ def insert_entry(
 
 def _insert_map(connection: sqlite3.Connection, bag: int, digest: MapDigest) -> None:
     connection.execute(
-        "INSERT INTO maps VALUES (?, ?, ?, ?)",
+        "INSERT INTO maps VALUES (?, ?, ?)",
         (
             bag,
             digest.statics,
-            packed_by_model(connection, NO_TOPIC, TRACK, encode_map_track(digest)),
             packed_by_model(connection, NO_TOPIC, SIGHTS, digest.sights),
         ),
     )

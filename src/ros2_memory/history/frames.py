@@ -34,12 +34,24 @@ def transform_rows(
     """
     sessions = sessions_of(view)
     for rows in scan(view, topic, window, copies=True):
-        if sessions.holds_carried(rows.recording):
-            found = (each for each in messages_of(view, rows) if sessions.has(among, each))
-            yield rows, _by_message(view, found)
-        elif sessions.folder(rows.recording) in among:
-            edges = edges_in(rows.table, rows.times, rows.index)
-            yield rows, _by_message(view, messages_of(view, rows)) if edges is None else edges
+        if sessions.holds_carried(rows.recording) or sessions.folder(rows.recording) in among:
+            yield rows, edges_of_rows(view, rows, among)
+
+
+def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
+    """Returns the transforms of a session in some rows, by their columns, else by their messages.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    sessions = sessions_of(view)
+    if sessions.holds_carried(rows.recording):
+        found = (each for each in messages_of(view, rows) if sessions.has(among, each))
+        return _by_message(view, found)
+    if sessions.folder(rows.recording) not in among:
+        return {}
+    edges = edges_in(rows.table, rows.times, rows.index)
+    return _by_message(view, messages_of(view, rows)) if edges is None else edges
 
 
 def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:
