@@ -548,15 +548,9 @@ def build_filling(settings: Settings, memory: Memory) -> Filling | None:
 def build_digester(memory: Memory) -> Digester:
     """Returns what digests the bags of a memory."""
     from ros2_memory.catalogue.digest import Digester
-    from ros2_memory.places.map_digests import map_settings
 
     limits = memory.limits
-    return Digester(
-        memory.reader,
-        memory.extractor,
-        limits.max_plausible_speed_mps,
-        map_settings(limits),
-    )
+    return Digester(memory.reader, memory.extractor, limits.max_plausible_speed_mps)
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:

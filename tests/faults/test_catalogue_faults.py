@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, NoReturn
 import anyio
 import pytest
 import structlog
+from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.columns.database import RETRY_S
 from ros2_memory.core.errors import BagError

@@ -25,10 +25,7 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import View
 from ros2_memory.index.scan import BAG_DIR_SETTING
-from ros2_memory.places.bag_statics import BagStatics
-from ros2_memory.places.map_digests import map_settings
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -105,19 +102,11 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     catalogue = Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test"))
     recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
-    digester = Digester(
-        memory.reader,
-        memory.extractor,
-        limit,
-        map_settings(memory.limits),
-    )
-    statics = BagStatics(View(memory, Call()))
+    digester = Digester(memory.reader, memory.extractor, limit)
     bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)
     for bag in bags[: round(part * len(bags))]:
         with suppress(BagError):  # one that is damaged inside stays without an entry
-            assert catalogue.put(
-                BagKey.of(bag, bag_dir), digester.digest(bag.path, statics.of(bag))
-            )
+            assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))
     return replace(memory, recall=recall, columns=stored_columns(memory, bag_dir, part=part))
 
 

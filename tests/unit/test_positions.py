@@ -363,17 +363,17 @@ def test_the_path_by_transforms_is_that_by_poses(tmp_path: Path, recalls: bool) 
     assert (there[0]["place"], there[0]["entries"]) == ("door", 1)
 
 
-def test_a_path_by_transforms_has_a_bound(tmp_path: Path) -> None:
+def test_a_path_by_transforms_has_a_bound_but_visits_have_none(tmp_path: Path) -> None:
     for nth in range(130):
         at = T0 + nth * 10 * S
         moved = [
             tf(at + n * S, transform(at + n * S, "odom", "base_link", (0, 0, 0))) for n in range(2)
         ]
         write_mcap(tmp_path / "rec_0" / f"rec_0_{nth}.mcap", moved)
-    refused = ask(tmp_path, False, "visits", x=0.0, y=0.0)
+    refused = ask(tmp_path, False, "trajectory_summary", start=T0_S, end=T0_S + 1300)
     assert refused["error"] == "invalid_arguments"
     assert "read from 128 bags at most: these are 130; ask about a shorter" in refused["detail"]
-    assert ask(tmp_path, False, "visits", x=0.0, y=0.0, start=T0_S, end=T0_S + 99)["total"] == 1
+    assert ask(tmp_path, False, "visits", x=0.0, y=0.0)["total"] == 1
 
 
 def test_the_body_is_placed_in_the_map_and_in_a_named_place(tmp_path: Path) -> None:

@@ -153,6 +153,10 @@ class Frames:
         moving: the moving ones of the times that are asked about, and of what they need around.
         target: the frame in which the others are looked up.
         clock: which time of the transforms counts; None: as `agreeing_clock` finds.
+
+    Attributes:
+        target: the name of that frame.
+        clock: which time counts.
     """
 
     def __init__(
@@ -163,10 +167,11 @@ class Frames:
         clock: TfClock | None = None,
     ) -> None:
         self.target = target.lstrip("/")
-        chosen: TfClock = clock or _agreeing(moving.values())
+        moving = {pair: edge for pair, edge in moving.items() if all(pair)}
+        self.clock: TfClock = clock or _agreeing(moving.values())
         self._changes = static_changes(static)
         self._periods = [
-            _Period(static_at(static, since), moving, self.target, chosen)
+            _Period(static_at(static, since), moving, self.target, self.clock)
             for since in (MIN_NS, *self._changes)
         ]
 

@@ -6,11 +6,10 @@ certain the bag is read. Pure: reads through the port, stores nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.payload_templates import Templates
-from ros2_memory.catalogue.map_digest import NO_STATICS, MapCollector, MapSettings
 from ros2_memory.catalogue.topic_digest import TopicCollector
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
@@ -18,7 +17,6 @@ from ros2_memory.core.model import TimeWindow
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.catalogue.map_digest import MapDigest, Statics
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
@@ -31,7 +29,6 @@ _MESSAGE_BYTES: Final = 200
 """Counted for each message besides its payload, since decoding it takes time too."""
 _MAX_EXPANSION: Final = 100
 """A bag whose messages decompress to more times its size is not digested."""
-_DEFAULT_MAP: Final = MapSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,17 +37,15 @@ class Digest:
 
     summary: BagSummary
     topics: tuple[TopicDigest, ...]
-    in_map: MapDigest | None = None
 
 
 class Digester:
-    """Builds digests; equal ones for the same bag and the same static transforms.
+    """Builds digests; equal ones for the same bag.
 
     Args:
         reader: gives the messages that count.
         extractor: gives the values that conditions are tested on.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
-        map_settings: which topics place the robot.
     """
 
     def __init__(
@@ -58,16 +53,14 @@ class Digester:
         reader: BagReader,
         extractor: SchemaExtractor,
         max_plausible_speed_mps: float,
-        map_settings: MapSettings = _DEFAULT_MAP,
     ) -> None:
         self._reader = reader
-        self._map_settings = map_settings
         self._extractor = extractor
         self._templates = Templates(reader, extractor)
         self._max_plausible_speed_mps = max_plausible_speed_mps
 
-    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
-        """Reads a bag and returns its digest, given the static transforms in force.
+    def digest(self, path: Path) -> Digest:
+        """Reads a bag and returns its digest.
 
         Raises:
             BagVanishedError: the file is gone.
@@ -77,10 +70,6 @@ class Digester:
         latched: dict[str, bool] = {}
         for each in summary.topics:
             latched[each.topic] = latched.get(each.topic, False) or each.latched
-        settings = self._map_settings
-        if statics.poses is not None:
-            settings = replace(settings, pose_topic=statics.poses)
-        in_map = MapCollector(settings)
         collectors = {
             topic: TopicCollector(
                 topic,
@@ -89,7 +78,6 @@ class Digester:
                 self._templates,
                 self._max_plausible_speed_mps,
                 latched=is_latched,
-                in_map=in_map,
             )
             for topic, is_latched in latched.items()
         }
@@ -102,7 +90,7 @@ class Digester:
             add[record.channel.topic](record)
         reasons = self._reasons(path)
         topics = tuple(each.digest(reasons.get(topic, {})) for topic, each in collectors.items())
-        return Digest(summary, topics, in_map.digest(statics))
+        return Digest(summary, topics)
 
     def _reasons(self, path: Path) -> dict[str, dict[str, str]]:
         """Returns, by topic and type, why messages cannot be decoded."""

@@ -45,7 +45,6 @@ class SegmentDigests:
         numbers: by file, the number of its entry.
         whole: whether every bag of the segment has an entry.
         as_of: the state of the catalogue when the entries were looked up.
-        is_outdated: whether some entry is to be replaced by another of the same bag.
     """
 
     def __init__(self, cache: DigestCache, segment: Segment, as_of: int) -> None:
@@ -65,7 +64,6 @@ class SegmentDigests:
             if (number := by_path.get(bag.file, bag.entry)) is not None
         }
         self.whole = len(self.numbers) == len(segment.bags)
-        self.is_outdated = False
         every = [*self.numbers.values()]
         self._with_topic: dict[str, list[int]] = {
             # Most topics are in all bags: these share one list.
@@ -83,7 +81,7 @@ class SegmentDigests:
     @property
     def is_complete(self) -> bool:
         """Whether no later state of the catalogue adds to this."""
-        is_final = self.whole and not self.is_outdated
+        is_final = self.whole
         return is_final and self.catalogue.is_current(self.as_of)
 
     def words(self, topic: str) -> Mapping[int, str | None]:
@@ -135,10 +133,6 @@ class SegmentDigests:
             self._held = sum(len(each) for by_entry in held for each in by_entry.values())
         self._cache.touch(self, self._held)
         return found
-
-    def map_keys(self) -> Mapping[int, int]:
-        """Returns, by entry, the hash of the static transforms its map digest was made with."""
-        return self.derived("map keys", lambda: self.catalogue.map_keys([*self.numbers.values()]))
 
     def derived(self, name: str, compute: Callable[[], T]) -> T:
         """Returns a value computed once from the entries of this segment, by name.

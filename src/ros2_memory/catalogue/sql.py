@@ -16,7 +16,6 @@ from ros2_memory.catalogue.codec import (
     encode_schema,
     encode_standstills,
 )
-from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 from ros2_memory.columns.database import ROW_ID_BITS, Tables
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
     from ros2_memory.catalogue.digest import Digest
-    from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.storage.base import Record
 
@@ -40,7 +38,6 @@ TABLES: Final = Tables(
         "channels",
         "edges",
         "shapes",
-        "maps",
         "models",
         "configs",
     ),
@@ -56,7 +53,6 @@ CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, l
 CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
-CREATE TABLE maps (bag INTEGER PRIMARY KEY, statics INTEGER NOT NULL, track BLOB NOT NULL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
   log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
@@ -84,13 +80,11 @@ STANDSTILLS: Final = "rests"
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
-TRACK: Final = "track"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
     POSES: "held",
     STANDSTILLS: "tales",
-    TRACK: "maps",
     COUNTS: "bags",
 }
 """The table in whose column of that name what is packed of a kind lies; answers lie elsewhere."""
@@ -196,7 +190,6 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
                 (topic << ROW_ID_BITS, listed),
             )
         connection.execute(f"DELETE FROM kept WHERE topic = ? AND bag {_AMONG}", (topic, listed))
-    connection.execute(f"DELETE FROM maps WHERE bag {_AMONG}", (listed,))
     connection.execute(f"DELETE FROM bags WHERE id {_AMONG}", (listed,))
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
@@ -222,7 +215,6 @@ def renew_entry(connection: sqlite3.Connection, row_id: int, sidecar: int) -> No
         connection.execute(
             "UPDATE kept SET bag = ? WHERE topic = ? AND bag = ?", (new, topic, row_id)
         )
-    connection.execute("UPDATE maps SET bag = ? WHERE bag = ?", (new, row_id))
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
 
@@ -239,34 +231,12 @@ def insert_entry(
         (own, *key, schema, packed_by_model(connection, schema, COUNTS, counts)),
     )
     bag = int(cursor.lastrowid or 0)
-    if digest.in_map is not None:
-        _insert_map(connection, bag, digest.in_map)
     for topic in digest.topics:
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
         _insert_standstills(connection, (number, bag), topic)
         for nth, record in enumerate(topic.kept or ()):
             _insert_record(connection, (bag, number, nth), record)
-
-
-def _insert_map(connection: sqlite3.Connection, bag: int, digest: MapDigest) -> None:
-    connection.execute(
-        "INSERT INTO maps VALUES (?, ?, ?)",
-        (
-            bag,
-            digest.statics,
-            packed_by_model(connection, NO_TOPIC, TRACK, encode_map_track(digest)),
-        ),
-    )
-
-
-def map_rows(
-    connection: sqlite3.Connection, columns: str, row_ids: Sequence[int]
-) -> list[sqlite3.Row]:
-    """Returns row id, key of the static transforms, and these columns of map digests."""
-    return connection.execute(
-        f"SELECT bag, statics, {columns} FROM maps WHERE bag {_AMONG}", (json.dumps(row_ids),)
-    ).fetchall()
 
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:

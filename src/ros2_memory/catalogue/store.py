@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import os
 import time
-from functools import partial
 from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -23,7 +22,6 @@ from ros2_memory.catalogue.codec import (
     decode_standstills,
 )
 from ros2_memory.catalogue.digest_config import may_be_one
-from ros2_memory.catalogue.map_digest import decode_map_tracks
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.sql import (
     COUNTS,
@@ -34,14 +32,12 @@ from ros2_memory.catalogue.sql import (
     RELATCHED,
     STANDSTILLS,
     TABLES,
-    TRACK,
     UNDECODABLE,
     any_is_gone,
     delete_entries,
     entry_rows,
     existing_rows,
     insert_entry,
-    map_rows,
     message_rows,
     model_of,
     packed_by_model,
@@ -69,7 +65,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.digest_config import DigestConfig
-    from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.core.timebase import Ns
 
 FOLDER: Final = ".episodic"
@@ -228,33 +223,6 @@ class Catalogue(Database):
             return EdgeDigest(pairs[text], first, last)
 
         return self._of_topic(topic, numbers, EDGES, decode)
-
-    def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
-        """Returns the map digests of entries, with only their track.
-
-        With `own` in the poses' own frame.
-        """
-        return self._of_map(numbers, TRACK, partial(decode_map_tracks, own=own))
-
-    def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
-        """Returns, by entry, the hash of the static transforms its map digest was made with."""
-        return self._of_map(numbers, "x''", lambda rows: [key for _, key in rows])
-
-    def _of_map(
-        self,
-        numbers: Sequence[int],
-        column: str,
-        decode: Callable[[Sequence[tuple[bytes, int]]], Sequence[T]],
-    ) -> dict[int, T]:
-        """Decodes a column of map digests, all with their hashes at once, by entry."""
-
-        def ask(connection: sqlite3.Connection) -> dict[int, T]:
-            model = model_of(connection, NO_TOPIC, column)
-            rows = map_rows(connection, column, self.row_ids(numbers))
-            found = decode([(unpacked(stored, model), int(key)) for _, key, stored in rows])
-            return {self.offset + row[0]: each for row, each in zip(rows, found, strict=True)}
-
-        return self.read(ask, {})
 
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns, by message type, why messages of the topic cannot be decoded; mostly nothing."""

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
-    from ros2_memory.catalogue.map_digest import MapCollector
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
@@ -91,7 +90,6 @@ class TopicCollector:
         templates: of the same reader and extractor.
         max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         latched: whether its messages are stored whole where they are few.
-        in_map: takes the robot's poses and moving transforms of all topics of the bag.
     """
 
     def __init__(
@@ -103,12 +101,8 @@ class TopicCollector:
         max_plausible_speed_mps: float,
         *,
         latched: bool,
-        in_map: MapCollector | None = None,
     ) -> None:
         self._topic = topic
-        self._map = in_map
-        self._map_poses = in_map is not None and in_map.has_poses(topic)
-        self._map_transforms = in_map is not None and in_map.has_transforms(topic)
         self._reader = reader
         self._extractor = extractor
         self._templates = templates
@@ -179,7 +173,6 @@ class TopicCollector:
         batch, self._batch, self._batch_bytes = self._batch, [], 0
         if batch:
             self._ends = (batch[0] if self._ends is None else self._ends[0], batch[-1])
-        map_poses = self._map if self._map_poses else None
         samples = self._decoder.decode(batch)
         for record, sample in zip(batch, samples, strict=True):
             if isinstance(sample, UndecodableError):
@@ -190,8 +183,6 @@ class TopicCollector:
             if pose is None:
                 self._poses = None
                 continue
-            if map_poses is not None:
-                map_poses.add_pose(time, pose)
             if self._poses is not None:
                 self._poses.add(time, pose, sample.speed_mps)
                 if is_place(pose.position):
@@ -202,15 +193,13 @@ class TopicCollector:
         type_name = record.channel.type
         message = self._reader.decode(record)
         pairs = None
-        if self._pairs is not None or self._map_transforms:
+        if self._pairs is not None:
             pairs = self._add_transforms(self._transforms(message, record))
         motion = motion_sample(self._extractor, message, type_name)
         return _Sample(*motion, pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
         """Takes the valid transforms of a message, and returns their frames."""
-        if self._map is not None and self._map_transforms:
-            self._map.add_transforms(transforms)
         pairs = frozenset([(each.parent, each.child) for each in transforms])
         if self._pairs is not None and pairs:
             self._pairs |= pairs
@@ -224,10 +213,8 @@ class TopicCollector:
         return template if template is not None and template.pairs == sample.pairs else None
 
     def _apply(
-        self, template: PayloadTemplate, _: _Sample, records: Sequence[Record], rows: Bytes
+        self, template: PayloadTemplate, _: _Sample, __: Sequence[Record], rows: Bytes
     ) -> Iterable[_Sample]:
-        if self._map is not None and self._map_transforms:
-            self._map.add_rows(template, records, rows)
         if template.position is None and template.velocity is None:
             return repeat(_Sample(None, None), len(rows))
         return map(_Sample, template.poses(rows), template.speeds(rows))

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.motion.robot_track import TrackPart
     from ros2_memory.analysis.sights import Sights
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
@@ -161,6 +162,7 @@ class Scanner:
         events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
         static_runs: by part, when its static transforms change.
+        tracks: by part, frame and transforms, where the robot was.
         statics: by session and topics, the static transforms of a timeline.
         sights: by session and ten minutes, with all that they follow from, what detectors saw:
             the frame, the session that it is of, and the tables.
@@ -177,6 +179,7 @@ class Scanner:
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
         self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
+        self.tracks: ByteLru[TrackPart] = ByteLru(32 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
         self.sights: ByteLru[tuple[str, object, tuple[Sights, ...]]] = ByteLru(48 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)

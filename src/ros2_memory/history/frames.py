@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, static_at
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.transforms import edges_in
@@ -34,12 +36,39 @@ def transform_rows(
     """
     sessions = sessions_of(view)
     for rows in scan(view, topic, window, copies=True):
-        if sessions.holds_carried(rows.recording):
-            found = (each for each in messages_of(view, rows) if sessions.has(among, each))
-            yield rows, _by_message(view, found)
-        elif sessions.folder(rows.recording) in among:
-            edges = edges_in(rows.table, rows.times, rows.index)
-            yield rows, _by_message(view, messages_of(view, rows)) if edges is None else edges
+        if sessions.holds_carried(rows.recording) or sessions.folder(rows.recording) in among:
+            yield rows, edges_of_rows(view, rows, among)
+
+
+def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
+    """Returns the transforms of a session in some rows, by their columns, else by their messages.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    sessions = sessions_of(view)
+    if sessions.holds_carried(rows.recording):
+        found = (each for each in messages_of(view, rows) if sessions.has(among, each))
+        return _by_message(view, found)
+    if sessions.folder(rows.recording) not in among:
+        return {}
+    edges = edges_in(rows.table, rows.times, rows.index)
+    return _decoded(view, rows) if edges is None else edges
+
+
+def _decoded(view: View, rows: Rows) -> Edges:
+    """Returns the transforms of rows without columns, from their bags; copies as they are there."""
+    times, channel, parts = rows.times, rows.table.channel, list[Edges]()
+    for bag, positions in rows.bag_rows():
+        first, last = times[positions[0]], times[positions[-1]]
+        for table in view.bags.tables(bag, channel.topic, hashed=False, columns=True):
+            if table.channel.type == channel.type:
+                inside = np.flatnonzero((table.log_times >= first) & (table.log_times <= last))
+                edges = edges_in(table, table.log_times[inside], inside)
+                if edges is None:
+                    return _by_message(view, messages_of(view, rows))
+                parts.append(edges)
+    return joined_edges(parts) if parts else {}
 
 
 def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:

@@ -34,7 +34,7 @@ class PoseRows:
         last: one that none is later than.
     """
 
-    def __init__(self, reader: _Reader, rows: Sequence[Rows]) -> None:
+    def __init__(self, reader: PoseReader, rows: Sequence[Rows]) -> None:
         self.first = min(each.first for each in rows)
         self.last = max(each.last for each in rows)
         self._reader = reader
@@ -76,7 +76,7 @@ def pose_rows(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    reader = _Reader(view, failures)
+    reader = PoseReader(view, failures)
     together: list[Rows] = []
     for rows in scan(view, topic, window, newest_first=newest_first, reached=reached):
         if not among(rows.recording):
@@ -110,8 +110,13 @@ def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
     )
 
 
-class _Reader:
-    """Reads the poses of rows by their columns, else by their messages."""
+class PoseReader:
+    """Reads the poses of rows by their columns, else by their messages.
+
+    Args:
+        view: of the memory.
+        failures: why messages cannot be decoded is added to it.
+    """
 
     def __init__(self, view: View, failures: list[UndecodableError]) -> None:
         self._view = view
@@ -119,6 +124,11 @@ class _Reader:
         self._columns = PoseColumns(view.memory.extractor)
 
     def poses(self, rows: Rows) -> Poses:
+        """Returns the poses of rows, in order of log time.
+
+        Raises:
+            InvalidArgumentsError: messages carry no position.
+        """
         try:
             found = self._columns.of(rows.table, rows.times, rows.index)
         except NoPoseError:

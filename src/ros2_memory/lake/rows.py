@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.frames import static_at
+from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut
 from ros2_memory.analysis.motion.standstills import StandstillBuilder
 from ros2_memory.analysis.motion.trajectory import TrajectoryBuilder
-from ros2_memory.analysis.sights import Spot, decode_sights
+from ros2_memory.analysis.sights import Spot
 from ros2_memory.analysis.state_changes import has_levels
 from ros2_memory.analysis.topic_events import (
     MAX_PER_BAG,
@@ -25,14 +27,13 @@ from ros2_memory.analysis.topic_events import (
     state_of,
 )
 from ros2_memory.catalogue.codec import encode_poses, encode_standstills
-from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import DIGEST_VERSION
-from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call
+from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
 from ros2_memory.lake.event_codec import encode_topic_events
@@ -40,13 +41,16 @@ from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, EmptyRuns, StateRuns, 
 from ros2_memory.lake.tables import TABLES, microseconds, topic_key
 from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
+from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.catalogue.map_digest import MapDigest
+    from ros2_memory.analysis.sights import Sights
     from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
@@ -54,7 +58,7 @@ if TYPE_CHECKING:
     from ros2_memory.lake.tables import Row
     from ros2_memory.storage.base import Record
 
-ROWS_VERSION: Final = 3
+ROWS_VERSION: Final = 5
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 _BLOCK: Final = 1 << 20
 _NO_SCORE: Final = -1
@@ -120,7 +124,9 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Sequence[str] =
     counted = [
         (each.topic, each.type, each.count, each.first, each.last) for each in bag.summary.topics
     ]
-    statics = catalogue.map_keys([number]).get(number)
+    view = View(memory, Call())
+    among = sessions_of(view).lending_to(bag.recording, bag.end)
+    statics = repr(static_at(static_transforms(view, among), bag.end))
     parts = json.dumps([ROWS_VERSION, DIGEST_VERSION, config, statics, sorted(messages), counted])
     return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
@@ -164,24 +170,31 @@ class _BagRows:
         self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
 
     def rows(self, messages: Sequence[str]) -> dict[str, list[Row]]:
-        in_map, own = self._maps()
+        tracks = self._tracks()
+        in_map = tracks[0] if tracks else None
         events = self._events()
-        self._add_poses(in_map, own)
-        self._add_digests(in_map, own, events)
-        self._add_things(in_map)
+        self._add_poses(tracks)
+        self._add_digests(events)
+        self._add_things()
         stood_s = self._add_events(events)
         self._add_messages(events, messages, in_map)
         self._add_bag(in_map, stood_s)
         return self._rows
 
-    def _maps(self) -> tuple[MapDigest | None, MapDigest | None]:
-        """Returns the map digest, and that in the poses' own frame where it is another."""
-        number = self._number
-        in_map = self._catalogue.maps([number]).get(number)
-        own = self._catalogue.maps([number], own=True).get(number)
-        if in_map is None or own is None or own.frame_id == in_map.frame_id:
-            return in_map, None
-        return in_map, own
+    def _tracks(self) -> list[tuple[str, RobotTrack]]:
+        """Returns the robot's track in the bag, with its frame: in the map, and in the poses' own.
+
+        The first of them has the place that other rows name.
+        """
+        view = View(self._memory, Call())
+        window = TimeWindow(self._bag.start, self._bag.end + 1)
+        places = robot_places(view, window)
+        if places is None:
+            return []
+        frames = dict.fromkeys((places.map_frame, places.pose_frame))
+        tracks = [(frame, RobotTracks(view, frame).over(window).track) for frame in frames]
+        within = [(frame, cut(track, window)) for frame, track in tracks]
+        return [(frame, track) for frame, track in within if len(track.times)]
 
     def _events(self) -> dict[str, TopicEvents | None]:
         """Returns the events on each topic that can have some; None: no message counts."""
@@ -198,7 +211,7 @@ class _BagRows:
             for topic, events in found.items()
         }
 
-    def _add_bag(self, in_map: MapDigest | None, stood_s: float | None) -> None:
+    def _add_bag(self, in_map: tuple[str, RobotTrack] | None, stood_s: float | None) -> None:
         bag, content, number = self._bag, self._content, self._number
         digest = self._catalogue.poses(self._pose_topic, [number]).get(number)
         driven = None
@@ -221,7 +234,7 @@ class _BagRows:
                 self._undecodable,
                 len(self._rows["sightings"]),
                 self._pose_topic,
-                None if in_map is None else in_map.frame_id,
+                None if in_map is None else in_map[0],
                 None if driven is None else driven.poses,
                 None if driven is None else driven.totals.distance_m,
                 None if driven is None else driven.totals.gap_m,
@@ -230,14 +243,10 @@ class _BagRows:
             )
         )
 
-    def _add_poses(self, in_map: MapDigest | None, own: MapDigest | None) -> None:
+    def _add_poses(self, tracks: Sequence[tuple[str, RobotTrack]]) -> None:
         key = topic_key(self._pose_topic)
-        for each in (in_map, own):
-            if each is None:
-                continue
-            track, frame = each.track, each.frame_id
+        for frame, track in tracks:
             columns = (track.times, track.x, track.y, track.heading, track.begins)
-            error_m = round(track.error_m, 6)
             self._rows["poses"] += [
                 (
                     self._pose_topic,
@@ -249,19 +258,14 @@ class _BagRows:
                     y,
                     _finite(heading),
                     begins,
-                    error_m,
+                    TOLERANCE_M,
                 )
                 for time, x, y, heading, begins in zip(
                     *(column.tolist() for column in columns), strict=True
                 )
             ]
 
-    def _add_digests(
-        self,
-        in_map: MapDigest | None,
-        own: MapDigest | None,
-        events: Mapping[str, TopicEvents | None],
-    ) -> None:
+    def _add_digests(self, events: Mapping[str, TopicEvents | None]) -> None:
         number, catalogue, add = self._number, self._catalogue, self._add_digest
         for each in self._bag.summary.topics:
             self._rows["digests"].append(
@@ -287,9 +291,6 @@ class _BagRows:
             found = events.get(topic, NO_EVENTS)
             if found is not NO_EVENTS:
                 add(topic, "events", encode_topic_events(found))
-        if in_map is not None:
-            add(self._pose_topic, "map", encode_map_track(replace(in_map, own=own)))
-            add("", "sights", self._sights())
 
     def _add_digest(self, topic: str, kind: str, packed: bytes | None) -> None:
         if packed is None:
@@ -303,34 +304,29 @@ class _BagRows:
             (topic, topic_key(topic), kind, version, None, count, first, last, packed)
         )
 
-    def _sights(self) -> bytes:
-        return self._catalogue.sights([self._number]).get(self._number, (0, b""))[1]
+    def _add_things(self) -> None:
+        watching = Watching(View(self._memory, Call()))
+        for stretch in watching.in_bag(self._bag):
+            for sights in stretch.sights:
+                for spot in sights.spots.tolist():
+                    self._add_thing(stretch.frame_id, sights, spot)
 
-    def _add_things(self, in_map: MapDigest | None) -> None:
-        packed = self._sights()
-        if not packed or in_map is None:
-            return
-        sights = decode_sights(packed)
-        for spot in sights.spots.tolist():
-            topic, label = sights.topics[spot[Spot.TOPIC]], sights.labels[spot[Spot.LABEL]]
-            best = spot[Spot.BEST]
-            self._rows["things"].append(
-                (
-                    topic,
-                    topic_key(topic),
-                    label,
-                    spot[Spot.N],
-                    spot[Spot.FIRST],
-                    spot[Spot.LAST],
-                    microseconds(spot[Spot.FIRST]),
-                    sights.frame_id,
-                    spot[Spot.X] / _MM,
-                    spot[Spot.Y] / _MM,
-                    spot[Spot.Z] / _MM,
-                    spot[Spot.DEV] / _MM,
-                    None if best == _NO_SCORE else best / _SCORE_UNIT,
-                )
+    def _add_thing(self, frame: str, sights: Sights, spot: Sequence[int]) -> None:
+        topic, best = sights.topics[spot[Spot.TOPIC]], spot[Spot.BEST]
+        self._rows["things"].append(
+            (
+                topic,
+                topic_key(topic),
+                sights.labels[spot[Spot.LABEL]],
+                spot[Spot.N],
+                spot[Spot.FIRST],
+                spot[Spot.LAST],
+                microseconds(spot[Spot.FIRST]),
+                frame,
+                *(spot[column] / _MM for column in (Spot.X, Spot.Y, Spot.Z, Spot.DEV)),
+                None if best == _NO_SCORE else best / _SCORE_UNIT,
             )
+        )
 
     def _add_events(self, events: Mapping[str, TopicEvents | None]) -> float | None:
         """Adds the events of the bag alone, and returns how long the robot stood in it."""
@@ -371,16 +367,15 @@ class _BagRows:
         self,
         events: Mapping[str, TopicEvents | None],
         messages: Sequence[str],
-        in_map: MapDigest | None,
+        in_map: tuple[str, RobotTrack] | None,
     ) -> None:
         """Reads the detections of the bag, what messages state, and those of the chosen topics."""
-        wants = DetectorSights(self._memory.reader, self._memory.extractor).wants
         # What the digest of a topic rules out is not read.
         seen = {
             topic
             for topic, found in events.items()
             if (found is None or found.visible.size or found.left_out)
-            and any(wants(topic, each) for each in self._types[topic])
+            and any(map(may_have_detections, self._types[topic]))
         }
         whole = {topic for topic in messages if topic in self._types}
         states = {
@@ -477,11 +472,11 @@ class _Decoded(NamedTuple):
 class _RobotAt:
     """Where the robot was, by the track of a bag."""
 
-    def __init__(self, in_map: MapDigest | None) -> None:
+    def __init__(self, in_map: tuple[str, RobotTrack] | None) -> None:
         self._track: RobotTrack | None = None
         self._frame = ""
-        if in_map is not None and len(in_map.track.times):
-            self._track, self._frame = in_map.track, in_map.frame_id
+        if in_map is not None:
+            self._frame, self._track = in_map
 
     def at(self, time: Ns) -> tuple[str | None, float | None, float | None]:
         """Returns the frame, x and y (m); nulls where the track has a gap, or has not begun."""

@@ -1,36 +1,56 @@
 """Where the robot was in one frame over many bags, and when it was inside of a region.
 
-Joined from the map digests of bags, which have it in the map and in the poses' own frame, so that
-a week costs milliseconds.
+Each table of poses gives a part of the track, by the transforms around it; parts of tables that do
+not change any more are remembered, so a week is asked again in a tenth of a second.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.frames import Edge, Frames, joined_edges, multiply, static_at
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, track_of
+from ros2_memory.analysis.motion.robot_track import (
+    STRETCH_NS,
+    RobotTrack,
+    TrackPart,
+    joined_track,
+    thinned,
+    track_part,
+)
+from ros2_memory.analysis.poses import headings
+from ros2_memory.analysis.transform_tree import TF_CACHE_NS
+from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.geometry import yaw
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Steps, parts_inside
-from ros2_memory.history.context import READING_S
-from ros2_memory.history.driven_path import body_by_transforms, poses_of_body
-from ros2_memory.places.map_digests import MapDigests
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
+from ros2_memory.history.frames import edges_of_rows
+from ros2_memory.history.poses import PoseReader
+from ros2_memory.history.scan import scan
+from ros2_memory.history.transforms import sessions_of, static_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Hashable, Iterator, Sequence
+    from pathlib import Path
 
-    from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.catalogue.map_digest import MapDigest
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.analysis.frames import Edges, Floats, Times
+    from ros2_memory.analysis.poses import Poses
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.core.errors import UndecodableError
+    from ros2_memory.core.model import StampedTransform
     from ros2_memory.core.regions import Region
     from ros2_memory.core.timebase import Deadline, Ns
+    from ros2_memory.history.driven_path import Body
+    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Segment
+
+_READING_S: Final = 10.0
+"""How long a call places poses that it does not remember, before its answer is partial."""
 
 
 class Inside(NamedTuple):
@@ -50,8 +70,8 @@ class JoinedTrack:
     """The track of the robot in a window.
 
     Attributes:
-        track: of all bags; `error_m` is the largest of them.
-        since: how far back it reaches, where not all bags could be read in time; else None.
+        track: of all recordings.
+        since: how far back it reaches, where the time was over before all was placed; else None.
         left_out: how many poses could not be placed.
     """
 
@@ -61,145 +81,291 @@ class JoinedTrack:
 
 
 class RobotTracks:
-    """Joins the map digests of a view in one frame."""
+    """Places the robot in one frame.
+
+    By its poses; where no topic has these, by the transforms of its body.
+    """
 
     def __init__(self, view: View, frame_id: str) -> None:
         self._view = view
         self._frame_id = frame_id
-        self._maps = MapDigests(view)
-        self._topic = view.pose_topic
-        self._reading: Deadline | None = None
-        self._is_map = frame_id == view.memory.limits.map_frame
+        self._body = body_by_transforms(view)
+        self._failures: list[UndecodableError] = []
+        self._reader = PoseReader(view, self._failures)
+        self._statics: dict[Session, tuple[StampedTransform, ...]] = {}
 
     def over(self, window: TimeWindow) -> JoinedTrack:
         """Returns the track in a window, and a little beyond.
 
         Raises:
+            InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out before any result.
         """
-        if body_by_transforms(self._view) is not None:
-            return JoinedTrack(_track_of_body(self._view, self._frame_id, window))
-        parts: list[RobotTrack] = []
+        view = self._view
+        # Whole stretches, so that the window bears on no vertex; and what may reach into it.
+        begin = max(window.start - SILENCE_NS, MIN_NS) // STRETCH_NS * STRETCH_NS
+        end = -(-min(window.stop + SILENCE_NS, MAX_NS) // STRETCH_NS) * STRETCH_NS
+        around = TimeWindow(max(begin, MIN_NS), min(end, MAX_NS))
+        found: list[tuple[Path, TrackPart]] = []
         since: Ns | None = None
-        left_out = 0
+        reading = view.call.partial_after(_READING_S)
         try:
-            for segment in self._segments(window):
-                track, missed = self._of_segment(segment, window)
-                parts.append(track)
-                left_out += missed
-        except _PartlyReadError as error:
-            parts.append(error.track)
-            since = error.since
-            if not any(len(each.times) for each in parts):
+            for rows, part in self._parts(around, reading):
+                found.append((rows.recording, part))
+                since = rows.first
+        except QueryTimeoutError as error:
+            if not found:
                 raise QueryTimeoutError(
-                    f"the question needs more time; {self._view.bags.backfill_progress()}"
+                    f"the question needs more time; {view.bags.backfill_progress()}"
                     "ask about a shorter window"
                 ) from error
-        return JoinedTrack(_joined(parts[::-1]), since, left_out)
+        else:
+            since = None
+        if self._failures:
+            note_left_out(view, self._failures[0])
+        left_out = sum(part.left_out for _, part in found)
+        return JoinedTrack(joined_track(_of_one_robot(found)), since, left_out)
 
-    def _segments(self, window: TimeWindow) -> Iterator[Segment]:
-        """Yields the segments with poses in a window, newest first."""
-        for segment in reversed(self._view.snapshot.timeline.segments):
-            span = segment.spans.get(self._topic)
-            if span is not None and window.overlaps(*span):
-                self._view.bags.check_deadline()
-                yield segment
+    def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
+        """Yields the track table by table, the newest first."""
+        view, scanner = self._view, self._view.memory.columns
+        limits = view.memory.limits
+        is_own = self._body is None and pose_frame(view, view.pose_topic) == self._frame_id
+        moving = None if is_own else _Moving(view, window.widened(TF_CACHE_NS))
+        topics = (view.pose_topic,) if self._body is None else limits.tf_topics
+        for topic in topics:
+            for rows in scan(view, topic, window, newest_first=True):
+                sources = [] if moving is None else moving.around(rows.first, rows.last)
+                groups = [] if is_own else self._sessions(rows)
+                key = self._key(rows, sources, groups)
+                part = None if key is None or scanner is None else scanner.tracks.get(key)
+                if part is None:
+                    if reading.expired():
+                        raise QueryTimeoutError("to place poses takes too long")
+                    noted = view.notes.added, len(self._failures)
+                    part = self._placed(rows, sources, groups)
+                    is_sure = noted == (view.notes.added, len(self._failures))
+                    if key is not None and scanner is not None and is_sure:
+                        scanner.tracks.put(key, part, part.size)
+                yield rows, part
 
-    def _of_segment(self, segment: Segment, window: TimeWindow) -> tuple[RobotTrack, int]:
-        """Returns the track of the bags of a segment that reach into a window."""
-        digests = self._view.bags.digests_of(segment)
-        valid = {} if digests is None else self._maps.valid_in(digests, segment)
-        if digests is not None and len(valid) == len(segment.bags):
-            return self._stored(digests, segment, valid)
-        bags = [each.bag for each in segment.extents(self._topic, window)]
-        known = {} if digests is None else self._known(digests, valid)
-        found: list[MapDigest] = []
-        for bag in reversed([*dict.fromkeys(bags)]):
-            stored = known.get(valid.get(bag.file, -1))
-            try:
-                found.append(self._made(bag) if stored is None else stored)
-            except QueryTimeoutError as error:
-                raise _PartlyReadError(self._columns(found[::-1])[0], bag.end) from error
-        return self._columns(found[::-1])
+    def _key(
+        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group]
+    ) -> Hashable | None:
+        """Returns what the track by some rows follows from; None where that may still change."""
+        used = [source.rows.part for source in sources]
+        if rows.part is None or None in used:
+            return None
+        clock = self._view.memory.limits.tf_clock
+        statics = tuple((group.since, self._static(group.session)) for group in groups)
+        return rows.part, self._frame_id, self._body, clock, tuple(used), statics
 
-    def _stored(
-        self, digests: SegmentDigests, segment: Segment, valid: Mapping[str, int]
-    ) -> tuple[RobotTrack, int]:
-        """Returns the track of a whole segment, joined once for as long as it is in use."""
+    def _static(self, session: Session) -> tuple[StampedTransform, ...]:
+        if session not in self._statics:
+            self._statics[session] = tuple(static_transforms(self._view, session))
+        return self._statics[session]
 
-        def joined() -> tuple[RobotTrack, int]:
-            stored = self._known(digests, valid)
-            bags = segment.bags_with(self._topic)
-            # An entry that was deleted meanwhile is of a bag that is gone.
-            known = [stored.get(valid[bag.file]) for bag in bags]
-            return self._columns([each for each in known if each is not None])
+    def _sessions(self, rows: Rows) -> list[_Group]:
+        """Returns which sessions' transforms place the poses of some rows, each since when."""
+        sessions, recording = sessions_of(self._view), rows.recording
+        own = sessions.of(recording)
+        if sessions.has_all_kinds(own):
+            return [_Group(MIN_NS, own)]
+        first, last = (sessions.lending_to(recording, at) for at in (rows.first, rows.last))
+        if first == last:
+            return [_Group(MIN_NS, first)]
+        stretches = np.unique(rows.times // STRETCH_NS).tolist()
+        every = [
+            _Group(at, sessions.lending_to(recording, at))
+            for at in (stretch * STRETCH_NS for stretch in stretches)
+        ]
+        return [
+            group
+            for nth, group in enumerate(every)
+            if not nth or group.session != every[nth - 1].session
+        ]
 
-        # The numbers of entries do not change in a whole segment, the frame may be another.
-        return digests.derived(f"track in {self._frame_id}", joined)
+    def _placed(
+        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group]
+    ) -> TrackPart:
+        """Returns the track by the poses of some rows."""
+        ends = [group.since for group in groups[1:]] + [MAX_NS]
+        found: list[_Placed] = []
+        poses = None if self._body is not None else self._poses(rows)
+        for group, end in zip(groups or [_Group(MIN_NS, frozenset())], ends, strict=True):
+            span = TimeWindow(max(group.since, rows.first), min(end, rows.last + 1))
+            frames = self._frames(sources, span, group.session) if groups else None
+            if poses is not None:
+                found.append(_placed(poses.between(group.since, end), frames, self._frame_id))
+            elif self._body is not None and frames is not None:
+                edges = edges_of_rows(self._view, rows, group.session)
+                found.append(_placed_body(edges, self._body, frames, span))
+        times, x, y, heading = (
+            np.concatenate([getattr(one, name) for one in found])
+            for name in ("times", "x", "y", "heading")
+        )
+        return track_part(times, x, y, heading, sum(one.left_out for one in found))
 
-    def _known(self, digests: SegmentDigests, valid: Mapping[str, int]) -> Mapping[int, MapDigest]:
-        """Returns what is stored of bags, in the poses' own frame unless the map is asked for."""
-        return digests.catalogue.maps([*valid.values()], own=not self._is_map)
+    def _poses(self, rows: Rows) -> Poses:
+        poses = self._reader.poses(rows)
+        return poses.rows(thinned(poses.times))
 
-    def _made(self, bag: BagFile) -> MapDigest:
-        """Returns the digest of a bag that has none, unless reading has taken too long."""
-        if self._reading is None:
-            self._reading = self._view.call.partial_after(READING_S)
-        if self._reading.expired():
-            raise QueryTimeoutError("reading bags without a digest takes too long")
-        made = self._maps.made(bag)
-        return made if self._is_map or made.own is None else made.own
-
-    def _columns(self, found: Sequence[MapDigest]) -> tuple[RobotTrack, int]:
-        """Returns the joined track of digests in order of time, and how many poses it lacks."""
-        here = [each for each in found if each.frame_id == self._frame_id]
-        elsewhere = sum(len(each.track.times) for each in found if each.frame_id != self._frame_id)
-        track = _joined([each.track for each in here])
-        return track, sum(each.left_out for each in here) + elsewhere
+    def _frames(self, sources: Sequence[_Source], span: TimeWindow, among: Session) -> Frames:
+        around = span.widened(TF_CACHE_NS)
+        moving = [_within(source.edges(self._view, among), around) for source in sources]
+        recorded = self._static(among)
+        static = static_at(recorded, span.start)
+        static += [one for one in recorded if span.contains(one.log_time)]
+        clock = self._view.memory.limits.tf_clock
+        return Frames(
+            static, joined_edges(moving), self._frame_id, None if clock == "auto" else clock
+        )
 
 
-def _track_of_body(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
-    """Returns the track by transforms, where no topic has the robot's poses."""
-    poses = poses_of_body(view, window.widened(SILENCE_NS), frame_id)
-    turns = [None if each.orientation is None else yaw(each.orientation) for _, each in poses]
-    return track_of(
-        np.array([time for time, _ in poses], np.int64),
-        np.array([each.position[0] for _, each in poses], np.float64),
-        np.array([each.position[1] for _, each in poses], np.float64),
-        np.array([math.nan if each is None else each for each in turns], np.float64),
+class _Group(NamedTuple):
+    """The session whose transforms place poses from a log time on."""
+
+    since: Ns
+    session: Session
+
+
+class _Placed(NamedTuple):
+    """Poses in the asked frame: log times, metres, radians."""
+
+    times: Times
+    x: Floats
+    y: Floats
+    heading: Floats
+    left_out: int
+
+
+def _placed(poses: Poses, frames: Frames | None, target: str) -> _Placed:
+    """Returns poses in a frame; those that no transform places are left out."""
+    turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
+    x, y, z = (column.copy() for column in poses.positions.T)
+    valid = np.zeros(len(poses), np.bool_)
+    for code, name in enumerate(poses.frames.words):
+        here = np.flatnonzero(poses.frames.codes == code)
+        if name.lstrip("/") == target.lstrip("/"):
+            valid[here] = True
+        elif here.size and frames is not None:
+            found = frames.poses(name, poses.times[here])
+            if found is None:
+                continue
+            x[here], y[here], _ = found.points((x[here], y[here], z[here]))
+            qx, qy, qz, qw = turns[here].T
+            turns[here] = np.stack(multiply(found.rotation, (qx, qy, qz, qw)), axis=1)
+            valid[here] = found.valid
+    kept = np.flatnonzero(valid)
+    left_out = len(poses) - len(kept)
+    return _Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
+
+
+def _placed_body(edges: Edges, body: Body, frames: Frames, span: TimeWindow) -> _Placed:
+    """Returns the robot's body in the target of frames, whenever its transform was received."""
+    own = [edge for (_, child), edge in edges.items() if child == body.child]
+    times = np.concatenate([edge.log_times for edge in own] or [np.zeros(0, np.int64)])
+    stamps = np.concatenate([edge.stamps for edge in own] or [np.zeros(0, np.int64)])
+    order = np.argsort(times, kind="stable")
+    order = order[(times[order] >= span.start) & (times[order] < span.stop)]
+    order = order[thinned(times[order])]
+    found = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
+    if found is None:
+        return _Placed(times[:0], times[:0] * 1.0, times[:0] * 1.0, times[:0] * 1.0, 0)
+    x, y, _ = found.translation
+    valid = found.valid
+    return _Placed(
+        times[order][valid],
+        x[valid],
+        y[valid],
+        headings(np.stack(found.rotation, axis=1))[valid],
+        0,
     )
 
 
-class _PartlyReadError(Exception):
-    """The time was over before all bags of a segment were read; `since` is as far as it got."""
+class _Source:
+    """A table of moving transforms."""
 
-    def __init__(self, track: RobotTrack, since: Ns) -> None:
-        super().__init__()
-        self.track, self.since = track, since
+    def __init__(self, rows: Rows) -> None:
+        self.rows = rows
+        self._edges: dict[Session, Edges] = {}
+
+    def edges(self, view: View, among: Session) -> Edges:
+        """Returns the transforms of a session in it."""
+        if among not in self._edges:
+            self._edges[among] = edges_of_rows(view, self.rows, among)
+        return self._edges[among]
 
 
-def _joined(tracks: Sequence[RobotTrack]) -> RobotTrack:
-    """Returns tracks in order of time as one; of two of one time the earlier one counts."""
-    some = [each for each in tracks if len(each.times)]
-    if len(some) < 2:
-        return some[0] if some else empty_track()
-    times = np.concatenate([each.times for each in some])
-    reach = np.maximum.accumulate(np.concatenate((times[:1] - 1, times[:-1])))
-    fresh = times > reach
-    number = np.repeat(np.arange(len(some)), [len(each.times) for each in some])[fresh]
-    times = times[fresh]
-    begins = np.concatenate([each.begins for each in some])[fresh]
-    # Where a track ends and the next one begins, the time between the two decides.
-    seams = np.append([True], number[1:] != number[:-1])
-    silent = np.append([True], np.diff(times) > SILENCE_NS)
-    return RobotTrack(
-        times,
-        np.concatenate([each.x for each in some])[fresh],
-        np.concatenate([each.y for each in some])[fresh],
-        np.concatenate([each.heading for each in some])[fresh],
-        np.where(seams, silent, begins),
-        max(each.error_m for each in some),
-    )
+class _Moving:
+    """The tables of moving transforms around times that are asked about, the latest first."""
+
+    def __init__(self, view: View, window: TimeWindow) -> None:
+        topics = [
+            topic
+            for topic in view.memory.limits.tf_topics
+            if topic in view.snapshot.timeline.topics()
+        ]
+        self._waiting = [
+            scan(view, topic, window, newest_first=True, copies=True) for topic in topics
+        ]
+        self._held: list[list[_Source]] = [[] for _ in topics]
+
+    def around(self, first: Ns, last: Ns) -> list[_Source]:
+        """Returns the tables that bear on log times (inclusive), none later than asked before."""
+        first, last = first - TF_CACHE_NS, last + TF_CACHE_NS
+        found: list[_Source] = []
+        for waiting, held in zip(self._waiting, self._held, strict=True):
+            held[:] = [source for source in held if source.rows.first <= last]
+            while not held or held[-1].rows.last >= first:
+                rows = next(waiting, None)
+                if rows is None:
+                    break
+                held.append(_Source(rows))
+            found += [each for each in held if each.rows.first <= last and each.rows.last >= first]
+        return found
+
+
+def _within(edges: Edges, window: TimeWindow) -> Edges:
+    """Returns the transforms that were received in a window."""
+    found = {}
+    for pair, edge in edges.items():
+        begin, end = np.searchsorted(edge.log_times, (window.start, window.stop)).tolist()
+        if begin < end:
+            found[pair] = Edge(
+                edge.stamps[begin:end],
+                edge.log_times[begin:end],
+                edge.translation[begin:end],
+                edge.rotation[begin:end],
+            )
+    return found
+
+
+def _of_one_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[TrackPart]:
+    """Returns the parts of tracks in order of time, without a second robot.
+
+    Where several recordings place a robot at a time, that which began first does.
+    """
+    parts = [(recording, part) for recording, part in found[::-1] if len(part.times)]
+    parts.sort(key=lambda one: int(one[1].times[0]))
+    recordings = [*dict.fromkeys(recording for recording, _ in parts)]
+    if len(recordings) < 2:
+        return [part for _, part in parts]
+    kept: list[TrackPart] = []
+    pieces: list[tuple[Times, Times]] = []
+    for recording in recordings:
+        own = [part for each, part in parts if each == recording]
+        for part in own:
+            fresh = np.ones(len(part.times), np.bool_)
+            for starts, stops in pieces:
+                nth = np.searchsorted(starts, part.times, side="right") - 1
+                fresh &= (nth < 0) | (part.times > stops[nth])
+            kept.append(part if fresh.all() else part.some(np.flatnonzero(fresh)))
+        times = np.concatenate([part.times for part in own])
+        times.sort()
+        new = np.diff(times) > SILENCE_NS
+        pieces.append((times[np.append([True], new)], times[np.append(new, [True])]))
+    return kept
 
 
 def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:

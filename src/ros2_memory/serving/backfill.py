@@ -35,8 +35,6 @@ from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
 from ros2_memory.insights.drive import drive_in, store_shared_standstills
-from ros2_memory.places.bag_statics import BagStatics
-from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.queries import list_recorded_topics
 
 if TYPE_CHECKING:
@@ -45,12 +43,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.handover_file import Handover
     from ros2_memory.catalogue.digest import Digester
-    from ros2_memory.catalogue.map_digest import Statics
     from ros2_memory.columns.fill import Filling
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.context import Memory
-    from ros2_memory.index.timeline import Timeline
 
 T = TypeVar("T")
 
@@ -119,70 +115,24 @@ class Backfill:
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
         self._shared_from: Ns = MIN_NS
-        self._statics: BagStatics | None = None
-        self._stale: tuple[Timeline, int, list[BagFile]] | None = None
-        self._guesses = False
 
-    def waiting(self, *, guesses: bool = False) -> list[BagFile]:
-        """Returns the bags to be digested, the newest first.
-
-        Args:
-            guesses: where many bags have no entry, only these are returned, and `digest` guesses
-                their static transforms: all of a session's bags have these, and would be read
-                before the first is digested. Once few are left, those that were guessed wrong wait.
-        """
-        missing, self._guesses = self._waiting(guesses=guesses)
-        return missing
-
-    def _waiting(self, *, guesses: bool) -> tuple[list[BagFile], bool]:
-        """Returns the bags to be digested, and whether their static transforms are guessed."""
+    def waiting(self) -> list[BagFile]:
+        """Returns the bags to be digested, the newest first."""
         timeline = self._memory.index.snapshot().timeline
         missing = self._not_refused(bags_without_entry(timeline.segments, self._digests))
-        guesses = guesses and len(missing) > MOST_READ
-        if not guesses:
-            missing += self._not_refused(self._with_other_statics(timeline))
-        missing.sort(key=in_time, reverse=True)
-        return missing, guesses
+        return sorted(missing, key=in_time, reverse=True)
 
     def _not_refused(self, bags: list[BagFile]) -> list[BagFile]:
         if not self._refused:
             return bags
         return [bag for bag in bags if not self._is_refused(self._key(bag))]
 
-    def _with_other_statics(self, timeline: Timeline) -> list[BagFile]:
-        """Returns the bags whose entry was made with static transforms that are not in force now.
-
-        Looked up once for each timeline and state of the catalogue.
-        """
-        newest = self.catalogue.newest()
-        if self._stale is None or self._stale[:2] != (timeline, newest):
-            # An older view would read the static transforms of bags that have an entry since.
-            maps = MapDigests(View(self._memory, Call()))
-            self._statics = maps.statics
-            stale: list[BagFile] = []
-            for segment in timeline.segments:
-                digests = self._digests.digests_for(segment, newest)
-                valid = maps.valid_in(digests, segment)
-                if not digests.numbers.keys() <= valid.keys():
-                    # Another server may have digested the same bag meanwhile: its entry replaced
-                    # ours, and digesting the bag again would replace that one.
-                    digests = self._digests.looked_up_again(segment, newest)
-                    valid = maps.valid_in(digests, segment)
-                known = (bag for bag in segment.bags if bag.file in digests.numbers)
-                stale += [bag for bag in known if bag.file not in valid]
-            self._stale = timeline, newest, stale
-        return self._stale[2]
-
     def progress(self) -> Progress:
-        """Returns how much of the catalogue is filled.
-
-        While many bags have no entry, those whose static transforms were guessed wrong are not
-        counted as waiting.
-        """
+        """Returns how much of the catalogue is filled."""
         bags = self._memory.index.snapshot().bags
         closed = sum(bag.state is BagState.CLOSED for bag in bags)
         refused = sum(self._is_refused(key) for key in list(self._refused))
-        return Progress(closed, len(self._waiting(guesses=True)[0]), refused)
+        return Progress(closed, len(self.waiting()), refused)
 
     def not_stored(self) -> list[BagFile]:
         """Returns the bags of which columns are to be stored, the newest first."""
@@ -209,7 +159,7 @@ class Backfill:
             return False
         begun = time.perf_counter_ns()
         try:
-            digest = self._digester.digest(bag.path, self._statics_of(bag))
+            digest = self._digester.digest(bag.path)
         except BagError as error:
             self._refuse(bag, error.reason)
             return False
@@ -254,12 +204,6 @@ class Backfill:
                     whole.append((key, summary))
         renewed = self.catalogue.renew(whole)
         return [bag for bag in bags if self._key(bag) not in renewed] if renewed else [*bags]
-
-    def _statics_of(self, bag: BagFile) -> Statics:
-        timeline = self._memory.index.snapshot().timeline
-        if self._statics is None or self._statics.timeline is not timeline:
-            self._statics = BagStatics(View(self._memory, Call()))
-        return self._statics.guessed(bag) if self._guesses else self._statics.of(bag)
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Returns the catalogue to its file, unless the bag directory itself is missing.

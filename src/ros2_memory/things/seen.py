@@ -132,11 +132,33 @@ class Watching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         topics = [topic for topic in self._view.snapshot.timeline.topics() if self._detects(topic)]
-        for number, found in _by_stretch(self._view, topics):
+        for number, found in _by_stretch(self._view, topics, TimeWindow.everything()):
             of_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
             for topic, rows in found:
                 of_session[self._sessions.of(rows.recording)].append((topic, rows))
             yield [self._stretch(number, own, some) for own, some in of_session.items()]
+
+    def in_bag(self, bag: BagFile) -> Iterator[Stretch]:
+        """Yields the sights of the messages of one bag that count.
+
+        Raises:
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
+        """
+        topics = [
+            each.topic for each in bag.summary.schema.topics if may_have_detections(each.type)
+        ]
+        window = TimeWindow(bag.start, bag.end + 1)
+        for number, found in _by_stretch(self._view, topics, window):
+            stretch = TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS)
+            own = [
+                (topic, rows.some(positions))
+                for topic, rows in found
+                for each, positions in rows.bag_rows()
+                if each.file == bag.file
+            ]
+            if own:
+                session = self._sessions.of(bag.recording)
+                yield self._read(stretch, session, self._transforms_of(session, own[0][1]), own)
 
     def _detects(self, topic: str) -> bool:
         """Returns whether some message of a topic holds detections, or its type is named so."""
@@ -292,11 +314,13 @@ class Watching:
                     yield found.time, sigma
 
 
-def _by_stretch(view: View, topics: Sequence[str]) -> Iterator[tuple[int, list[tuple[str, Rows]]]]:
+def _by_stretch(
+    view: View, topics: Sequence[str], window: TimeWindow
+) -> Iterator[tuple[int, list[tuple[str, Rows]]]]:
     """Yields the rows of some topics by stretches of the clock, the newest first."""
 
     def of(topic: str) -> Iterator[tuple[str, Rows]]:
-        for rows in scan(view, topic, TimeWindow.everything(), newest_first=True):
+        for rows in scan(view, topic, window, newest_first=True):
             yield topic, rows
 
     waiting: dict[int, list[tuple[str, Rows]]] = defaultdict(list)

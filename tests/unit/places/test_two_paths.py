@@ -36,7 +36,7 @@ def track(*pieces: Sequence[Vertex]) -> RobotTrack:
     every = [vertex for piece in pieces for vertex in piece]
     times, x, y = (np.array(column, np.float64) for column in zip(*every, strict=True))
     begins = [nth == 0 for piece in pieces for nth in range(len(piece))]
-    return RobotTrack((times * S).astype(np.int64), x, y, 0 * x, np.array(begins), 0.05)
+    return RobotTrack((times * S).astype(np.int64), x, y, 0 * x, np.array(begins))
 
 
 def points_of(piece: Sequence[Vertex]) -> list[tuple[float, float]]:

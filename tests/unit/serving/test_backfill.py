@@ -15,6 +15,7 @@ import anyio
 import anyio.lowlevel
 import pytest
 import structlog
+from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -23,7 +24,6 @@ from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli import main
 from ros2_memory.cli.doctor import check_catalogue

@@ -347,7 +347,7 @@ def test_where_a_thinned_path_begins_anew_is_kept() -> None:
     begins = np.zeros(count, np.bool_)
     begins[[0, 7_001]] = True
     level = np.zeros(count)
-    track = RobotTrack(times, level, level, level, begins, 0.0)
+    track = RobotTrack(times, level, level, level, begins)
     kept = thinned(level, level, times)
     [first, second] = span._begins(track, kept)
     assert first == 0
@@ -549,7 +549,7 @@ def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: floa
     begins[0] = True
     x, y = draw.random((2, count)) * size
     times = BEGIN + np.arange(count, dtype=np.int64) * S
-    found: Any = driven_cells(RobotTrack(times, x, y, np.zeros(count), begins, 0.0))
+    found: Any = driven_cells(RobotTrack(times, x, y, np.zeros(count), begins))
     side = found["size"]
     cells = (np.array([found["x"], found["y"]]).T + 0.5) * side
     share = np.linspace(0, 1, 40)[:, None, None]

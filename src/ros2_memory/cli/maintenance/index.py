@@ -191,8 +191,7 @@ def fill_catalogue(
         total = _digest(backfill, _every if second is None else second.share, show)
         if second is not None:
             second.stop()
-        # Many may be left that cannot be digested now: those that were guessed wrong come anyway.
-        total += _digest(backfill, _every, show, guesses=False)
+        total += _digest(backfill, _every, show)
     backfill.prune()
     backfill.precompute()
     if total >= _COMPACTED:
@@ -233,8 +232,6 @@ def _digest(
     backfill: Backfill,
     share: Callable[[Sequence[BagFile]], Sequence[BagFile]],
     show: Callable[[Progress], None] = lambda _: None,
-    *,
-    guesses: bool = True,
 ) -> int:
     """Digests until nothing of the process's share waits; returns how many bags it digested.
 
@@ -242,12 +239,11 @@ def _digest(
         backfill: digests the bags.
         share: returns which of the waiting bags are the process's own.
         show: takes the progress, before each bag.
-        guesses: as in `Backfill.waiting`.
     """
     done, total = 1, 0
     while done:
         progress = backfill.progress()
-        waiting = share(backfill.waiting(guesses=guesses))[:_BATCH]
+        waiting = share(backfill.waiting())[:_BATCH]
         left = backfill.renew(waiting)
         done = len(waiting) - len(left)
         for number, bag in enumerate(left, done):

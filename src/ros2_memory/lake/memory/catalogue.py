@@ -11,7 +11,6 @@ from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.codec import decode_poses, decode_standstills
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
-from ros2_memory.catalogue.map_digest import NO_STATICS, decode_map_tracks
 from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.lake.event_codec import decode_topic_events
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.catalogue.map_digest import MapDigest
     from ros2_memory.columns.store import BagKey
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeIndex
@@ -108,22 +106,6 @@ class LakeCatalogue(Catalogue):
             for number in numbers
             if number in known or self._index.bag(number).is_current
         }
-
-    def maps(self, numbers: Sequence[int], *, own: bool = False) -> dict[int, MapDigest]:
-        """Returns the map digests of entries, with only their track."""
-        topic = self._index.pose_topic
-        found = self._packed("map", topic, numbers)
-        decoded = decode_map_tracks([(each, NO_STATICS.key) for each in found.values()], own=own)
-        return dict(zip(found, decoded, strict=True))
-
-    def map_keys(self, numbers: Sequence[int]) -> dict[int, int]:
-        """Returns that all were made with the static transforms that are in force here: none."""
-        return dict.fromkeys(numbers, NO_STATICS.key)
-
-    def sights(self, numbers: Sequence[int]) -> dict[int, tuple[int, bytes]]:
-        """Returns the bytes of the entries' sights."""
-        found = self._packed("sights", "", numbers)
-        return {number: (NO_STATICS.key, packed) for number, packed in found.items()}
 
     def words(self, topic: str, numbers: Sequence[int]) -> dict[int, str]:
         """Returns the words of labels in detections of the topic; of others nothing is known."""

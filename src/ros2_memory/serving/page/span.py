@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -326,29 +326,6 @@ def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
         "continues": bool(len(kept)) and not bool(track.begins[0]),
         "whole": is_whole,
     }
-
-
-def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
-    """Returns a track in a window: where it goes on beyond an end, with a point at that end.
-
-    Such a first point does not begin a piece.
-    """
-    times = track.times
-    first, last = np.searchsorted(times, (window.start, window.stop)).tolist()
-    at: list[Ns] = times[first:last].tolist()
-    begins: list[bool] = track.begins[first:last].tolist()
-    if 0 < first < len(times) and not track.begins[first] and window.start < times[first]:
-        at, begins = [window.start, *at], [False, *begins]
-    if 0 < last < len(times) and not track.begins[last] and at[-1:] != [window.stop - 1]:
-        at, begins = [*at, window.stop - 1], [*begins, False]
-    moments = np.array(at, np.int64)
-    # From the first vertex, so that numbers are small enough for a double to be exact.
-    since = times[0] if len(times) else 0
-    x, y, heading = (
-        np.interp(moments - since, times - since, column) if len(at) else column[:0]
-        for column in (track.x, track.y, track.heading)
-    )
-    return RobotTrack(moments, x, y, heading, np.array(begins, np.bool_), track.error_m)
 
 
 def thinned(
