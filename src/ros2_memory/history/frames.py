@@ -58,7 +58,8 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
 
 def _decoded(view: View, rows: Rows) -> Edges:
     """Returns the transforms of rows without columns, from their bags; copies as they are there."""
-    times, channel, parts = rows.times, rows.table.channel, list[Edges]()
+    times, channel = rows.times, rows.table.channel
+    parts: list[Edges] = []
     for bag, positions in rows.bag_rows():
         first, last = times[positions[0]], times[positions[-1]]
         for table in view.bags.tables(bag, channel.topic, hashed=False, columns=True):

@@ -13,7 +13,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call
-from ros2_memory.index import timeline
+from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
@@ -21,7 +21,7 @@ from tests.support.memories import memory_of, recalling
 from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked, write
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Hashable
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 TOPIC = "/vision/scene/scene_objects"
+APART_S = 600
+"""Each bag is in ten minutes of its own, which are gathered together."""
 THINGS = [(f"thing {number}", 3.0 + number % 3, number / 3) for number in range(8)]
 
 
@@ -43,16 +45,21 @@ def fresh(tmp_path: Path) -> Callable[[], Memory]:
 
     None knows what another has read.
     """
-    moments = [looked(10 * n, 10 * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
+    moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
     write(tmp_path, [message for some in moments for message in some])
     recall = recalling(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).recall
     return lambda: replace(memory_of(tmp_path, limits=NAMED), recall=recall)
 
 
+def begin_of(nth: int) -> int:
+    """When the ten minutes of a bag begin."""
+    return (BEGIN + APART_S * nth) // APART_S * APART_S
+
+
 def in_time(ask: Callable[[Call], T]) -> list[T]:
     """The answers after some numbers of looks at the clock, without the refusals."""
     answers = []
-    for looks in (*range(1, 60), *range(60, 600, 6), 100_000):
+    for looks in (*range(1, 60, 4), *range(60, 600, 20), 100_000):
         with suppress(QueryTimeoutError):
             answers.append(ask(call(looks)))
     return answers
@@ -68,8 +75,8 @@ def test_find_things_answers_from_the_newest_bags_and_says_since_when(
         assert {each.label for each in answer.things} == newest
         told = [note for note in answer.notes if "2 of 8 bags" in note]
         assert (answer.total < len(THINGS)) == bool(told)
-        first = 10 * (len(THINGS) - answer.total) if answer.total else 72  # where all ends
-        assert all(str(BEGIN + first) in note for note in told), told
+        first = begin_of(len(THINGS) - answer.total)
+        assert all(str(first) in note for note in told), told
 
 
 def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None:
@@ -84,10 +91,9 @@ def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None
 
 
 @pytest.fixture
-def crowded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Memory:
-    """A memory of eight bags in segments of two, each bag with a thing of its own."""
-    monkeypatch.setattr(timeline, "SEGMENT_BAGS", 2)
-    moments = [looked(10 * n, 10 * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
+def crowded(tmp_path: Path) -> Memory:
+    """A memory of eight bags, each with a thing of its own."""
+    moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
     write(tmp_path, [message for some in moments for message in some])
     return recalling(memory_of(tmp_path, limits=NAMED), tmp_path)
 
@@ -108,30 +114,40 @@ def test_of_too_many_sightings_the_newest_are_compared(
     again = replace(crowded, index=memory_of(crowded.index.bag_dir, limits=NAMED).index)
     for _ in range(2):  # the second time it is known
         labels, [note] = labels_and_notes(again, Deadline.after(60))
-        assert labels == {label for label, *_ in THINGS[4:]}
-        assert str(BEGIN + 40) in note
+        assert labels == {label for label, *_ in THINGS[5:]}
+        assert str(begin_of(5)) in note
 
 
 def test_where_comparing_takes_too_long_fewer_are_compared_from_then_on(
     crowded: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
-    newest = {label for label, *_ in THINGS[6:]}
+    newest = {label for label, *_ in THINGS[7:]}
     labels, [note] = labels_and_notes(crowded, Deadline.after(60))
     assert labels == newest
-    assert str(BEGIN + 60) in note
+    assert str(begin_of(7)) in note
+
+
+class WithoutEstimates(ByteLru[tuple[Timeline, object]]):
+    """Keeps only how many sightings can be compared in time."""
+
+    def put(self, key: Hashable, value: tuple[Timeline, object], size: int) -> None:
+        if not isinstance(value[1], known.KnownThings):
+            super().put(key, value, size)
 
 
 def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     crowded: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(known._CACHE, "estimates", lambda _: ByteLru(0))
+    scanner = crowded.columns
+    assert scanner is not None
+    monkeypatch.setattr(scanner, "things", WithoutEstimates(8))
     monkeypatch.setattr(known, "_FEWER", 100)
     monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
     labels_and_notes(crowded, Deadline.after(60))
     monkeypatch.setattr(known, "_ESTIMATING_S", 1e6)
     compared = [len(labels_and_notes(crowded, Deadline.after(60))[0]) for _ in range(5)]
-    assert compared == [2, 2, 4, 8, 8]
+    assert compared == [1, 2, 4, 8, 8]
 
 
 def test_a_call_without_an_end_compares_all(
