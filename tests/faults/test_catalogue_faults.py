@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NoReturn
 import anyio
 import pytest
 import structlog
-from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache
@@ -248,7 +247,7 @@ class Busy(sqlite3.Connection):
 
 
 class Refusing(Digester):
-    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
+    def digest(self, path: Path) -> Digest:
         raise BagError(str(path), "no digest of it can be made")
 
 

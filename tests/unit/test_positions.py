@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.view import View
-from ros2_memory.places.map_digests import MapDigests
+from ros2_memory.history.context import QuerySettings
 from tests.support.bags import (
     Msg,
     boolean,
@@ -433,7 +431,7 @@ def test_the_only_topic_of_poses_serves_every_tool_that_places_the_robot(
     assert "set data.pose_topic=/pose" in refused["detail"]
 
 
-def test_digests_that_another_topic_of_poses_placed_are_made_again(tmp_path: Path) -> None:
+def test_once_the_usual_topic_of_poses_is_recorded_it_places_the_robot(tmp_path: Path) -> None:
     """A bag without /odom is placed by /pose; with /odom in a later one it is no longer."""
     driven = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(6)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", driven)
@@ -443,12 +441,6 @@ def test_digests_that_another_topic_of_poses_placed_are_made_again(tmp_path: Pat
     write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + n * S, 2.0, 0.0) for n in range(20, 26)])
     [known] = asked(recalls, tmp_path, "visits", **near)["visits"]
     assert known["arrived"] == T0_S + 20
-    view = View(recalls, Call())
-    [segment] = view.snapshot.timeline.segments
-    digests = view.bags.digests_of(segment)
-    assert digests is not None
-    assert len(digests.numbers) == 1
-    assert not MapDigests(view).valid_in(digests, segment)
 
 
 def test_of_several_topics_with_poses_each_is_named(tmp_path: Path) -> None:

@@ -118,8 +118,7 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Sequence[str] =
     That is which of its messages count, the static transforms in force, the settings (`config`)
     and versions of the digest, and the topics whose `messages` are shipped.
     """
-    catalogue, number = _entry(memory, bag)
-    if number is None:
+    if _entry(memory, bag)[1] is None:
         return None
     counted = [
         (each.topic, each.type, each.count, each.first, each.last) for each in bag.summary.topics

@@ -3,26 +3,23 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.sights import (
     Beside,
+    Fix,
     Hit,
     Look,
-    PlacedDetection,
     Score,
     Sights,
-    SightsBuilder,
     Spot,
     Unplaced,
-    decode_joined,
-    decode_sights,
-    encode_sights,
+    fixes_of,
     joined,
     no_sights,
 )
+from tests.support.sights import Message, PlacedDetection, sights_of_messages
 
 HERE = (0.0, 0.0, 0.0)
 SECOND = 10**9
@@ -31,10 +28,13 @@ SECOND = 10**9
 def sights_of(
     *messages: list[PlacedDetection], robot: tuple[float, float, float] | None = HERE
 ) -> Sights:
-    builder = SightsBuilder()
-    for nth, things in enumerate(messages):
-        builder.add("/detections", nth * SECOND, robot, things)
-    return builder.sights()
+    times = np.linspace(0, 9 * SECOND, max(len(messages), 10)).astype(np.int64).tolist()
+    return sights_of_messages(
+        [
+            Message("/detections", time, robot, things)
+            for time, things in zip(times, messages, strict=False)
+        ]
+    )
 
 
 def mug(x: float, y: float = 0.0, score: float | None = None) -> PlacedDetection:
@@ -74,13 +74,10 @@ def test_a_look_counts_every_message_from_a_pose_whether_it_saw_anything_or_not(
 
 
 def test_looks_differ_by_place_and_direction() -> None:
-    builder = SightsBuilder()
-    for nth, pose in enumerate(
-        [(0.1, 0.1, 0.05), (0.2, 0.2, 0.1), (0.3, 0.1, 0.05), (0.1, 0.1, 1)]
-    ):
-        builder.add("/detections", nth, pose, [])
-    looks = builder.sights().looks
-    assert looks[:, Look.N].tolist() == [2, 1, 1]
+    poses = [(0.1, 0.1, 0.05), (0.2, 0.2, 0.1), (0.3, 0.1, 0.05), (0.1, 0.1, 1.0)]
+    messages = [Message("/detections", nth, pose, []) for nth, pose in enumerate(poses)]
+    looks = sights_of_messages(messages).looks
+    assert sorted(looks[:, Look.N].tolist()) == [1, 1, 2]
     assert looks[0, Look.X] == 150
     assert looks[0, Look.YAW] == 43  # the mean of 2.9 and 5.7 degrees
 
@@ -124,18 +121,32 @@ def test_what_moves_through_a_bag_makes_a_bounded_number_of_spots() -> None:
     assert found.unplaced[:, Unplaced.N].tolist() == [136]
 
 
-def test_joined_sights_name_bags_topics_and_labels_once() -> None:
+def test_messages_of_one_slice_of_the_clock_are_looked_at_together_and_no_others() -> None:
+    messages = [Message("/a", nth * SECOND, HERE, [mug(1.0)]) for nth in range(7, 24)]
+    found = sights_of_messages(messages)
+    assert found.spots[:, [Spot.SLICE, Spot.N]].tolist() == [[0, 3], [1, 10], [2, 4]]
+    assert found.looks[:, [Look.SLICE, Look.N]].tolist() == [[0, 3], [1, 10], [2, 4]]
+
+
+def test_joined_sights_number_slices_and_name_topics_and_labels_once() -> None:
     one = sights_of([mug(1.0), PlacedDetection("cup", (3, 0, 0))])
-    builder = SightsBuilder()
-    builder.add("/other", 5, HERE, [])
-    builder.add("/detections", 7, HERE, [PlacedDetection("cup", (3, 0, 0)), mug(1.0)])
-    both = joined([one, builder.sights()])
-    assert both.topics == ("/detections", "/other")
-    assert both.labels == ("mug", "cup")
-    assert both.spots[:, Spot.BAG].tolist() == [0, 0, 1, 1]
-    assert both.spots[:, Spot.LABEL].tolist() == [0, 1, 1, 0]
-    assert both.hits[:, Hit.LOOK].tolist() == [0, 0, 2, 2]
-    assert both.bags == 2
+    other = sights_of_messages(
+        [Message("/a", 12 * SECOND, HERE, [PlacedDetection("cup", (3, 0, 0)), mug(1.0)])]
+    )
+    both, epochs = joined([other, one], [1, 0])
+    assert both.topics == ("/a", "/detections")
+    assert both.labels == ("cup", "mug")
+    assert both.spots[:, Spot.SLICE].tolist() == [0, 0, 1, 1]
+    assert both.spots[:, Spot.TOPIC].tolist() == [1, 1, 0, 0]
+    assert both.spots[:, Spot.LABEL].tolist() == [0, 1, 0, 1]
+    assert both.hits[:, Hit.LOOK].tolist() == [0, 0, 1, 1]
+    assert (both.slices, epochs.tolist()) == (2, [0, 1])
+
+
+def test_one_slice_in_two_coordinate_systems_is_two() -> None:
+    both, epochs = joined([sights_of([mug(1.0)]), sights_of([mug(1.0)])], [0, 1])
+    assert both.spots[:, Spot.SLICE].tolist() == [0, 1]
+    assert epochs.tolist() == [0, 1]
 
 
 coordinates = st.floats(-20, 20, allow_nan=False)
@@ -147,8 +158,7 @@ things = st.builds(
 )
 messages = st.lists(
     st.tuples(
-        st.sampled_from(["/a", "/b"]),
-        st.integers(0, 2**62),
+        st.integers(0, 60 * SECOND),
         st.none() | st.tuples(coordinates, coordinates, st.floats(-4, 4)),
         st.lists(things, max_size=6),
     ),
@@ -156,69 +166,51 @@ messages = st.lists(
 )
 
 
-def built(
-    bag: list[tuple[str, int, tuple[float, float, float] | None, list[PlacedDetection]]],
-) -> Sights:
-    builder = SightsBuilder()
-    for topic, time, robot, seen in bag:
-        builder.add(topic, time, robot, seen)
-        if robot is not None and seen:
-            builder.add_fix(time, robot, seen[0].score)
-    return builder.sights()
+def built(topic: str, seen: list[tuple[int, None, list[PlacedDetection]]]) -> Sights:
+    ordered = sorted(seen, key=lambda each: each[0])
+    return sights_of_messages([Message(topic, *each) for each in ordered])
 
 
 @given(messages)
-def test_sights_survive_being_stored(
-    bag: list[tuple[str, int, None, list[PlacedDetection]]],
+def test_nothing_that_was_detected_is_lost(
+    seen: list[tuple[int, None, list[PlacedDetection]]],
 ) -> None:
-    sights = built([*bag])
-    assert decode_sights(encode_sights(sights)) == sights
+    found = built("/a", seen)
+    count = sum(len(detections) for *_, detections in seen)
+    assert int(found.spots[:, Spot.N].sum() + found.unplaced[:, Unplaced.N].sum()) == count
+    assert int(found.hits[:, Hit.N].sum()) == int(found.spots[:, Spot.N].sum())
+    assert int(found.looks[:, Look.N].sum()) == sum(robot is not None for _, robot, _ in seen)
 
 
-@given(messages, messages, messages)
-def test_joining_is_associative(
-    a: list[tuple[str, int, None, list[PlacedDetection]]],
-    b: list[tuple[str, int, None, list[PlacedDetection]]],
-    c: list[tuple[str, int, None, list[PlacedDetection]]],
+@given(messages, messages)
+def test_sights_are_joined_in_any_order(
+    one: list[tuple[int, None, list[PlacedDetection]]],
+    other: list[tuple[int, None, list[PlacedDetection]]],
 ) -> None:
-    one, two, three = built([*a]), built([*b]), built([*c])
-    assert joined([joined([one, two]), three]) == joined([one, joined([two, three])])
-    assert joined([no_sights(), one]).spots.shape == one.spots.shape
+    parts = [built("/a", one), built("/b", other), no_sights()]
+    forward, backward = joined(parts)[0], joined(parts[::-1])[0]
+    assert forward.topics == backward.topics
+    for table, same in zip(forward.tables, backward.tables, strict=True):
+        assert table.tolist() == same.tolist()
 
 
-@given(st.lists(messages, max_size=5))
-def test_stored_bags_are_decoded_together_as_they_are_joined_one_by_one(
-    bags: list[list[tuple[str, int, None, list[PlacedDetection]]]],
+@given(messages)
+def test_sights_cut_between_slices_are_those_of_the_whole(
+    seen: list[tuple[int, None, list[PlacedDetection]]],
 ) -> None:
-    every = [built([*bag]) for bag in bags]
-    found, which, frames = decode_joined([encode_sights(each) for each in every])
-    assert which == [nth for nth, each in enumerate(every) if each.topics]
-    assert found == joined(every[nth] for nth in which)
-    assert frames == [every[nth].frame_id for nth in which]
+    parts = [
+        built("/a", [each for each in seen if each[0] // (10 * SECOND) == number])
+        for number in range(7)
+    ]
+    whole, cut = joined([built("/a", seen)])[0], joined(parts)[0]
+    for table, same in zip(whole.tables, cut.tables, strict=True):
+        assert table.tolist() == same.tolist()
 
 
-def test_fixes_are_numbered_by_bag_and_kept_where_no_detector_published() -> None:
-    builder = SightsBuilder()
-    builder.add_fix(3 * SECOND, (1.0, -2.0, math.pi / 2), 0.25)
-    alone = builder.sights("map")
-    assert decode_sights(encode_sights(alone)) == alone
-    both, which, frames = decode_joined(
-        [encode_sights(sights_of([mug(1.0)])), encode_sights(alone)]
-    )
-    assert both.fixes.tolist() == [[1, 3 * SECOND, 1000, -2000, 900, 250]]
-    assert (both.bags, which, frames) == (2, [0, 1], ["", "map"])
-
-
-@pytest.mark.parametrize(
-    "packed",
-    [b"nothing", b"\xff\n", b'[0,"",["/a"],[],[[9,9]]]\n12345'],
-)
-def test_other_bytes_are_no_sights(packed: bytes) -> None:
-    with pytest.raises(ValueError, match=r"not sights|Expecting|codec"):
-        decode_sights(packed)
-
-
-def test_a_bag_without_a_detector_costs_nothing() -> None:
-    assert encode_sights(no_sights()) == b""
-    assert decode_sights(b"") == no_sights()
-    assert np.array_equal(no_sights().spots, np.zeros((0, len(Spot))))
+def test_fixes_are_kept_where_no_detector_published() -> None:
+    poses, sigma = np.array([[1.0, -2.0, math.pi / 2]]), np.array([0.25])
+    alone = fixes_of(np.array([13 * SECOND]), poses, sigma)
+    both, _ = joined([sights_of([mug(1.0)]), alone])
+    assert both.fixes.tolist() == [[1, 13 * SECOND, 1000, -2000, 900, 250]]
+    assert both.fixes[0, Fix.SIGMA] == 250
+    assert both.slices == 2

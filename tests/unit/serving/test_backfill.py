@@ -15,7 +15,6 @@ import anyio
 import anyio.lowlevel
 import pytest
 import structlog
-from ros2_memory.catalogue.map_digest import NO_STATICS, Statics
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -168,9 +167,9 @@ class Counting(Digester):
 
     names: list[str]
 
-    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
+    def digest(self, path: Path) -> Digest:
         self.names = [*getattr(self, "names", ()), path.name]
-        return super().digest(path, statics)
+        return super().digest(path)
 
 
 def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
@@ -182,7 +181,6 @@ def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
     return {
         os.path.relpath(file, bag_dir): [
             files[file].summary,
-            catalogue.map_keys([number]).get(number),
             *(
                 each(topic, [number]).get(number)
                 for topic in sorted({each.topic for each in files[file].summary.topics})
@@ -235,14 +233,14 @@ def test_a_handover_has_only_those_bags_digested_again_that_it_changes(tmp_path:
 class Meddling(Digester):
     """Something happens to the bag while it is read."""
 
-    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
-        found = super().digest(path, statics)
+    def digest(self, path: Path) -> Digest:
+        found = super().digest(path)
         write_handover(path.parent, Handover())
         return found
 
 
 class Failing(Digester):
-    def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
+    def digest(self, path: Path) -> Digest:
         raise BagError(str(path), "damaged in the middle")
 
 
