@@ -54,8 +54,6 @@ log = get_logger(__name__)
 
 BACKLOG: Final = 8
 """A child process digests more bags than these, so that answers stay fast."""
-MOST_READ: Final = 64
-"""Bags without an entry whose static transforms are read before others are digested."""
 PRUNE_INTERVAL_S: Final = 600.0
 """How often the entries of deleted files are removed."""
 
@@ -408,7 +406,7 @@ class Filler:
         backfill = self._backfill
         due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
         await _in_thread(partial(backfill.look_after, thorough=due))
-        find = partial(backfill.waiting, guesses=True)
+        find = backfill.waiting
         waiting = await _in_thread(find)
         waiting = await _in_thread(partial(backfill.renew, waiting))
         unstored = await _in_thread(backfill.not_stored)
