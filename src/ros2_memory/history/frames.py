@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, static_at
+from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, sorted_edges, static_at
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.transforms import edges_in
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import messages_of, scan, tables_of
 from ros2_memory.history.transforms import decoded_transforms, sessions_of, static_transforms
 
 if TYPE_CHECKING:
@@ -51,7 +51,15 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
     if sessions.folder(rows.recording) not in among:
         return {}
     edges = edges_in(rows.table, rows.times, rows.index)
-    return _by_message(view, messages_of(view, rows)) if edges is None else edges
+    if edges is not None:
+        return edges
+    decoded = [
+        edges_in(table, table.log_times[index], index) for table, index in tables_of(view, rows)
+    ]
+    known = [edges for edges in decoded if edges is not None]
+    if decoded and len(known) == len(decoded):
+        return sorted_edges(joined_edges(known))
+    return _by_message(view, messages_of(view, rows))
 
 
 def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:
