@@ -367,6 +367,20 @@ def _agreeing(blocks: Iterable[Edge]) -> Literal["stamp", "log"]:
     return "stamp" if int(np.partition(every, middle)[middle]) <= AGREEMENT_NS else "log"
 
 
+def sorted_edges(edges: Edges) -> Edges:
+    """Returns transforms by log time, as those of bags come in the order of these."""
+    found: dict[tuple[str, str], Edge] = {}
+    for pair, edge in edges.items():
+        order = np.argsort(edge.log_times, kind="stable")
+        found[pair] = Edge(
+            edge.stamps[order],
+            edge.log_times[order],
+            edge.translation[order],
+            edge.rotation[order],
+        )
+    return found
+
+
 def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
     """Returns, of static transforms in log-time order, the newest of each child at a moment.
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, static_at
+from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, sorted_edges, static_at
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.transforms import edges_in
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import messages_of, scan, tables_of
 from ros2_memory.history.transforms import decoded_transforms, sessions_of, static_transforms
 
 if TYPE_CHECKING:
@@ -53,23 +51,15 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
     if sessions.folder(rows.recording) not in among:
         return {}
     edges = edges_in(rows.table, rows.times, rows.index)
-    return _decoded(view, rows) if edges is None else edges
-
-
-def _decoded(view: View, rows: Rows) -> Edges:
-    """Returns the transforms of rows without columns, from their bags; copies as they are there."""
-    times, channel = rows.times, rows.table.channel
-    parts: list[Edges] = []
-    for bag, positions in rows.bag_rows():
-        first, last = times[positions[0]], times[positions[-1]]
-        for table in view.bags.tables(bag, channel.topic, hashed=False, columns=True):
-            if table.channel.type == channel.type:
-                inside = np.flatnonzero((table.log_times >= first) & (table.log_times <= last))
-                edges = edges_in(table, table.log_times[inside], inside)
-                if edges is None:
-                    return _by_message(view, messages_of(view, rows))
-                parts.append(edges)
-    return joined_edges(parts) if parts else {}
+    if edges is not None:
+        return edges
+    decoded = [
+        edges_in(table, table.log_times[index], index) for table, index in tables_of(view, rows)
+    ]
+    known = [edges for edges in decoded if edges is not None]
+    if decoded and len(known) == len(decoded):
+        return sorted_edges(joined_edges(known))
+    return _by_message(view, messages_of(view, rows))
 
 
 def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:

@@ -51,7 +51,7 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import messages_of, scan, tables_of
 from ros2_memory.history.sessions import Sessions, components
 
 if TYPE_CHECKING:
@@ -377,6 +377,11 @@ def _pairs_in(
         pairs = None if scanner is None or part is None else scanner.pairs.get(part)
         if pairs is None:
             pairs = None if is_mixed else pairs_in(rows.table, rows.index)
+            if pairs is None and not is_mixed:
+                every = [pairs_in(table, index) for table, index in tables_of(view, rows)]
+                known = [each for each in every if each is not None]
+                if every and len(known) == len(every):
+                    pairs = frozenset[Pair]().union(*known)
             if pairs is None:
                 found = messages_of(view, rows)
                 if is_mixed and sessions is not None and among is not None:

@@ -49,12 +49,17 @@ def listed(found: Detections, digits: int) -> list[tuple[int | str, ...]]:
         found.scores.tolist(),
         found.places.tolist(),
     )
+
+    def said(number: float) -> str:
+        """A number as a text, so that NaN is NaN; of what is rounded to zero nothing is left."""
+        return "0" if abs(number) < 10.0**-digits else f"{number:.{digits}g}"
+
     rows = []
     for row, label, frame, score, place in zip(*columns, strict=True):
-        # What is rounded to zero is not filled in. As texts, so that NaN is NaN.
-        is_somewhere = max(map(abs, place)) >= 10.0**-digits
-        where = [f"{axis:.{digits}g}" for axis in place] if is_somewhere else []
-        rows.append((row, label, frame if where else "", f"{score:.{digits}g}", *where))
+        where = [said(axis) for axis in place]
+        # A point of zeros is not filled in.
+        where = [] if {*where} <= {"0", "nan"} else where
+        rows.append((row, label, frame if where else "", said(score), *where))
     return sorted(rows)
 
 
