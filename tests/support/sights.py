@@ -45,11 +45,13 @@ def seen_in(messages: Sequence[Message]) -> Seen:
     nowhere = (math.nan, math.nan, math.nan)
     every = [(row, one) for row, message in enumerate(messages) for one in message.things]
     scores = [math.nan if one.score is None else one.score for _, one in every]
+    labels = Texts.of([one.label for _, one in every])
     return Seen(
         np.array([message.time for message in messages], np.int64),
         np.array([message.robot or nowhere for message in messages], np.float64).reshape(-1, 3),
         np.array([row for row, _ in every], np.int64),
-        Texts.of([one.label for _, one in every]),
+        labels.codes.astype(np.int64),
+        labels.words,
         np.array([one.place or nowhere for _, one in every], np.float64).reshape(-1, 3),
         np.array(scores, np.float64),
     )

@@ -27,8 +27,6 @@ from ros2_memory.core.timebase import NS_PER_S
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from ros2_memory.columns.table import Texts
-
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 Flags: TypeAlias = NDArray[np.bool_]
@@ -154,7 +152,8 @@ class Seen(NamedTuple):
         times: log times of the messages (ns).
         robot: x, y (m) and yaw (rad) of the robot at each (M x 3); NaN where that is not known.
         rows: of each detection its message, ascending.
-        labels: their names.
+        labels: the place of their names in `names`.
+        names: of labels; there may be some that none has.
         places: N x 3 (m); NaN where that is not known.
         scores: NaN where there is none.
     """
@@ -162,7 +161,8 @@ class Seen(NamedTuple):
     times: Ints
     robot: Floats
     rows: Ints
-    labels: Texts
+    labels: Ints
+    names: tuple[str, ...]
     places: Floats
     scores: Floats
 
@@ -239,7 +239,17 @@ class _Detections(NamedTuple):
 
     def at(self, among: Ints | Flags) -> _Detections:
         """Returns some of them."""
-        return _Detections(*(column[among] for column in self))
+        message, slices, label, x, y, z, score, is_placed = self
+        return _Detections(
+            message[among],
+            slices[among],
+            label[among],
+            x[among],
+            y[among],
+            z[among],
+            score[among],
+            is_placed[among],
+        )
 
 
 def sights_of(topic: str, seen: Seen) -> Sights:
@@ -303,12 +313,12 @@ def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
 
 def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels."""
-    names = sorted({word[:_MAX_LABEL_CHARS] for word in seen.labels.words})
+    names = sorted({word[:_MAX_LABEL_CHARS] for word in seen.names})
     number = {name: nth for nth, name in enumerate(names)}
-    codes = [number[word[:_MAX_LABEL_CHARS]] for word in seen.labels.words]
-    label = np.array(codes, np.int64)[seen.labels.codes]
+    codes = [number[word[:_MAX_LABEL_CHARS]] for word in seen.names]
+    label = np.array(codes, np.int64)[seen.labels]
     with np.errstate(invalid="ignore"):
-        near = (np.abs(seen.places) < _MAX_AWAY_M).all(axis=1)
+        near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
     found = _Detections(seen.rows, slices[seen.rows], label, x, y, z, seen.scores, near)
     if len(names) > _MAX_LABELS:
@@ -477,7 +487,8 @@ def _beside(found: _Detections) -> tuple[Ints, Ints]:
 def _tallied(one: Ints, other: Ints) -> Ints:
     """Returns the distinct pairs, and how often there is each."""
     rows, nth = distinct_rows((one, other))
-    return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
+    found: Ints = np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
+    return found
 
 
 def _mm(metres: Floats) -> Ints:
@@ -485,7 +496,8 @@ def _mm(metres: Floats) -> Ints:
 
 
 def _decideg(radians: Floats) -> Ints:
-    return np.rint(np.degrees(radians) * 10).astype(np.int64)
+    found: Ints = np.rint(np.degrees(radians) * 10).astype(np.int64)
+    return found
 
 
 def _thousandths(scores: Floats) -> Ints:

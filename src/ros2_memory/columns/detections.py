@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.messages.detections import Detection
 
 Point: TypeAlias = tuple[Leaf, Leaf, Leaf]
+Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 _STAMP: Final = "builtin_interfaces/msg/Time"
 
 
@@ -61,7 +62,7 @@ class Detections(NamedTuple):
     rows: Ints
     labels: Texts
     scores: Floats
-    places: Floats
+    places: Points
     frames: Texts
 
     def at(self, rows: Ints) -> Detections:
@@ -364,7 +365,7 @@ def _found(values: Values, level: Level, name: Texts, among: Ints, scores: Float
     return Detections(rows, labels, scores[among], _nowhere(among.size), _no_frames(among.size))
 
 
-def _nowhere(count: int) -> Floats:
+def _nowhere(count: int) -> Points:
     return np.full((count, 3), math.nan)
 
 
@@ -463,7 +464,7 @@ def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     return best
 
 
-def _places(values: Values, source: Labels, level: Level, among: Ints) -> Floats:
+def _places(values: Values, source: Labels, level: Level, among: Ints) -> Points:
     """Returns the first valid point of each detection (N x 3); NaN where it has none."""
     if source.points is None or source.best_points is None:
         raise UnknownShapeError("points are of another shape in each message")

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
 """Decodes a topic of a bag, with hashes of payloads where the last argument is true."""
 
+Placed: TypeAlias = "tuple[str, frozenset[str] | None, tuple[Sights, ...]]"
+"""The frame of sights, the session that it is of, and the sights."""
+
 _SLICE_NS: Final = 600 * NS_PER_S
 """How much of overlapping recordings is compared at a time."""
 _HEAD_BYTES: Final = 400
@@ -181,7 +184,7 @@ class Scanner:
         self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
         self.tracks: ByteLru[TrackPart] = ByteLru(32 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
-        self.sights: ByteLru[tuple[str, object, tuple[Sights, ...]]] = ByteLru(48 << 20)
+        self.sights: ByteLru[Placed] = ByteLru(48 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:

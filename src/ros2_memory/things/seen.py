@@ -367,7 +367,8 @@ def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:
             placed = np.stack(known.points((x, y, z)), axis=1)
             places[some] = np.where(known.valid[:, None], placed, math.nan)
     robot = _robot_at(poses, detected.times, frames)
-    return Seen(detected.log_times, robot, found.rows, found.labels, places, found.scores)
+    labels = found.labels.codes.astype(np.int64), found.labels.words
+    return Seen(detected.log_times, robot, found.rows, *labels, places, found.scores)
 
 
 def _robot_at(poses: Poses, times: Ints, frames: Frames) -> Floats:
