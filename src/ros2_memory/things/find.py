@@ -57,7 +57,7 @@ def find_things(
     """Returns the things of some labels, or all, that were seen in a window, those seen last first.
 
     A thing counts where it was at the window's end. `where` takes those that are in a region then;
-    of what moves by itself, what was seen in it. Bags count as a whole.
+    of what moves by itself, what was seen in it. Slices (10 s) count as a whole.
 
     Raises:
         InvalidArgumentsError: the bounds make no window, `where` is no region, or `min_score` is

@@ -150,9 +150,9 @@ class Estimate:
     """By key and epoch: the evidence for each place."""
 
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
-        """Returns which of some spots are of bags that reach into a window and end before a time.
+        """Returns which of some spots are of slices that reach into a window and end before a time.
 
-        Bags count as a whole; a spot without detections that count is left out.
+        Slices count as a whole; a spot without detections that count is left out.
         """
         first, last = self.sights.spots[rows][:, [Spot.FIRST, Spot.LAST]].T
         inside = (first < window.stop) & (last >= window.start) & (last < before)

@@ -200,6 +200,8 @@ class Watching:
 
     def _transforms_of(self, own: Session, rows: Rows) -> Session:
         """Returns the session whose transforms hold for some rows; empty where none has any."""
+        if self._view.memory.columns is None:  # a lake, whose rows are placed and hold none
+            return frozenset()
         if self._sessions.has_all_kinds(own):
             return own
         return self._sessions.lending_to(rows.recording, int(rows.times[0]))

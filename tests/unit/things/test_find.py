@@ -228,7 +228,7 @@ def test_a_thing_is_said_to_be_missed_only_after_looks_from_where_it_was_seen(
     assert thing["still_there"] == {"not_looked_at_since": BEGIN + 19}
     write(tmp_path / "missed", [*seen, *looked(20, 60, HERE)])
     [thing] = ask(tmp_path / "missed", label="mug")["things"]
-    # Two looks in a split of ten: a split counts as a whole.
+    # Two looks in ten seconds of the clock, which count as a whole.
     assert thing["still_there"] == {"not_seen_where_expected": BEGIN + 29, "looks": 40}
 
 
@@ -236,7 +236,7 @@ def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path)
     write(tmp_path, looked(0, 60, HERE, ("mug", 3.0, 0.5)))
     [thing] = ask(tmp_path, label="mug", end=BEGIN + 25)["things"]
     assert thing["still_there"] == {"seen_since": BEGIN + 59}
-    assert thing["last_seen"] == BEGIN + 29  # bags count as a whole
+    assert thing["last_seen"] == BEGIN + 29  # ten seconds count as a whole
     assert ask(tmp_path, label="mug", end=BEGIN - 5)["reason"] == "outside_range"
 
 
