@@ -46,7 +46,7 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ThingsBetween:
-    """Compares the things of two windows. Slices (10 s) count as a whole, a shared one in the later.
+    """Compares the things of two windows. Slices (10 s) count whole, a shared one in the later.
 
     Attributes:
         earlier, later: the windows.
