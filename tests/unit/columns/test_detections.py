@@ -54,7 +54,7 @@ def listed(found: Detections, digits: int) -> list[tuple[int | str, ...]]:
         """A number as a text, so that NaN is NaN; of what is rounded to zero nothing is left."""
         return "0" if abs(number) < 10.0**-digits else f"{number:.{digits}g}"
 
-    rows = []
+    rows: list[tuple[int | str, ...]] = []
     for row, label, frame, score, place in zip(*columns, strict=True):
         where = [said(axis) for axis in place]
         # A point of zeros is not filled in.
