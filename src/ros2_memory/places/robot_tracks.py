@@ -90,6 +90,9 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._body = body_by_transforms(view)
+        tf_topics = view.memory.limits.tf_topics
+        self._topics = (view.pose_topic,) if self._body is None else tf_topics
+        self._is_own = self._body is None and pose_frame(view, view.pose_topic) == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
         self._statics: dict[Session, tuple[StampedTransform, ...]] = {}
@@ -129,21 +132,21 @@ class RobotTracks:
     def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
         """Yields the track table by table, the newest first."""
         view, scanner = self._view, self._view.memory.columns
-        limits = view.memory.limits
-        is_own = self._body is None and pose_frame(view, view.pose_topic) == self._frame_id
-        moving = None if is_own else _Moving(view, window.widened(TF_CACHE_NS))
-        topics = (view.pose_topic,) if self._body is None else limits.tf_topics
-        for topic in topics:
+        moving = None if self._is_own else _Moving(view, window.widened(TF_CACHE_NS))
+        for topic in self._topics:
             for rows in scan(view, topic, window, newest_first=True):
                 sources = [] if moving is None else moving.around(rows.first, rows.last)
-                groups = [] if is_own else self._sessions(rows)
+                groups = [] if moving is None else self._sessions(rows)
                 key = self._key(rows, sources, groups)
                 part = None if key is None or scanner is None else scanner.tracks.get(key)
                 if part is None:
                     if reading.expired():
                         raise QueryTimeoutError("to place poses takes too long")
                     noted = view.notes.added, len(self._failures)
-                    part = self._placed(rows, sources, groups)
+                    placed = self._placed(rows, sources, groups, thins=True)
+                    part = track_part(
+                        placed.times, placed.x, placed.y, placed.heading, placed.left_out
+                    )
                     is_sure = noted == (view.notes.added, len(self._failures))
                     if key is not None and scanner is not None and is_sure:
                         scanner.tracks.put(key, part, part.size)
@@ -185,30 +188,41 @@ class RobotTracks:
             if not nth or group.session != every[nth - 1].session
         ]
 
-    def _placed(
-        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group]
-    ) -> TrackPart:
-        """Returns the track by the poses of some rows."""
-        ends = [group.since for group in groups[1:]] + [MAX_NS]
-        found: list[_Placed] = []
-        poses = None if self._body is not None else self._poses(rows)
-        for group, end in zip(groups or [_Group(MIN_NS, frozenset())], ends, strict=True):
-            span = TimeWindow(max(group.since, rows.first), min(end, rows.last + 1))
-            frames = self._frames(sources, span, group.session) if groups else None
-            if poses is not None:
-                found.append(_placed(poses.between(group.since, end), frames, self._frame_id))
-            elif self._body is not None and frames is not None:
-                edges = edges_of_rows(self._view, rows, group.session)
-                found.append(_placed_body(edges, self._body, frames, span))
-        times, x, y, heading = (
-            np.concatenate([getattr(one, name) for one in found])
-            for name in ("times", "x", "y", "heading")
-        )
-        return track_part(times, x, y, heading, sum(one.left_out for one in found))
+    def poses(self, window: TimeWindow) -> Placed:
+        """Returns all poses in a short window, in order.
 
-    def _poses(self, rows: Rows) -> Poses:
-        poses = self._reader.poses(rows)
-        return poses.rows(thinned(poses.times))
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
+        moving = None if self._is_own else _Moving(self._view, window.widened(TF_CACHE_NS))
+        found = [NOWHERE]
+        for topic in self._topics:
+            for rows in scan(self._view, topic, window, newest_first=True):
+                sources = [] if moving is None else moving.around(rows.first, rows.last)
+                groups = [] if moving is None else self._sessions(rows)
+                found.append(self._placed(rows, sources, groups, thins=False))
+        return _joined(found)
+
+    def _placed(
+        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group], *, thins: bool
+    ) -> Placed:
+        """Returns the poses of some rows; with `thins` those that a track needs."""
+        if self._body is None:
+            poses = self._reader.poses(rows)
+            poses = poses.rows(thinned(poses.times)) if thins else poses
+        if not groups:
+            return _placed(poses, None, self._frame_id)
+        found: list[Placed] = []
+        ends = [group.since for group in groups[1:]] + [MAX_NS]
+        for group, end in zip(groups, ends, strict=True):
+            span = TimeWindow(max(group.since, rows.first), min(end, rows.last + 1))
+            frames = self._frames(sources, span, group.session)
+            if self._body is None:
+                found.append(_placed(poses.between(group.since, end), frames, self._frame_id))
+            else:
+                edges = edges_of_rows(self._view, rows, group.session)
+                found.append(_placed_body(edges, self._body, frames, span, thins=thins))
+        return _joined(found)
 
     def _frames(self, sources: Sequence[_Source], span: TimeWindow, among: Session) -> Frames:
         around = span.widened(TF_CACHE_NS)
@@ -229,8 +243,16 @@ class _Group(NamedTuple):
     session: Session
 
 
-class _Placed(NamedTuple):
-    """Poses in the asked frame: log times, metres, radians."""
+class Placed(NamedTuple):
+    """Poses of the robot in a frame.
+
+    Attributes:
+        times: log times (ns), ascending.
+        x: metres.
+        y: metres.
+        heading: radians; NaN where it is not known.
+        left_out: how many no transform placed.
+    """
 
     times: Times
     x: Floats
@@ -239,7 +261,23 @@ class _Placed(NamedTuple):
     left_out: int
 
 
-def _placed(poses: Poses, frames: Frames | None, target: str) -> _Placed:
+NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0), 0)
+
+
+def _joined(parts: Sequence[Placed]) -> Placed:
+    """Returns the poses of several tables, in order of time."""
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    return Placed(
+        times[order],
+        np.concatenate([part.x for part in parts])[order],
+        np.concatenate([part.y for part in parts])[order],
+        np.concatenate([part.heading for part in parts])[order],
+        sum(part.left_out for part in parts),
+    )
+
+
+def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
     """Returns poses in a frame; those that no transform places are left out."""
     turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
     x, y, z = (column.copy() for column in poses.positions.T)
@@ -258,23 +296,25 @@ def _placed(poses: Poses, frames: Frames | None, target: str) -> _Placed:
             valid[here] = found.valid
     kept = np.flatnonzero(valid)
     left_out = len(poses) - len(kept)
-    return _Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
+    return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _placed_body(edges: Edges, body: Body, frames: Frames, span: TimeWindow) -> _Placed:
+def _placed_body(
+    edges: Edges, body: Body, frames: Frames, span: TimeWindow, *, thins: bool
+) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
     own = [edge for (_, child), edge in edges.items() if child == body.child]
     times = np.concatenate([edge.log_times for edge in own] or [np.zeros(0, np.int64)])
     stamps = np.concatenate([edge.stamps for edge in own] or [np.zeros(0, np.int64)])
     order = np.argsort(times, kind="stable")
     order = order[(times[order] >= span.start) & (times[order] < span.stop)]
-    order = order[thinned(times[order])]
+    order = order[thinned(times[order])] if thins else order
     found = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
     if found is None:
-        return _Placed(times[:0], times[:0] * 1.0, times[:0] * 1.0, times[:0] * 1.0, 0)
+        return NOWHERE
     x, y, _ = found.translation
     valid = found.valid
-    return _Placed(
+    return Placed(
         times[order][valid],
         x[valid],
         y[valid],
