@@ -258,16 +258,16 @@ def _gather(
     static = _StaticReader(view)
     folders: dict[str, tuple[str, bool]] = {}
     for topic in topics:
-        held = view.bags.all_of(segment, topic) if topic in segment.spans else ()
-        for bag, messages in held:
+        for bag in segment.bags_with(topic) if topic in segment.spans else ():
             path = bag.file.rpartition("/")[0]
             if path not in folders:
                 folders[path] = sessions.folder(bag.recording), sessions.is_carried(bag)
             folder, is_carried = folders[path]
-            if folder != wanted and not isinstance(messages, list):
+            if folder != wanted:
                 unread.add(folder)
             if folder in unread:
                 continue
+            messages = view.bags.read(bag, (topic,), TimeWindow.everything())
             of_folder = gathered.get(folder)
             if of_folder is None:
                 of_folder = gathered[folder] = _Gathered()

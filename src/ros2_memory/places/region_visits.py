@@ -39,7 +39,7 @@ class RegionVisits(NamedTuple):
     """
 
     track: RobotTrack
-    all: list[Inside]
+    all: Sequence[tuple[Inside, RobotTrack]]
     elapsed: Elapsed
     is_all: bool
     tracks: RobotTracks
@@ -47,7 +47,7 @@ class RegionVisits(NamedTuple):
     @property
     def duration(self) -> Ns:
         """How long they were in all, as the track has them."""
-        return sum(self.elapsed.between(one.start, one.stop) for one in self.all)
+        return sum(self.elapsed.between(one.start, one.stop) for one, _ in self.all)
 
 
 def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
@@ -79,17 +79,24 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
         QueryTimeoutError: the call's time runs out before any result.
     """
     joined = _joined_in(view, frame_id, window)
-    inside = robot_inside(joined.track, where.region, window)
+    every = [
+        (one, track)
+        for track in (joined.track, *joined.others)
+        for one in robot_inside(track, where.region, window)
+    ]
+    every.sort(key=lambda visit: visit[0], reverse=True)
     elapsed = elapsed_in(view, window)
     tracks = RobotTracks(view, frame_id)
-    return RegionVisits(joined.track, inside[::-1], elapsed, joined.since is None, tracks)
+    return RegionVisits(joined.track, every, elapsed, joined.since is None, tracks)
 
 
-def visit_of(found: RegionVisits, coarse: Inside, where: Where, newest: Ns | None) -> Visit:
-    """Returns a visit for the reply; `newest` is the newest pose, if that is recent enough.
+def visit_of(found: RegionVisits, nth: int, where: Where, newest: Ns | None) -> Visit:
+    """Returns one of the visits for the reply; `newest` is the newest pose, if it is recent enough.
 
     Its times are those of poses: of the first and the last one inside, and of the closest.
     """
+    coarse, track = found.all[nth]
+    found = found._replace(track=track)
     one = _by_poses(found, coarse, where.region)
     there_still = newest is not None and one.stop >= newest
     distance_m, at = None, None
@@ -197,7 +204,8 @@ def place_visits(
     for place, track in places_in(view, places, placement, window):
         inside = robot_inside(track, place.region, window)
         tracks = RobotTracks(view, place.frame_id)
-        of_place = RegionVisits(track, inside, elapsed, is_all=True, tracks=tracks)
+        every = [(one, track) for one in inside]
+        of_place = RegionVisits(track, every, elapsed, is_all=True, tracks=tracks)
         entries = [one for one in inside if one.entered]
         exits = [one for one in inside if one.left]
         found.append(

@@ -26,29 +26,39 @@ from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Steps, parts_inside
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.regions import Parts, Steps, parts_inside
+from ros2_memory.core.text import Reason
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.scan import scan
-from ros2_memory.history.transforms import sessions_of, static_transforms
+from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.frames import Edges, Floats, Times
+    from ros2_memory.analysis.frames import Edges, Floats, Mask, Times
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import StampedTransform
     from ros2_memory.core.regions import Region
-    from ros2_memory.core.timebase import Deadline, Ns
+    from ros2_memory.core.timebase import Deadline
     from ros2_memory.history.driven_path import Body
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
+_NOT_PLACED: Final = Reason(
+    "has no transforms that place its poses: they are left out",
+    "recording",
+    many="have no transforms that place their poses: they are left out",
+)
+_FASTEST_MPS: Final = 5.0
+_JUMP_NS: Final[Ns] = 2 * NS_PER_S
+"""A step that is faster, and not longer than this, is a jump."""
 _READING_S: Final = 10.0
 """How long a call places poses that it does not remember, before its answer is partial."""
 
@@ -73,11 +83,14 @@ class JoinedTrack:
         track: of all recordings.
         since: how far back it reaches, where the time was over before all was placed; else None.
         left_out: how many poses could not be placed.
+        others: where recordings place a robot at one time, as of several robots, the tracks of
+            those that are not in `track`, as far as they are not.
     """
 
     track: RobotTrack
     since: Ns | None = None
     left_out: int = 0
+    others: tuple[RobotTrack, ...] = ()
 
 
 class RobotTracks:
@@ -92,7 +105,9 @@ class RobotTracks:
         self._body = body_by_transforms(view)
         tf_topics = view.memory.limits.tf_topics
         self._topics = (view.pose_topic,) if self._body is None else tf_topics
-        self._is_own = self._body is None and pose_frame(view, view.pose_topic) == frame_id
+        own = pose_frame(view, view.pose_topic) if self._body is None else self._body.child
+        self._own_frame = own
+        self._is_own = self._body is None and own == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
         self._statics: dict[Session, tuple[StampedTransform, ...]] = {}
@@ -127,7 +142,9 @@ class RobotTracks:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for _, part in found)
-        return JoinedTrack(joined_track(_of_one_robot(found)), since, left_out)
+        one, *others = _by_robot(found)
+        tracks = tuple(joined_track(parts) for parts in others)
+        return JoinedTrack(joined_track(one), since, left_out, tracks)
 
     def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
         """Yields the track table by table, the newest first."""
@@ -174,12 +191,12 @@ class RobotTracks:
         own = sessions.of(recording)
         if sessions.has_all_kinds(own):
             return [_Group(MIN_NS, own)]
-        first, last = (sessions.lending_to(recording, at) for at in (rows.first, rows.last))
+        first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [_Group(MIN_NS, first)]
         stretches = np.unique(rows.times // STRETCH_NS).tolist()
         every = [
-            _Group(at, sessions.lending_to(recording, at))
+            _Group(at, self._lending(recording, at))
             for at in (stretch * STRETCH_NS for stretch in stretches)
         ]
         return [
@@ -202,6 +219,13 @@ class RobotTracks:
                 groups = [] if moving is None else self._sessions(rows)
                 found.append(self._placed(rows, sources, groups, thins=False))
         return _joined(found)
+
+    def _lending(self, recording: Path, at: Ns) -> Session:
+        """Returns the session that places a recording's poses; a note says if none, or another."""
+        session = lending_to(self._view, recording, (self._frame_id, self._own_frame), at)
+        if not session:
+            self._view.notes.add(Note(_NOT_PLACED, recording.name))
+        return session
 
     def _placed(
         self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group], *, thins: bool
@@ -381,31 +405,50 @@ def _within(edges: Edges, window: TimeWindow) -> Edges:
     return found
 
 
-def _of_one_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[TrackPart]:
-    """Returns the parts of tracks in order of time, without a second robot.
+def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
+    """Returns the parts of the track in order of time, and of others what lies beside it.
 
-    Where several recordings place a robot at a time, that which began first does.
+    Where several recordings place a robot at a time, that which began first is in the track.
     """
     parts = [(recording, part) for recording, part in found[::-1] if len(part.times)]
     parts.sort(key=lambda one: int(one[1].times[0]))
     recordings = [*dict.fromkeys(recording for recording, _ in parts)]
     if len(recordings) < 2:
-        return [part for _, part in parts]
+        return [[part for _, part in parts]]
+    others: list[list[TrackPart]] = []
     kept: list[TrackPart] = []
     pieces: list[tuple[Times, Times]] = []
     for recording in recordings:
         own = [part for each, part in parts if each == recording]
+        beside: list[TrackPart] = []
         for part in own:
             fresh = np.ones(len(part.times), np.bool_)
             for starts, stops in pieces:
                 nth = np.searchsorted(starts, part.times, side="right") - 1
                 fresh &= (nth < 0) | (part.times > stops[nth])
             kept.append(part if fresh.all() else part.some(np.flatnonzero(fresh)))
+            if not fresh.all():
+                beside.append(part.some(np.flatnonzero(~fresh)))
+        if beside:
+            others.append(beside)
         times = np.concatenate([part.times for part in own])
         times.sort()
         new = np.diff(times) > SILENCE_NS
         pieces.append((times[np.append([True], new)], times[np.append(new, [True])]))
-    return kept
+    return [kept, *others]
+
+
+def _without_jumps(parts: Parts, jumps: Mask) -> Parts:
+    """Returns parts of steps, of those that are jumps their ends alone, or both where all is in.
+
+    Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
+    """
+    jumped = jumps[parts.step]
+    begins, ends = parts.start <= 0, parts.stop >= 1
+    start = np.where(jumped & ~begins, 1.0, parts.start)
+    stop = np.where(jumped & ~ends, 0.0, parts.stop)
+    kept = ~jumped | begins | ends
+    return Parts(parts.step[kept], start[kept], stop[kept])
 
 
 def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:
@@ -422,9 +465,14 @@ def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[
     after = np.where(ends, np.arange(count), np.arange(count) + 1)
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
     parts = parts_inside(region, steps)
+    lasted = track.times[after] - track.times
+    far = np.hypot(steps.to_x - steps.x, steps.to_y - steps.y) * 1e9 > _FASTEST_MPS * lasted
+    jumps = far & (lasted > 0) & (lasted <= _JUMP_NS)
+    if jumps[parts.step].any():
+        parts = _without_jumps(parts, jumps)
     if not len(parts.step):
         return []
-    lasted = (track.times[after] - track.times)[parts.step]
+    lasted = lasted[parts.step]
     begin = track.times[parts.step]
     starts = begin + np.rint(lasted * parts.start).astype(np.int64)
     stops = begin + np.rint(lasted * parts.stop).astype(np.int64)

@@ -173,8 +173,9 @@ def _by_track(
     found = region_visits(view, frame_id, place, window)
     newest = _newest(view, topic, found.track, window)
     current = newest if _is_current(view, newest, now) else None
-    shown = tuple(visit_of(found, one, place, current) for one in found.all[:limit])
-    entries, exits = sum(one.entered for one in found.all), sum(one.left for one in found.all)
+    some = range(min(limit, len(found.all)))
+    shown = tuple(visit_of(found, nth, place, current) for nth in some)
+    entries, exits = sum(one.entered for one, _ in found.all), sum(one.left for one, _ in found.all)
     return _Known(
         shown, len(found.all), found.duration, newest, entries, exits, is_all=found.is_all
     )

@@ -19,7 +19,6 @@ from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli.maintenance.index import fill_catalogue
 from ros2_memory.columns.store import BagKey
@@ -71,21 +70,14 @@ def backfill_of(bag_dir: Path, catalogue: str, reader: BagDirReader | None = Non
     return Backfill(memory, digester, bag_dir)
 
 
-def placed(backfill: Backfill, bag_dir: Path) -> dict[str, tuple[int, bytes, bytes]]:
+def placed(backfill: Backfill, bag_dir: Path) -> dict[str, tuple[int, bytes]]:
     """Returns what a catalogue has of the robot in the map, by bag."""
     catalogue = backfill.catalogue
     files = catalogue.known_files(bag_dir)
     numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in files.values()])
     found = [number for number in numbers if number is not None]
-    keys, maps, own = (
-        catalogue.map_keys(found),
-        catalogue.maps(found),
-        catalogue.maps(found, own=True),
-    )
-    return {
-        file: (keys[number], encode_map_track(maps[number]), encode_map_track(own[number]))
-        for file, number in zip(files, found, strict=True)
-    }
+    sights = catalogue.sights(found)
+    return {file: sights[number] for file, number in zip(files, found, strict=True)}
 
 
 def write_bag(bag_dir: Path, recording: str, number: int, statics: dict[str, float]) -> None:
