@@ -96,8 +96,6 @@ def visits(
             notes=view.notes.sentences(),
         )
     known = _by_track(view, topic, placement.frame_id, place, (window, now, limit))
-    # Its rows say which visit was under way, which only the ends of recordings cut.
-    is_unbounded = where is None and start_s is None and end_s is None
     known = known._replace(shown=tuple(_within_asked(each, window) for each in known.shown))
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
@@ -115,8 +113,8 @@ def visits(
         total=known.total,
         now=now,
         duration=known.duration,
-        entries=None if is_unbounded else known.entries,
-        exits=None if is_unbounded else known.exits,
+        entries=known.entries,
+        exits=known.exits,
         all_counted=known.is_all,
         where=place.name,
         notes=view.notes.sentences(),
