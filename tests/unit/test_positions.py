@@ -312,13 +312,31 @@ def test_transforms_alone_give_the_position_and_name_the_tools_for_them(
     elif tool == "visits":
         [visit] = reply["visits"]
         assert visit["arrived"] == T0_S
-        assert visit["departed"] == pytest.approx(T0_S + 0.5, abs=0.01)
+        assert visit["departed"] == T0_S  # the last pose inside
     else:
         assert (reply["distance_m"], reply["topic"]) == (2.0, "/tf")
     refused = ask(tmp_path, recalls, "get_velocity_at", timestamp=T0_S + 1)["detail"]
     assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
     asked_for = {"parent": "odom", "child": "base_link", "timestamp": T0_S + 1}
     assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
+
+
+def test_where_a_satellite_receiver_has_degrees_alone_the_place_is_by_transforms(
+    tmp_path: Path,
+) -> None:
+    seconds = range(9)
+    messages = [fix(T0 + n * S, n * 1e-5, 0.0) for n in seconds]
+    messages += [
+        tf(T0 + n * S, transform(T0 + n * S, "odom", "base_link", (n, 0.0, 0.0))) for n in seconds
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    told = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 3)
+    assert (told["x"], told["frame_id"]) == (3.0, "odom")
+    assert told["latitude"] is not None
+    [visit] = ask(tmp_path, False, "visits", x=3.0, y=0.0, radius_m=0.5)["visits"]
+    assert visit["arrived"] == T0_S + 3
+    of_topic = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 3, topic="/fix")
+    assert of_topic["x"] is None
 
 
 @each_way

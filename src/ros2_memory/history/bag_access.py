@@ -6,7 +6,6 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.core.errors import (
@@ -23,7 +22,7 @@ from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.columns.table import Table
@@ -231,12 +230,6 @@ class BagAccess:
         duplicates only.
         """
         self.check_deadline()
-        stored = self._stored_messages(bag, topics)
-        if stored is not None:
-            inside = [each for each in stored if window.contains(each.log_time)]
-            ordered = reversed(inside) if newest_first else inside
-            yield from (StoredMessage(bag, each) for each in ordered)
-            return
         part, reader = _indexed_part(bag, window), self.memory.reader
         records: Iterator[Record] | None = None
         # The time between two records is the reader's; what happens at `yield` is the caller's.
@@ -299,30 +292,8 @@ class BagAccess:
                     yield with_all_messages(self.memory.reader, bag.path, table, part)
             self.check_deadline()
 
-    def all_of(
-        self, segment: Segment, topic: str
-    ) -> Iterator[tuple[BagFile, Iterable[StoredMessage]]]:
-        """Yields the bags of a segment that hold a topic, each with all messages it has of it.
-
-        As `read` does for each; stored messages of all bags are looked up at once.
-        """
-        numbers: Mapping[str, int] = {}
-        stored: Mapping[int, Sequence[Record]] = {}
-        digests = self.digests_of(segment) if self._stores(topic) else None
-        if digests is not None:
-            self.check_deadline()
-            numbers, stored = digests.numbers, digests.messages(topic)
-        for bag in segment.bags_with(topic):
-            records = stored.get(numbers.get(bag.file, -1))
-            if records is None or is_carried(bag.file):
-                yield bag, self.read(bag, (topic,), TimeWindow.everything())
-            else:
-                yield bag, [StoredMessage(bag, each) for each in records]
-
     def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> StoredMessage | None:
         """Returns what `read` yields first with `newest_first`, without reading more of the bag."""
-        if self._stored_messages(bag, [topic]) is not None:
-            return next(self.read(bag, [topic], window, newest_first=True), None)
         self.check_deadline()
         with self.call.stages.timed("read"):
             try:
@@ -335,26 +306,6 @@ class BagAccess:
                 pass
         # Others of its messages may be whole.
         return next(self.read(bag, [topic], window, newest_first=True), None)
-
-    def _stored_messages(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
-        """Returns all messages of one topic in a bag, if the catalogue stores them; else None."""
-        if len(topics) != 1 or not self._stores(topics[0]):
-            return None
-        [topic] = topics
-        if is_carried(bag.file):
-            return None  # its channels name the recording of each message, the catalogue not
-        entry = self.entry(bag)
-        if entry is None:
-            return None
-        digests, number = entry
-        return digests.messages(topic).get(number)
-
-    def _stores(self, topic: str) -> bool:
-        """Whether the catalogue stores messages of a topic: static transforms, and latched ones."""
-        static = topic in self.memory.limits.tf_static_topics
-        return self.memory.recall is not None and (
-            static or topic in self.snapshot.timeline.transient_local
-        )
 
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:

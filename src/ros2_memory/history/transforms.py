@@ -330,12 +330,6 @@ def newest_in_session(
     return view.stream.first((topic,), window, newest_first=True, among=bags)
 
 
-def children_moving(view: View, among: Session) -> set[str]:
-    """Returns the child frames of a session's moving transforms."""
-    pairs = _pairs(view, view.memory.limits.tf_topics, among=among)
-    return {child.lstrip("/") for _, child in pairs}
-
-
 def edges(view: View) -> tuple[FrameEdge, ...]:
     """Returns every parent and child pair that was recorded, sorted; `static` where published so.
 
@@ -480,12 +474,6 @@ def connects(
                     known.add((frames, among))
                 return True
     return False
-
-
-def connected_by_statics(view: View, frames: tuple[str, str]) -> bool:
-    """Whether static transforms alone lead from one frame to the other, in some recording."""
-    pairs = _pairs(view, view.memory.limits.tf_static_topics)
-    return _link(pairs, frames)
 
 
 def _link(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:

@@ -1,17 +1,18 @@
 """Visits to regions by the robot's track: in a map that moves, and of any shape.
 
-The track is joined from digests of bags, so all visits of a week are counted in milliseconds. A
-time is as exact as the track: no pose is farther than some 5 cm from it.
+All visits are found by the track, from which no pose is farther than some 5 cm; those that are
+shown begin and end at poses.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
-from ros2_memory.core.timebase import NS_PER_MS, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.regions import Place
+    from ros2_memory.core.regions import Place, Region
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.robot_tracks import Inside, JoinedTrack
@@ -34,18 +35,19 @@ class RegionVisits(NamedTuple):
     """All visits to a region in a window, newest first, and the track that they are of.
 
     `elapsed`: how much time passed between moments of the window. `is_all`: whether the track
-    reaches back to its begin.
+    reaches back to its begin. `tracks`: has the poses themselves.
     """
 
     track: RobotTrack
-    all: list[Inside]
+    all: Sequence[tuple[Inside, RobotTrack]]
     elapsed: Elapsed
     is_all: bool
+    tracks: RobotTracks
 
     @property
     def duration(self) -> Ns:
-        """How long they were in all."""
-        return sum(self.elapsed.between(each.start, each.stop) for each in self.all)
+        """How long they were in all, as the track has them."""
+        return sum(self.elapsed.between(one.start, one.stop) for one, _ in self.all)
 
 
 def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
@@ -63,7 +65,7 @@ def _joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
         view.notes.complete = False
         view.notes.add(
             f"visits are known back to {unix_text(joined.since)}: out of time before older "
-            "bags without a digest were read"
+            "poses were placed"
         )
     if joined.left_out:
         view.notes.add(f"poses that no transform places in {frame_id} are left out")
@@ -77,17 +79,29 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
         QueryTimeoutError: the call's time runs out before any result.
     """
     joined = _joined_in(view, frame_id, window)
-    inside = robot_inside(joined.track, where.region, window)
+    every = [
+        (one, track)
+        for track in (joined.track, *joined.others)
+        for one in robot_inside(track, where.region, window)
+    ]
+    every.sort(key=lambda visit: visit[0], reverse=True)
     elapsed = elapsed_in(view, window)
-    return RegionVisits(joined.track, inside[::-1], elapsed, joined.since is None)
+    tracks = RobotTracks(view, frame_id)
+    return RegionVisits(joined.track, every, elapsed, joined.since is None, tracks)
 
 
-def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:
-    """Returns a visit for the reply; `newest` is the newest pose, if that is recent enough."""
-    there_still = newest is not None and one.stop >= newest // NS_PER_MS * NS_PER_MS
+def visit_of(found: RegionVisits, nth: int, where: Where, newest: Ns | None) -> Visit:
+    """Returns one of the visits for the reply; `newest` is the newest pose, if it is recent enough.
+
+    Its times are those of poses: of the first and the last one inside, and of the closest.
+    """
+    coarse, track = found.all[nth]
+    found = found._replace(track=track)
+    one = _by_poses(found, coarse, where.region)
+    there_still = newest is not None and one.stop >= newest
     distance_m, at = None, None
     if isinstance(where.region, Circle):
-        distance_m, at = _closest(found.track, one, where.region)
+        distance_m, at = _closest(found, one, where.region)
     departed = None if there_still and not one.left else one.stop
     return Visit(
         arrived=one.start,
@@ -101,8 +115,32 @@ def visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) 
     )
 
 
-def _closest(track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]:
-    """Returns how near (m) the track came to the middle of a circle in a visit, and when."""
+def _by_poses(found: RegionVisits, one: Inside, region: Region) -> Inside:
+    """Returns a visit from its first to its last pose inside, where it was entered and left."""
+    if one.entered:
+        poses = _poses_around(found, one.start)
+        inside = [time for time, x, y in poses if time <= one.stop and region.contains(x, y)]
+        one = one._replace(start=inside[0] if inside else one.start)
+    if one.left:
+        poses = _poses_around(found, one.stop)
+        inside = [time for time, x, y in poses if time >= one.start and region.contains(x, y)]
+        one = one._replace(stop=inside[-1] if inside else one.stop)
+    return one
+
+
+def _poses_around(found: RegionVisits, at: Ns) -> list[tuple[Ns, float, float]]:
+    """Returns the poses between the vertices before and after a time, these included."""
+    times = found.track.times
+    last = len(times) - 1
+    before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
+    after = min(int(np.searchsorted(times, at, side="right")), last)
+    poses = found.tracks.poses(TimeWindow(int(times[before]), int(times[after]) + 1))
+    return list(zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True))
+
+
+def _closest(found: RegionVisits, one: Inside, circle: Circle) -> tuple[float, Ns]:
+    """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
+    track = found.track
     first = max(int(np.searchsorted(track.times, one.start, side="right")) - 1, 0)
     last = int(np.searchsorted(track.times, one.stop, side="left"))
     times = track.times[first : last + 1]
@@ -117,9 +155,15 @@ def _closest(track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]
     along = ((circle.x - x[:-1]) * dx + (circle.y - y[:-1]) * dy) / np.where(size > 0, size, 1.0)
     along = np.where(size > 0, along.clip(0.0, 1.0), 0.0)
     off = np.hypot(x[:-1] + along * dx - circle.x, y[:-1] + along * dy - circle.y)
-    where = int(off.argmin())
-    at = int(inner[where] + round(float(along[where]) * int(inner[where + 1] - inner[where])))
-    return float(min(off[where], circle.radius_m)), at
+    nearest = int(off.argmin())
+    lasted = int(inner[nearest + 1] - inner[nearest])
+    at = int(inner[nearest] + round(float(along[nearest]) * lasted))
+    poses = [
+        (math.hypot(x - circle.x, y - circle.y), time)
+        for time, x, y in _poses_around(found, at)
+        if one.start <= time <= one.stop
+    ]
+    return min(poses, default=(float(min(off[nearest], circle.radius_m)), at))
 
 
 def places_in(
@@ -159,16 +203,19 @@ def place_visits(
     found: list[PlaceVisits] = []
     for place, track in places_in(view, places, placement, window):
         inside = robot_inside(track, place.region, window)
-        entries = [each.start for each in inside if each.entered]
-        exits = [each.stop for each in inside if each.left]
+        tracks = RobotTracks(view, place.frame_id)
+        every = [(one, track) for one in inside]
+        of_place = RegionVisits(track, every, elapsed, is_all=True, tracks=tracks)
+        entries = [one for one in inside if one.entered]
+        exits = [one for one in inside if one.left]
         found.append(
             PlaceVisits(
                 place=place.name,
                 entries=len(entries),
                 exits=len(exits),
-                duration=sum(elapsed.between(each.start, each.stop) for each in inside),
-                first=entries[0] if entries else None,
-                last=exits[-1] if exits else None,
+                duration=of_place.duration,
+                first=_by_poses(of_place, entries[0], place.region).start if entries else None,
+                last=_by_poses(of_place, exits[-1], place.region).stop if exits else None,
             )
         )
     return tuple(sorted(found, key=lambda each: (-each.duration, each.place)))

@@ -26,29 +26,39 @@ from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Steps, parts_inside
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.regions import Parts, Steps, parts_inside
+from ros2_memory.core.text import Reason
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.scan import scan
-from ros2_memory.history.transforms import sessions_of, static_transforms
+from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.frames import Edges, Floats, Times
+    from ros2_memory.analysis.frames import Edges, Floats, Mask, Times
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import StampedTransform
     from ros2_memory.core.regions import Region
-    from ros2_memory.core.timebase import Deadline, Ns
+    from ros2_memory.core.timebase import Deadline
     from ros2_memory.history.driven_path import Body
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
+_NOT_PLACED: Final = Reason(
+    "has no transforms that place its poses: they are left out",
+    "recording",
+    many="have no transforms that place their poses: they are left out",
+)
+_FASTEST_MPS: Final = 5.0
+_JUMP_NS: Final[Ns] = 2 * NS_PER_S
+"""A step that is faster, and not longer than this, is a jump."""
 _READING_S: Final = 10.0
 """How long a call places poses that it does not remember, before its answer is partial."""
 
@@ -73,11 +83,14 @@ class JoinedTrack:
         track: of all recordings.
         since: how far back it reaches, where the time was over before all was placed; else None.
         left_out: how many poses could not be placed.
+        others: where recordings place a robot at one time, as of several robots, the tracks of
+            those that are not in `track`, as far as they are not.
     """
 
     track: RobotTrack
     since: Ns | None = None
     left_out: int = 0
+    others: tuple[RobotTrack, ...] = ()
 
 
 class RobotTracks:
@@ -90,6 +103,11 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._body = body_by_transforms(view)
+        tf_topics = view.memory.limits.tf_topics
+        self._topics = (view.pose_topic,) if self._body is None else tf_topics
+        own = pose_frame(view, view.pose_topic) if self._body is None else self._body.child
+        self._own_frame = own
+        self._is_own = self._body is None and own == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
         self._statics: dict[Session, tuple[StampedTransform, ...]] = {}
@@ -124,26 +142,28 @@ class RobotTracks:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for _, part in found)
-        return JoinedTrack(joined_track(_of_one_robot(found)), since, left_out)
+        one, *others = _by_robot(found)
+        tracks = tuple(joined_track(parts) for parts in others)
+        return JoinedTrack(joined_track(one), since, left_out, tracks)
 
     def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
         """Yields the track table by table, the newest first."""
         view, scanner = self._view, self._view.memory.columns
-        limits = view.memory.limits
-        is_own = self._body is None and pose_frame(view, view.pose_topic) == self._frame_id
-        moving = None if is_own else _Moving(view, window.widened(TF_CACHE_NS))
-        topics = (view.pose_topic,) if self._body is None else limits.tf_topics
-        for topic in topics:
+        moving = None if self._is_own else _Moving(view, window.widened(TF_CACHE_NS))
+        for topic in self._topics:
             for rows in scan(view, topic, window, newest_first=True):
                 sources = [] if moving is None else moving.around(rows.first, rows.last)
-                groups = [] if is_own else self._sessions(rows)
+                groups = [] if moving is None else self._sessions(rows)
                 key = self._key(rows, sources, groups)
                 part = None if key is None or scanner is None else scanner.tracks.get(key)
                 if part is None:
                     if reading.expired():
                         raise QueryTimeoutError("to place poses takes too long")
                     noted = view.notes.added, len(self._failures)
-                    part = self._placed(rows, sources, groups)
+                    placed = self._placed(rows, sources, groups, thins=True)
+                    part = track_part(
+                        placed.times, placed.x, placed.y, placed.heading, placed.left_out
+                    )
                     is_sure = noted == (view.notes.added, len(self._failures))
                     if key is not None and scanner is not None and is_sure:
                         scanner.tracks.put(key, part, part.size)
@@ -171,12 +191,12 @@ class RobotTracks:
         own = sessions.of(recording)
         if sessions.has_all_kinds(own):
             return [_Group(MIN_NS, own)]
-        first, last = (sessions.lending_to(recording, at) for at in (rows.first, rows.last))
+        first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [_Group(MIN_NS, first)]
         stretches = np.unique(rows.times // STRETCH_NS).tolist()
         every = [
-            _Group(at, sessions.lending_to(recording, at))
+            _Group(at, self._lending(recording, at))
             for at in (stretch * STRETCH_NS for stretch in stretches)
         ]
         return [
@@ -185,30 +205,48 @@ class RobotTracks:
             if not nth or group.session != every[nth - 1].session
         ]
 
-    def _placed(
-        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group]
-    ) -> TrackPart:
-        """Returns the track by the poses of some rows."""
-        ends = [group.since for group in groups[1:]] + [MAX_NS]
-        found: list[_Placed] = []
-        poses = None if self._body is not None else self._poses(rows)
-        for group, end in zip(groups or [_Group(MIN_NS, frozenset())], ends, strict=True):
-            span = TimeWindow(max(group.since, rows.first), min(end, rows.last + 1))
-            frames = self._frames(sources, span, group.session) if groups else None
-            if poses is not None:
-                found.append(_placed(poses.between(group.since, end), frames, self._frame_id))
-            elif self._body is not None and frames is not None:
-                edges = edges_of_rows(self._view, rows, group.session)
-                found.append(_placed_body(edges, self._body, frames, span))
-        times, x, y, heading = (
-            np.concatenate([getattr(one, name) for one in found])
-            for name in ("times", "x", "y", "heading")
-        )
-        return track_part(times, x, y, heading, sum(one.left_out for one in found))
+    def poses(self, window: TimeWindow) -> Placed:
+        """Returns all poses in a short window, in order.
 
-    def _poses(self, rows: Rows) -> Poses:
-        poses = self._reader.poses(rows)
-        return poses.rows(thinned(poses.times))
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
+        moving = None if self._is_own else _Moving(self._view, window.widened(TF_CACHE_NS))
+        found = [NOWHERE]
+        for topic in self._topics:
+            for rows in scan(self._view, topic, window, newest_first=True):
+                sources = [] if moving is None else moving.around(rows.first, rows.last)
+                groups = [] if moving is None else self._sessions(rows)
+                found.append(self._placed(rows, sources, groups, thins=False))
+        return _joined(found)
+
+    def _lending(self, recording: Path, at: Ns) -> Session:
+        """Returns the session that places a recording's poses; a note says if none, or another."""
+        session = lending_to(self._view, recording, (self._frame_id, self._own_frame), at)
+        if not session:
+            self._view.notes.add(Note(_NOT_PLACED, recording.name))
+        return session
+
+    def _placed(
+        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group], *, thins: bool
+    ) -> Placed:
+        """Returns the poses of some rows; with `thins` those that a track needs."""
+        if self._body is None:
+            poses = self._reader.poses(rows)
+            poses = poses.rows(thinned(poses.times)) if thins else poses
+        if not groups:
+            return _placed(poses, None, self._frame_id)
+        found: list[Placed] = []
+        ends = [group.since for group in groups[1:]] + [MAX_NS]
+        for group, end in zip(groups, ends, strict=True):
+            span = TimeWindow(max(group.since, rows.first), min(end, rows.last + 1))
+            frames = self._frames(sources, span, group.session)
+            if self._body is None:
+                found.append(_placed(poses.between(group.since, end), frames, self._frame_id))
+            else:
+                edges = edges_of_rows(self._view, rows, group.session)
+                found.append(_placed_body(edges, self._body, frames, span, thins=thins))
+        return _joined(found)
 
     def _frames(self, sources: Sequence[_Source], span: TimeWindow, among: Session) -> Frames:
         around = span.widened(TF_CACHE_NS)
@@ -229,8 +267,16 @@ class _Group(NamedTuple):
     session: Session
 
 
-class _Placed(NamedTuple):
-    """Poses in the asked frame: log times, metres, radians."""
+class Placed(NamedTuple):
+    """Poses of the robot in a frame.
+
+    Attributes:
+        times: log times (ns), ascending.
+        x: metres.
+        y: metres.
+        heading: radians; NaN where it is not known.
+        left_out: how many no transform placed.
+    """
 
     times: Times
     x: Floats
@@ -239,7 +285,23 @@ class _Placed(NamedTuple):
     left_out: int
 
 
-def _placed(poses: Poses, frames: Frames | None, target: str) -> _Placed:
+NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0), 0)
+
+
+def _joined(parts: Sequence[Placed]) -> Placed:
+    """Returns the poses of several tables, in order of time."""
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    return Placed(
+        times[order],
+        np.concatenate([part.x for part in parts])[order],
+        np.concatenate([part.y for part in parts])[order],
+        np.concatenate([part.heading for part in parts])[order],
+        sum(part.left_out for part in parts),
+    )
+
+
+def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
     """Returns poses in a frame; those that no transform places are left out."""
     turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
     x, y, z = (column.copy() for column in poses.positions.T)
@@ -258,23 +320,25 @@ def _placed(poses: Poses, frames: Frames | None, target: str) -> _Placed:
             valid[here] = found.valid
     kept = np.flatnonzero(valid)
     left_out = len(poses) - len(kept)
-    return _Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
+    return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _placed_body(edges: Edges, body: Body, frames: Frames, span: TimeWindow) -> _Placed:
+def _placed_body(
+    edges: Edges, body: Body, frames: Frames, span: TimeWindow, *, thins: bool
+) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
     own = [edge for (_, child), edge in edges.items() if child == body.child]
     times = np.concatenate([edge.log_times for edge in own] or [np.zeros(0, np.int64)])
     stamps = np.concatenate([edge.stamps for edge in own] or [np.zeros(0, np.int64)])
     order = np.argsort(times, kind="stable")
     order = order[(times[order] >= span.start) & (times[order] < span.stop)]
-    order = order[thinned(times[order])]
+    order = order[thinned(times[order])] if thins else order
     found = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
     if found is None:
-        return _Placed(times[:0], times[:0] * 1.0, times[:0] * 1.0, times[:0] * 1.0, 0)
+        return NOWHERE
     x, y, _ = found.translation
     valid = found.valid
-    return _Placed(
+    return Placed(
         times[order][valid],
         x[valid],
         y[valid],
@@ -341,31 +405,50 @@ def _within(edges: Edges, window: TimeWindow) -> Edges:
     return found
 
 
-def _of_one_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[TrackPart]:
-    """Returns the parts of tracks in order of time, without a second robot.
+def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
+    """Returns the parts of the track in order of time, and of others what lies beside it.
 
-    Where several recordings place a robot at a time, that which began first does.
+    Where several recordings place a robot at a time, that which began first is in the track.
     """
     parts = [(recording, part) for recording, part in found[::-1] if len(part.times)]
     parts.sort(key=lambda one: int(one[1].times[0]))
     recordings = [*dict.fromkeys(recording for recording, _ in parts)]
     if len(recordings) < 2:
-        return [part for _, part in parts]
+        return [[part for _, part in parts]]
+    others: list[list[TrackPart]] = []
     kept: list[TrackPart] = []
     pieces: list[tuple[Times, Times]] = []
     for recording in recordings:
         own = [part for each, part in parts if each == recording]
+        beside: list[TrackPart] = []
         for part in own:
             fresh = np.ones(len(part.times), np.bool_)
             for starts, stops in pieces:
                 nth = np.searchsorted(starts, part.times, side="right") - 1
                 fresh &= (nth < 0) | (part.times > stops[nth])
             kept.append(part if fresh.all() else part.some(np.flatnonzero(fresh)))
+            if not fresh.all():
+                beside.append(part.some(np.flatnonzero(~fresh)))
+        if beside:
+            others.append(beside)
         times = np.concatenate([part.times for part in own])
         times.sort()
         new = np.diff(times) > SILENCE_NS
         pieces.append((times[np.append([True], new)], times[np.append(new, [True])]))
-    return kept
+    return [kept, *others]
+
+
+def _without_jumps(parts: Parts, jumps: Mask) -> Parts:
+    """Returns parts of steps, of those that are jumps their ends alone, or both where all is in.
+
+    Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
+    """
+    jumped = jumps[parts.step]
+    begins, ends = parts.start <= 0, parts.stop >= 1
+    start = np.where(jumped & ~begins, 1.0, parts.start)
+    stop = np.where(jumped & ~ends, 0.0, parts.stop)
+    kept = ~jumped | begins | ends
+    return Parts(parts.step[kept], start[kept], stop[kept])
 
 
 def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:
@@ -382,9 +465,14 @@ def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[
     after = np.where(ends, np.arange(count), np.arange(count) + 1)
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
     parts = parts_inside(region, steps)
+    lasted = track.times[after] - track.times
+    far = np.hypot(steps.to_x - steps.x, steps.to_y - steps.y) * 1e9 > _FASTEST_MPS * lasted
+    jumps = far & (lasted > 0) & (lasted <= _JUMP_NS)
+    if jumps[parts.step].any():
+        parts = _without_jumps(parts, jumps)
     if not len(parts.step):
         return []
-    lasted = (track.times[after] - track.times)[parts.step]
+    lasted = lasted[parts.step]
     begin = track.times[parts.step]
     starts = begin + np.rint(lasted * parts.start).astype(np.int64)
     stops = begin + np.rint(lasted * parts.stop).astype(np.int64)

@@ -1,7 +1,7 @@
 """Visits to a place: arrival, departure and closest approach, newest first.
 
-A visit is pose after pose within the radius. It is over when the robot is farther away for some
-seconds, and where for longer there is no pose to know it by. When odometry is reset, the same
+A visit is pose after pose inside. It is over when the robot is outside for some seconds, and where
+for longer there is no pose to know it by. When odometry is reset, the same
 coordinates are another place: visits from before that are marked.
 """
 
@@ -9,64 +9,36 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import chain, pairwise
-from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import motion_decoder
-from ros2_memory.analysis.conditions import Condition, NearPosition
-from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.dwell import FLICKER_NS, Approach, DwellBuilder, Unread
-from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
-from ros2_memory.core.spans import COPY_HORIZON_NS
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
-from ros2_memory.history.bag_groups import StoredDigests, groups_of
+from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.driven_path import (
-    POSES,
-    add_poses,
     driven_path,
     pose_frame,
-    positions_of,
     resolve_path_topic,
 )
 from ros2_memory.history.no_data import require_recorded
-from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
-from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, region_visits, visit_of
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from ros2_memory.analysis.motion.dwell import Dwell
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.core.model import JsonValue, Pose, Vector3
-    from ros2_memory.core.regions import Region
-    from ros2_memory.history.bag_groups import Group
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.places.map_placement import MapPlacement
 
-_COUNTING_S: Final = 5.0
-"""How long visits are counted that are not shown."""
-_ROUNDING_M: Final = 1e-6
-"""What rounding of doubles may take off a distance."""
-_FLICKERS: Final = -(-SILENCE_NS // FLICKER_NS)
-"""So many visits may be in the margin of a window: poses just outside decide what is one visit."""
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
 
@@ -123,18 +95,7 @@ def visits(
             places=found,
             notes=view.notes.sentences(),
         )
-    search = _VisitSearch(view, topic, placement, place.region, window)
-    by_track = where is not None or placement.moves or topic in memory.limits.tf_topics
-    # A lake has the track alone, of which few poses are vertices.
-    by_track = by_track or memory.stated is not None
-    # In the poses' own frame as in the map: by the track, where that map moves.
-    by_track = by_track or (asked == own_frame and map_placement(view, own_frame, topic).moves)
-    if by_track:
-        known = _by_track(view, search, placement.frame_id, place, (window, now, limit))
-    else:
-        known = _by_poses(view, search, window, now, limit)
-    # Its rows say which visit was under way, which only the ends of recordings cut.
-    is_unbounded = not by_track and start_s is None and end_s is None
+    known = _by_track(view, topic, placement.frame_id, place, (window, now, limit))
     known = known._replace(shown=tuple(_within_asked(each, window) for each in known.shown))
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
@@ -152,8 +113,8 @@ def visits(
         total=known.total,
         now=now,
         duration=known.duration,
-        entries=None if is_unbounded else known.entries,
-        exits=None if is_unbounded else known.exits,
+        entries=known.entries,
+        exits=known.exits,
         all_counted=known.is_all,
         where=place.name,
         notes=view.notes.sentences(),
@@ -203,58 +164,27 @@ def asked_place(
 
 
 def _by_track(
-    view: View,
-    search: _VisitSearch,
-    frame_id: str,
-    place: Where,
-    bounds: tuple[TimeWindow, Ns, int],
+    view: View, topic: str, frame_id: str, place: Where, bounds: tuple[TimeWindow, Ns, int]
 ) -> _Known:
-    """Returns the visits by the robot's track."""
+    """Returns the visits by the robot's track; those to show by its poses."""
     window, now, limit = bounds
     found = region_visits(view, frame_id, place, window)
-    newest = search.newest_time
+    newest = _newest(view, topic, found.track, window)
     current = newest if _is_current(view, newest, now) else None
-    shown = tuple(visit_of(found, each, place, current) for each in found.all[:limit])
-    entries, exits = sum(each.entered for each in found.all), sum(each.left for each in found.all)
+    some = range(min(limit, len(found.all)))
+    shown = tuple(visit_of(found, nth, place, current) for nth in some)
+    entries, exits = sum(one.entered for one, _ in found.all), sum(one.left for one, _ in found.all)
     return _Known(
         shown, len(found.all), found.duration, newest, entries, exits, is_all=found.is_all
     )
 
 
-def _by_poses(view: View, search: _VisitSearch, window: TimeWindow, now: Ns, limit: int) -> _Known:
-    """Returns the visits pose by pose."""
-    newest = search.newest_time
-    known = _is_current(view, newest, now)
-    every = search.all(limit)
-    left = [search.has_left(each) for each in every]
-    elapsed = elapsed_in(view, window)
-    lasted = [
-        elapsed.between(max(each.arrived, window.start), min(each.departed, window.stop - 1))
-        for each in every
-    ]
-    shown: list[Visit] = []
-    for dwell, is_left, duration in list(zip(every, left, lasted, strict=True))[:limit]:
-        closest = search.closest(dwell)
-        is_there = known and dwell.departed == newest
-        shown.append(
-            Visit(
-                arrived=max(dwell.arrived, window.start) if dwell.begun else None,
-                departed=None if is_there else min(dwell.departed, window.stop - 1),
-                duration=duration,
-                closest_m=None if closest is None else closest.distance_m,
-                closest_at=None if closest is None else closest.time,
-                restarts=0,
-                already_inside=dwell.begun and not _entered(dwell, window),
-                still_inside=not is_there and (is_left is False or dwell.departed >= window.stop),
-            )
-        )
-    entries = sum(_entered(each, window) for each in every)
-    exits = sum(
-        bool(is_left) and each.departed < window.stop
-        for each, is_left in zip(every, left, strict=True)
-    )
-    is_all = search.is_all
-    return _Known(tuple(shown), len(every), sum(lasted), newest, entries, exits, is_all=is_all)
+def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow) -> Ns | None:
+    """Returns the time of the newest pose, where the window reaches as far; else None."""
+    message = view.stream.newest(topic, TimeWindow.everything())
+    if message is None or not len(track.times) or window.stop <= message.time:
+        return None
+    return int(track.times[-1])
 
 
 def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
@@ -263,10 +193,6 @@ def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
     if visit.arrived == window.start:
         visit = replace(visit, arrived=start)
     return replace(visit, departed=end) if visit.departed == window.stop - 1 else visit
-
-
-def _entered(dwell: Dwell, window: TimeWindow) -> bool:
-    return dwell.entered and dwell.arrived >= window.start
 
 
 def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
@@ -318,255 +244,3 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
         view.notes.add("there was no time to check whether odometry restarted since")
         return ()
     return () if path is None else path.trajectory.totals.resets
-
-
-class _VisitSearch:
-    """Searches the poses of a topic, newest first, without bags that are ruled out.
-
-    Attributes:
-        is_all: whether the time was enough to find all visits.
-    """
-
-    def __init__(
-        self, view: View, topic: str, placement: MapPlacement, region: Region, window: TimeWindow
-    ) -> None:
-        self._window = window
-        # What is one visit, and was entered or left, is decided by poses just outside, too.
-        self._within = window.widened(SILENCE_NS)
-        self._view = view
-        self._topic = topic
-        self._placement = placement
-        circle = region if isinstance(region, Circle) else Circle(0.0, 0.0, 0.0)
-        self._x, self._y, self._radius = circle.x, circle.y, circle.radius_m
-        self._digests = StoredDigests(view, topic, POSES, window)
-        self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
-        self._counting: Deadline | None = None
-        self.is_all = True
-
-    @property
-    def newest_time(self) -> Ns | None:
-        """The log time of the newest pose; None without one."""
-        if self._topic in self._view.memory.limits.tf_topics:
-            newest = self._view.stream.newest(self._topic, TimeWindow.everything())
-            return None if newest is None else newest.time
-        return next((found.time for found, _ in self._positions(TimeWindow.everything())), None)
-
-    def all(self, limit: int) -> list[Dwell]:
-        """Returns the visits, newest first; if the time runs out before all, at least some.
-
-        A note then says how far back they were counted.
-        """
-        visits = DwellBuilder(limit + _FLICKERS)
-        before = self._within.stop
-        try:
-            for part in self._parts():
-                self._pass_over(visits, TimeWindow(part.stop, max(before, part.stop)))
-                self._add_part(visits, part)
-                before = part.start
-                if visits.enough and self._counting is None:
-                    self._counting = self._view.call.partial_after(_COUNTING_S)
-                self._check_counting()
-            self._pass_over(visits, TimeWindow(self._within.start, before))
-            visits.end()
-        except QueryTimeoutError:
-            if not visits.all:
-                raise
-            self.is_all = False
-            self._view.notes.complete = False
-            if self._counting is None:
-                self._view.notes.add(f"the search ran out of time at {unix_text(before)}")
-            self._view.notes.add(
-                f"total counts the visits back to {unix_text(before)}: there may be more"
-            )
-        return [each for each in visits.all if self._window.overlaps(each.arrived, each.departed)]
-
-    def has_left(self, visit: Dwell) -> bool | None:
-        """Whether the robot was seen elsewhere just after a visit; None without time to know."""
-        if visit.left is None:
-            after = TimeWindow(visit.departed + 1, visit.departed + SILENCE_NS + 1)
-            try:
-                messages = self._view.stream.messages([self._topic], after)
-                visit.left = any(True for _ in positions_of(self._view, self._decoder, messages))
-            except QueryTimeoutError:
-                self._view.notes.complete = False
-        return visit.left
-
-    def _check_counting(self) -> None:
-        """Checks that there is time left to count visits that are not shown.
-
-        Raises:
-            QueryTimeoutError: there is none.
-        """
-        if self._counting is not None and self._counting.expired():
-            raise QueryTimeoutError("counting takes too long")
-
-    def closest(self, visit: Dwell) -> Approach | None:
-        """Returns the closest pose of a visit, the earliest of equals; None where it has none.
-
-        Whole bags within the radius are read only where one of their poses may be closer.
-        """
-        closest = visit.closest
-        for bound, window, target in sorted(visit.unread, key=attrgetter("bound")):
-            if closest is not None and closest <= bound:
-                break
-            approaches = [] if closest is None else [closest]
-            try:
-                self._add_approaches(approaches, window, target)
-            except QueryTimeoutError:
-                self._view.notes.complete = False
-                self._view.notes.add(
-                    f"closest_m of the visit until {unix_text(visit.departed)} is not the least: "
-                    "there was no time to read all of its poses"
-                )
-                return min(approaches, default=bound)
-            closest = min(approaches, default=None)
-        # Bags that were deleted meanwhile leave their bounds.
-        closest = closest or min(each.bound for each in visit.unread)
-        return closest if math.isfinite(closest.distance_m) else None
-
-    def _add_approaches(
-        self, approaches: list[Approach], window: TimeWindow, target: tuple[float, float]
-    ) -> None:
-        def add(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
-            if is_place(pose.position):
-                approaches.append(Approach(_away(pose.position, target), time))
-
-        messages = self._view.stream.messages([self._topic], window)
-        add_poses(self._view, add, self._decoder, messages, [])
-
-    def _parts(self) -> Iterator[TimeWindow]:
-        """Yields the times in which the robot may have been near, newest first.
-
-        Each is in the window as a whole, or beyond it.
-        """
-        start, stop = self._window.start, self._window.stop
-        newer, older = TimeWindow(stop, self._within.stop), TimeWindow(self._within.start, start)
-        for part in self._near():
-            for each in map(part.intersect, (newer, self._window, older)):
-                if not each.empty:
-                    yield each
-
-    def _near(self) -> Iterator[TimeWindow]:
-        if self._view.stream.may_be_relatched([self._topic]):
-            # A visit may be ended by the duplicate of a pose in a bag that is ruled out.
-            yield self._within
-            return
-        bags = self._view.stream.overlapping_bags([self._topic], self._within)
-        target = (
-            self._target_in(bags[0]) if self._placement.is_fixed(self._topic) and bags else None
-        )
-        if target is None:  # its coordinates are not the same in all bags, so none is ruled out
-            near = Condition(NearPosition(0.0, 0.0, None, math.inf))
-        else:
-            near = Condition(NearPosition(*target, None, self._radius))
-        for part in CandidateBags(self._view, (self._topic,), near, self._within.stop).windows():
-            if part.window.stop <= self._within.start:
-                return
-            yield part.window
-
-    def _pass_over(self, visits: DwellBuilder, gap: TimeWindow) -> None:
-        """Adds the poses between two parts, which are all elsewhere, until the visit is over."""
-        if gap.empty or not visits.under_way:
-            return
-        for found, _ in self._positions(gap):
-            if not visits.away(found.time):
-                return
-
-    def _add_part(self, visits: DwellBuilder, part: TimeWindow) -> None:
-        """Adds the poses of a part: by their digest where that is enough, else one by one."""
-        groups = groups_of(self._view.stream, self._topic, part)
-        alone = len(groups) == 1 and groups[0].is_whole and not self._may_have_duplicates(part)
-        alone = alone and self._window.covers(part.start, part.stop - 1)
-        target = self._target_in(groups[0].bags[0]) if alone else None
-        if target is not None:
-            known = self._digests.of(groups[0])
-            if known is not None and self._add_digest(visits, groups[0], *known, target):
-                return
-        self._placement.use_window(part)
-        for found, position in self._positions(part):
-            self._check_counting()
-            distance = self._distance(found, position)
-            if distance is not None and distance <= self._radius:
-                counts = self._window.contains(found.time)
-                visits.near(Approach(distance if counts else math.inf, found.time))
-            else:
-                visits.away(found.time)
-
-    def _add_digest(
-        self,
-        visits: DwellBuilder,
-        group: Group,
-        digest: PoseDigest,
-        span: tuple[Ns, Ns],
-        target: tuple[float, float],
-    ) -> bool:
-        """Adds a whole group by the digest of its poses; False where that is not enough to know."""
-        if digest.invalid or not digest.vertices:
-            return False
-        path = [vertex[1] for vertex in digest.vertices]
-        first, last = digest.vertices[0][0], digest.vertices[-1][0]
-        error_m = digest.error_m + _ROUNDING_M
-        bound_m = _off_path(path, target) - error_m
-        if bound_m > self._radius:
-            visits.away(first, last)
-            return True
-        near = all(_away(position, target) + error_m <= self._radius for position in path)
-        if not near or not self._unbroken(group, digest, span):
-            return False
-        if digest.error_m == 0 and len({*path}) == 1:
-            # The robot stood still: the digest has the exact position of all poses.
-            visits.near(Approach(_away(path[0], target), first), last)
-            return True
-        bound = Approach(max(bound_m, 0.0), span[0])
-        visits.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), target))
-        return True
-
-    def _unbroken(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
-        """Whether no silence between two poses of a group is long enough to end a visit."""
-        first, last = span
-        if last - first <= SILENCE_NS:
-            return True
-        if len(group.bags) > 1:
-            return False
-        bag, window = group.bags[0].bag, TimeWindow(first, last + 1)
-        times = self._view.bags.log_times(bag, self._topic, window)
-        return len(times) == digest.poses and all(
-            after - before <= SILENCE_NS for before, after in pairwise(times)
-        )
-
-    def _may_have_duplicates(self, part: TimeWindow) -> bool:
-        """Whether another recording may hold the original of a pose in a part."""
-        wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
-        bags = self._view.stream.overlapping_bags([self._topic], wider)
-        return len({each.bag.recording for each in bags}) > 1
-
-    def _target_in(self, held: BagSpan) -> tuple[float, float] | None:
-        """Returns the target in the frame of a bag's poses; None where that frame moves."""
-        return self._placement.to_pose_frame(held.bag.recording, held.first, self._x, self._y)
-
-    def _distance(self, found: StoredMessage, position: Vector3) -> float | None:
-        """Returns how far (m) a pose is from the target; None if no transform connects them."""
-        recording = found.bag.recording
-        target = self._placement.to_pose_frame(recording, found.time, self._x, self._y)
-        if target is not None:
-            return _away(position, target)
-        placed = self._placement.of(recording, found.time, position)
-        return None if placed is None else _away(placed, (self._x, self._y))
-
-    def _positions(self, part: TimeWindow) -> Iterator[tuple[StoredMessage, Vector3]]:
-        """Returns the positions of a part, newest first."""
-        messages = self._view.stream.messages([self._topic], part, newest_first=True)
-        return positions_of(self._view, self._decoder, messages)
-
-
-def _away(position: Vector3, target: tuple[float, float]) -> float:
-    """Returns how far (m, in the plane) a position is from a place of the same frame."""
-    return math.dist(position[:2], target)
-
-
-def _off_path(path: Sequence[Vector3], target: tuple[float, float]) -> float:
-    """Returns how far (m, in the plane) a place is from a path of the same frame."""
-    # Each vertex by itself too: a part of the path may be a single vertex.
-    pairs = chain(zip(path, path, strict=True), pairwise(path))
-    gaps = [off_segment(target, before[:2], after[:2]) for before, after in pairs]
-    return min(gap for gap in gaps if not math.isnan(gap))

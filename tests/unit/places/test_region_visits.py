@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +13,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory import queries
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call
+from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
+from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, recalling
 from tests.support.moving_map import BEGIN, S, write_moving_map
@@ -212,3 +216,34 @@ def test_visits_are_the_same_whatever_the_catalogue_knows(
             {"x": 0.5, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"},
         ):
             assert answer(memory, given) == answer(known, given)
+
+
+def test_the_poses_that_are_reported_in_a_place_are_visited(tmp_path: Path) -> None:
+    """A map that jumps by a metre once a second: positions and visits interpolate it alike."""
+    messages = []
+    for tick in range(1, 300):
+        at = BEGIN + tick * S // 10
+        messages.append(odom(at, 0.01 * tick, 0.0))
+        if tick % 10 == 1:
+            jump = 1.0 if tick // 10 % 3 == 0 else 0.0
+            messages.append(tf(at, transform(at, "map", "odom", (jump, 0.0, 0.0))))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    there = visits(memory, Call(), 2.0, 0.0, radius_m=0.3, frame_id="map", limit=100)
+    assert there.visits
+    inside = 0
+    for message in messages:
+        if message.topic != "/odom" or message.log_time > messages[-10].log_time:
+            continue
+        moment = AtTime(message.log_time / 1e9)
+        place = queries.position(memory, Call(), moment, frame_id="map").pose.position
+        if math.dist(place[:2], (2.0, 0.0)) < 0.3 - 1e-3:
+            inside += 1
+            assert any(
+                (visit.arrived or 0) <= message.log_time <= (visit.departed or 2**62)
+                for visit in there.visits
+            )
+    assert inside > 5
+    times = {message.log_time for message in messages}
+    assert {visit.arrived for visit in there.visits[:-1]} <= times
+    assert {visit.closest_at for visit in there.visits} <= times

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.motion.robot_track import TOLERANCE_M
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -355,9 +356,12 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
             first = visit.arrived or BEGIN
             last = visit.departed if visit.departed is not None else poses[-1][0]
             inside = [(math.dist((px, py), place), t) for t, px, py in poses if first <= t <= last]
-            distance, when = min(inside)
-            assert visit.closest_m == pytest.approx(distance, abs=1e-12)
-            assert visit.closest_at == when
+            distance, _ = min(inside)
+            # It is a pose, as near as the track knows.
+            [(at, px, py)] = [pose for pose in poses if pose[0] == visit.closest_at]
+            assert visit.closest_m == pytest.approx(math.dist((px, py), place), abs=1e-4)
+            assert visit.closest_m <= distance + 2 * TOLERANCE_M
+            assert {visit.arrived, visit.departed} <= {t for t, *_ in poses} | {None}
         assert told.total == len(told.visits)
         assert visits(recalling(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
 
@@ -433,23 +437,6 @@ def test_total_counts_the_visits_that_are_not_shown_too(tmp_path: Path, recalls:
     assert answer.more
     assert answer.total == 4
     assert not answer.notes
-
-
-def test_total_is_what_was_counted_where_the_time_is_over(tmp_path: Path) -> None:
-    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
-    memory = remembering(tmp_path, line(*there_and_back))
-    totals = set()
-    for looks in range(1, 60):
-        call = Call(Deadline.after(looks, iter(range(100_000)).__next__))
-        try:
-            answer = visits(memory, call, 10.0, 0.0, radius_m=1.0, limit=1)
-        except QueryTimeoutError:
-            continue
-        assert answer.total >= len(answer.visits)
-        assert (answer.total < 4) <= any("total counts" in note for note in answer.notes)
-        totals.add(answer.total)
-    assert 4 in totals
-    assert len(totals) > 1
 
 
 @settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -483,7 +483,7 @@ def test_a_look_after_a_warm_up_reads_nothing_that_is_stored(
     assert memory.recall is not None
     fresh = replace(memory, recall=DigestCache(memory.recall.catalogue, bag_dir))
     assert warm_up(fresh, dispatcher)
-    for name in ("maps", "sights", "standstills", "poses"):
+    for name in ("sights", "standstills", "poses"):
         monkeypatch.setattr(Catalogue, name, lambda *_given, **_more: pytest.fail("was read"))
     found = shown(fresh, "last=1000")
     for key in ("path", "events", "things", "distance_m"):
@@ -501,7 +501,7 @@ def test_a_transform_after_a_warm_up_gathers_no_static_ones(
     memory = memory_of(tmp_path)
     dispatcher = Dispatcher(memory, [], Replies(tmp_path, 9_000), call_timeout_s=5)
     assert warm_up(memory, dispatcher)
-    gathered = "ros2_memory.history.transforms._once_decoded"
+    gathered = "ros2_memory.history.transforms._received"
     monkeypatch.setattr(gathered, lambda *_: pytest.fail("was gathered"))
     found = transform_at(View(memory, Call()), "odom", "camera", at + S)
     assert found.transform.translation == pytest.approx((1.2, 0.0, 0.5))

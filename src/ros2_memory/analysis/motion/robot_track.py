@@ -162,7 +162,8 @@ def _continuous(turns: Times, settled: Mask) -> Times:
     steps = np.diff(turns, prepend=turns[:1])
     short = (steps + _TURN // 2) % _TURN - _TURN // 2
     among = settled & np.append([False], settled[:-1])[: len(settled)]
-    whole: Times = turns[:1].sum() % _TURN + np.cumsum(np.where(among, steps, short))
+    first = (turns[:1].sum() + _TURN // 2) % _TURN - _TURN // 2
+    whole: Times = first + np.cumsum(np.where(among, steps, short))
     return whole
 
 

@@ -6,6 +6,7 @@ only for what is new since its last look.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -397,7 +398,7 @@ def _last(track: RobotTrack) -> JsonObject | None:
         "t": _s(int(track.times[-1])),
         "x": rounded(float(track.x[-1]), 3),
         "y": rounded(float(track.y[-1]), 3),
-        "yaw": degrees(float(track.heading[-1])),
+        "yaw": degrees(float(track.heading[-1]) % math.tau),
     }
 
 
