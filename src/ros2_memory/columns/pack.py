@@ -63,8 +63,8 @@ if TYPE_CHECKING:
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Values = TypeVar("Values", "IntArray", "Floats")
 
-FORMAT: Final = 2
-"""Version of the bytes. Raise it with every change of what this module or `blob` writes."""
+FORMAT: Final = 3
+"""Version of the file. Raise it with every change of its tables and of their bytes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4
 """Of zstd. A blob of 10 s takes 0.5 ms; level 1 half of that and 7 % more bytes, level 6 0.8 ms and

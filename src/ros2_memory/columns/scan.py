@@ -21,6 +21,7 @@ from ros2_memory.columns.pack import decompressed, unpack
 from ros2_memory.columns.parts import part_table
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
+from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from ros2_memory.columns.pack import Packed
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.table import Column, Table
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import Zones
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
@@ -69,7 +72,8 @@ class Asked:
         decode: decodes a topic of a bag that is not stored.
         shared: the half-open spans in which different recordings may hold copies, in order.
         relatches: whether recordings may have received a message again, as of a latched topic.
-        may_match: whether rows of a part may be wanted, told by its zones; others are left out.
+        may_match: says by zones which parts may have rows that are wanted, of each or of all;
+            the others are left out.
         may_be_empty: whether rows are yielded also where none of them counts. Which do is then
             found out only where that is asked.
         check: is called before each table with a log time that what is left does not lie behind
@@ -82,7 +86,7 @@ class Asked:
     decode: Decode
     shared: Sequence[tuple[Ns, Ns]] = ()
     relatches: bool = False
-    may_match: Callable[[Table], bool] = lambda _: True
+    may_match: Callable[[PartZones], bool | Mask] | None = None
     may_be_empty: bool = False
     check: Callable[[Ns], None] = lambda _: None
 
@@ -131,11 +135,10 @@ class _Heads:
             live,
         )
 
-    def within(self, window: TimeWindow) -> Iterator[PartHead]:
-        """Yields the parts that may have rows in a window."""
+    def within(self, window: TimeWindow) -> list[PartHead]:
+        """Returns the parts that may have rows in a window."""
         here = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
-        for nth in np.flatnonzero(here).tolist():
-            yield self.heads[nth]
+        return [self.heads[nth] for nth in np.flatnonzero(here).tolist()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +167,7 @@ class Scanner:
         self._covering = None if store is None else Covering(store, bag_dir)
         self._columns: ByteLru[Column] = ByteLru(48 << 20)
         self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
+        self._all_zones: ByteLru[Zones] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
@@ -183,10 +187,10 @@ class Scanner:
         """Returns which bags of a timeline are stored; None without a store."""
         return None if self._covering is None else self._covering.of(timeline)
 
-    def parts(self, topic: str, window: TimeWindow, coverage: Coverage) -> Iterator[PartHead]:
-        """Yields the parts of a topic that may have rows in a window."""
+    def parts(self, topic: str, window: TimeWindow, coverage: Coverage) -> list[PartHead]:
+        """Returns the parts of a topic that may have rows in a window."""
         if self.store is None:
-            return
+            return []
         state = coverage.state
         known = self._heads.get(topic)
         if known is None or known.coverage is not coverage:
@@ -200,15 +204,37 @@ class Scanner:
             known = _Heads.of(heads, coverage)
             if self.store.failures == failures:
                 self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
-        yield from known.within(window)
+        return known.within(window)
 
-    def part(
-        self,
-        head: PartHead,
-        coverage: Coverage,
-        may_match: Callable[[Table], bool] = lambda _: True,
-    ) -> PartUnit | None:
-        """Returns a part; None where no row of it counts, or none may match.
+    def matching(
+        self, heads: Sequence[PartHead], may_match: Callable[[PartZones], bool | Mask]
+    ) -> Mask:
+        """Returns which of some parts may have rows that are wanted, by their zones."""
+        found = np.ones(len(heads), np.bool_)
+        topics = np.array([head.topic for head in heads], np.int64)
+        numbers = np.array([head.number for head in heads], np.int64)
+        for number in np.unique(topics).tolist():
+            topic = None if self.store is None else self.store.topic(number)
+            if topic is not None:
+                own = topics == number
+                zones = partial(self._zones, number, numbers[own])
+                found[own] = may_match(PartZones(topic, zones))
+        return found
+
+    def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
+        """Returns the zones of a column in some parts of a topic."""
+        assert self.store is not None  # noqa: S101 - there are no parts without one
+        key = (self.store.offset, topic, path)
+        known = self._all_zones.get(key)
+        newest = 0 if known is None or not known.parts.size else int(known.parts[-1])
+        if known is None or (parts.size and int(parts.max()) > newest):
+            newer = self.store.zones(topic, path, newest)
+            known = newer if known is None else known.joined(newer)
+            self._all_zones.put(key, known, known.memory_bytes)
+        return known.among(parts)
+
+    def part(self, head: PartHead, coverage: Coverage) -> PartUnit | None:
+        """Returns a part; None where no row of it counts.
 
         Raises:
             GoneError: it was deleted meanwhile.
@@ -225,8 +251,6 @@ class Scanner:
             return self._column(head.number, path, columns[path])
 
         table = part_table(topic, columns, load)
-        if not may_match(table):
-            return None
         counting = coverage.among(head.bags)
         if not counting.size:
             return None
@@ -308,7 +332,12 @@ class _Scan:
         sources = self._sources
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
-        window = self._asked.window
+        window, may_match = self._asked.window, self._asked.may_match
+        if may_match is not None:
+            heads = [source.part for source in sources if source.part is not None]
+            wanted = self._scanner.matching(heads, may_match)
+            ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
+            sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
         ahead = together = 1
         for nth, source in enumerate(sources):
             if nth == ahead:
@@ -319,7 +348,7 @@ class _Scan:
                 self._scanner.look_up(parts)
             if window.overlaps(source.first, source.last):
                 self._asked.check(source.last if newest_first else source.first)
-                for unit in self._units(source, self._asked.may_match):
+                for unit in self._units(source):
                     rows = Rows(unit, partial(self._counting, unit))
                     if self._asked.may_be_empty or len(rows):
                         yield rows
@@ -369,11 +398,9 @@ class _Scan:
             if reach.overlaps(bag.start, bag.end) and bag.summary.of(topic):
                 yield _Source(*bag.summary.span_of([topic]), None, bag)
 
-    def _units(
-        self, source: _Source, may_match: Callable[[Table], bool] = lambda _: True
-    ) -> Iterable[Unit]:
+    def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage, may_match)
+            unit = self._scanner.part(source.part, self._coverage)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         known = self._decoded.get(source.bag.file)

@@ -3,8 +3,9 @@
 Everything here is derived: deleting the file changes no answer, only how long it takes. A bag is
 stored whole or not at all. Until the ten minutes that it begins in are over, its columns lie in one
 row (`split`). Then those of one recording become parts, one for each topic (`part`), column by
-column (`part_column`). A part has rows of several bags, and names them: rows of a bag that is not
-in `bag` any more do not count.
+column (`part_column`). What is known of a column without unpacking it lies apart from the parts
+(`zone`), next to that of the same column in the other parts: a search reads it at once. A part has
+rows of several bags, and names them: rows of a bag that is not in `bag` any more do not count.
 
 A bag is known by its path below the bag directory, its size and mtime, and the mtime of the sidecar
 that says which of its messages count. Its number is never used twice.
@@ -39,6 +40,9 @@ from ros2_memory.columns.writing import (
     within,
     zone_of,
 )
+from ros2_memory.columns.zones import Zones
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
@@ -47,7 +51,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Definition, IntArray
 
@@ -57,14 +60,26 @@ LONG_NS: Final[Ns] = 2 * PART_NS
 
 TABLES: Final = Tables(
     version=FORMAT,
-    names=("bag", "topic", "definition", "split", "part", "part_column", "deletion"),
+    names=(
+        "bag",
+        "summary",
+        "topic",
+        "definition",
+        "split",
+        "part",
+        "part_column",
+        "zone",
+        "deletion",
+    ),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
     pragmas=("page_size = 4096", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
     statements="""
 CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQUE,
   size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  hashed INTEGER NOT NULL, definitions TEXT NOT NULL);
+  hashed INTEGER NOT NULL, definitions TEXT NOT NULL, summary INTEGER NOT NULL,
+  counts BLOB NOT NULL);
+CREATE TABLE summary (id INTEGER PRIMARY KEY, topics TEXT NOT NULL UNIQUE);
 CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, encoding TEXT NOT NULL,
   latched INTEGER NOT NULL, definition INTEGER NOT NULL, layout TEXT NOT NULL,
   UNIQUE (name, encoding, latched, definition, layout));
@@ -75,9 +90,11 @@ CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
   bags TEXT NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
-CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, codec TEXT NOT NULL,
-  count INTEGER NOT NULL, least, greatest, nulls INTEGER NOT NULL, error REAL NOT NULL,
-  words TEXT, data BLOB, PRIMARY KEY (part, path)) WITHOUT ROWID;
+CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB,
+  PRIMARY KEY (part, path)) WITHOUT ROWID;
+CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
+  codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
+  nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
 CREATE TABLE deletion (id INTEGER PRIMARY KEY AUTOINCREMENT);
 """,
 )
@@ -195,6 +212,34 @@ class ColumnStore(Database):
 
         return self.read(ask, State(-1, -1, (-1, -1)))
 
+    def known_files(self, bag_dir: Path) -> dict[str, BagFile]:
+        """Returns every bag that is stored as it was indexed, by its whole path."""
+        root = f"{bag_dir}{os.sep}"
+
+        def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
+            schemas = {
+                number: SummarySchema.from_json(topics)
+                for number, topics in connection.execute("SELECT id, topics FROM summary")
+            }
+            rows = connection.execute(
+                "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns"
+                " FROM bag WHERE size >= 0"
+            )
+            return {
+                file: BagFile(
+                    file,
+                    size,
+                    mtime,
+                    BagState.CLOSED,
+                    BagSummary.decoded(schemas[schema], counts),
+                    *rest,
+                )
+                for path, size, mtime, schema, counts, *rest in rows
+                for file in [root + path]
+            }
+
+        return self.read(ask, {})
+
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
 
@@ -239,7 +284,7 @@ class ColumnStore(Database):
         def ask(connection: sqlite3.Connection) -> dict[str, Ns]:
             rows = connection.execute(
                 "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
-                " WHERE part.id IN (SELECT part FROM part_column WHERE codec = ?)"
+                " WHERE part.id IN (SELECT part FROM zone WHERE codec = ?)"
                 " GROUP BY name ORDER BY name",
                 (DROPPED,),
             )
@@ -332,13 +377,29 @@ class ColumnStore(Database):
 
         return self.read(ask, [])
 
+    def zones(self, topic: int, path: str, after: int = 0) -> Zones:
+        """Returns the zones of a column in all parts of a topic that are newer than a part."""
+
+        def ask(connection: sqlite3.Connection) -> Zones:
+            rows = connection.execute(
+                "SELECT part, least, greatest, nulls, words FROM zone"
+                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
+                (topic, path, max(after - self.offset, 0)),
+            ).fetchall()
+            parts = [self.offset + part for part, *_ in rows]
+            return Zones.of(parts, [zone_of(*zone) for _, *zone in rows])
+
+        return self.read(ask, Zones.of([], []))
+
     def part_columns(self, parts: Sequence[int]) -> dict[int, dict[str, Packed]]:
         """Returns what is known of each column of some parts, without its values."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, dict[str, Packed]]:
             rows = connection.execute(
-                "SELECT part, path, codec, count, error, least, greatest, nulls, words"
-                " FROM part_column WHERE part IN (SELECT value FROM json_each(?))",
+                "SELECT id, path, codec, count, error, least, greatest, nulls, words"
+                " FROM part CROSS JOIN part_column ON part_column.part = id"
+                " CROSS JOIN zone USING (topic, path, part)"
+                " WHERE id IN (SELECT value FROM json_each(?))",
                 (json.dumps([part - self.offset for part in parts]),),
             )
             found: dict[int, dict[str, Packed]] = {part: {} for part in parts}

@@ -69,6 +69,39 @@ class Zone(NamedTuple):
         """The greatest value; minus infinity where there is none."""
         return -math.inf if self.greatest is None else self.greatest
 
+    def spans(self, number: float) -> bool:
+        """Returns whether a number may be a value."""
+        return self.low <= number <= self.high
+
+    def reaches(self, limit: float, *, above: bool) -> bool:
+        """Returns whether some value lies above a limit, or below it."""
+        return self.high > limit if above else self.low < limit
+
+    def is_near(self, place: float, distance: float) -> bool:
+        """Returns whether some value may be within a distance of a place."""
+        return as_float(self.low) - place <= distance and place - as_float(self.high) <= distance
+
+    def may_have(self, text: str) -> bool:
+        """Returns whether a casefolded text may be part of a value."""
+        return self.words is None or text in self.words
+
+    @property
+    def may_be_json(self) -> bool:
+        """Whether a text may be a JSON array or object."""
+        return self.words is None or "[" in self.words or "{" in self.words
+
+    def divided(self, by: int) -> Zone:
+        """Returns the zone of the values divided by a positive number."""
+        return Zone(self.low / by, self.high / by, self.nulls)
+
+
+def as_float(number: float) -> float:
+    """Returns the float nearest to a number; infinite where it is too large for one."""
+    try:
+        return float(number)
+    except OverflowError:
+        return math.copysign(math.inf, 1 if number > 0 else -1)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Texts:

@@ -136,10 +136,12 @@ def insert_bag(
     connection: sqlite3.Connection, key: BagKey, bag: BagFile, definitions: str, *, hashed: bool
 ) -> int:
     """Inserts a bag; returns its number."""
+    summary = _number_of(connection, "summary", {"topics": bag.summary.schema.to_json()})
+    times = (bag.start, bag.end, _messages_of(bag))
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
-        " definitions) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, bag.start, bag.end, _messages_of(bag), hashed, definitions),
+        " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (*key, *times, hashed, definitions, summary, bag.summary.packed),
     )
     return int(cursor.lastrowid or 0)
 
@@ -156,20 +158,25 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
         "INSERT INTO part (topic, first_ns, last_ns, messages, bags) VALUES (?, ?, ?, ?, ?)",
         (topic, part.first, part.last, part.messages, json.dumps(part.bags)),
     )
+    number = cursor.lastrowid
     connection.executemany(
-        "INSERT INTO part_column VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO part_column VALUES (?, ?, ?)",
+        [(number, path, packed.data or None) for path, packed in part.columns.items()],
+    )
+    connection.executemany(
+        "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             (
-                cursor.lastrowid,
+                topic,
                 path,
+                number,
                 packed.codec,
                 packed.count,
+                packed.error,
                 _storable(packed.zone.least),
                 _storable(packed.zone.greatest),
                 packed.zone.nulls,
-                packed.error,
                 packed.zone.words,
-                packed.data or None,
             )
             for path, packed in part.columns.items()
         ],
@@ -262,6 +269,11 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
         "SELECT id FROM part WHERE NOT EXISTS"
         " (SELECT 1 FROM json_each(part.bags) JOIN bag ON bag.id = value)"
     ).fetchall()
+    connection.executemany(
+        "DELETE FROM zone WHERE (topic, path, part) IN (SELECT topic, path, part"
+        " FROM part JOIN part_column ON part_column.part = part.id WHERE part.id = ?)",
+        gone,
+    )
     connection.executemany("DELETE FROM part_column WHERE part = ?", gone)
     connection.executemany("DELETE FROM part WHERE id = ?", gone)
     connection.execute("INSERT INTO deletion DEFAULT VALUES")

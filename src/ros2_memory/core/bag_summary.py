@@ -7,6 +7,7 @@ it is asked for.
 
 from __future__ import annotations
 
+import json
 import struct
 import sys
 from dataclasses import dataclass
@@ -86,6 +87,26 @@ class SummarySchema:
         """The layout of a bag's numbers in bytes."""
         return struct.Struct(f"<{3 * len(self.topics)}q")
 
+    def to_json(self) -> str:
+        """Returns the schema as JSON; equal ones give equal texts."""
+        topics = [[*header] for header in self.topics]
+        return json.dumps([topics, self.silent, self.complete, self.notes, self.set_back])
+
+    @staticmethod
+    def from_json(text: str) -> SummarySchema:
+        """Returns the schema that `to_json` returned so.
+
+        Raises:
+            ValueError: the text is not valid.
+            TypeError: likewise.
+        """
+        topics, silent, complete, notes, set_back = json.loads(text)
+        headers = tuple(
+            TopicHeader(topic, type_name, encoding, bool(latched))
+            for topic, type_name, encoding, latched in topics
+        )
+        return shared_schema(headers, tuple(silent), bool(complete), tuple(notes), int(set_back))
+
 
 WRONG_STATISTICS: Final = "its own statistics are wrong"
 READ_WITHOUT_INDEXES: Final = "its messages were read without its indexes"
@@ -158,7 +179,7 @@ class BagSummary:
 
     @classmethod
     def decoded(cls, schema: SummarySchema, numbers: bytes) -> Self:
-        """Returns the summary of these numbers, which must be as many as the schema has."""
+        """Returns the summary of these numbers, packed or not, as many as the schema has."""
         made = cls.__new__(cls)
         made.schema = schema
         made._numbers = numbers
@@ -172,6 +193,11 @@ class BagSummary:
 
     def pack(self) -> None:
         """Takes about half of the memory from now on, and some microseconds for each look."""
+        self._numbers = self.packed
+
+    @property
+    def packed(self) -> bytes:
+        """The numbers in about half of the bytes, where they fit; `decoded` takes them, too."""
         numbers = self._unpacked()
         base = min(numbers[1::3], default=0)
         parts = [_BASE.pack(base)]
@@ -182,9 +208,8 @@ class BagSummary:
                 parts.append((first - base).to_bytes(_TIME_BYTES, "little"))
                 parts.append((last - base).to_bytes(_TIME_BYTES, "little"))
         except OverflowError:
-            return
-        if numbers:
-            self._numbers = b"".join(parts)
+            return self.numbers
+        return b"".join(parts) if numbers else b""
 
     def _unfolded(self, packed: bytes) -> bytes:
         (base,) = _BASE.unpack_from(packed)

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
@@ -28,7 +30,7 @@ def scan(
     columns: bool = True,
     copies: bool = False,
     shared: Sequence[tuple[Ns, Ns]] | None = None,
-    may_match: Callable[[Table], bool] = lambda _: True,
+    may_match: Callable[[PartZones], bool | Mask] | None = None,
     may_be_empty: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:

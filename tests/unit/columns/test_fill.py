@@ -136,8 +136,8 @@ def test_columns_beyond_the_share_are_dropped_and_times_and_zones_stay(tmp_path:
         write_bag(tmp_path, number, rows=2000, hz=100)
     world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
     world.fill()
-    assert count(world, "part_column", "codec = 'dropped' AND path = 'pose.pose.position.x'") == 1
-    assert count(world, "part_column", "codec = 'dropped' AND path GLOB '#*'") == 0
+    assert count(world, "zone", "codec = 'dropped' AND path = 'pose.pose.position.x'") == 1
+    assert count(world, "zone", "codec = 'dropped' AND path GLOB '#*'") == 0
     assert times(world, "/odom") == times(world.unstored(), "/odom")
     view = View(world.memory, Call())
     [rows] = scan(view, "/odom", EVERYTHING)
@@ -321,7 +321,7 @@ def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None
     write_bag(tmp_path, 0, rows=2000, hz=100)
     world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
     assert world.fill() == 1
-    assert count(world, "part_column", "codec = 'dropped'") > 0
+    assert count(world, "zone", "codec = 'dropped'") > 0
     assert times(world, "/odom") == times(world.unstored(), "/odom")
 
 
