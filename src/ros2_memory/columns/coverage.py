@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.columns.store import BagKey, relative
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import overlap_spans
+from ros2_memory.core.model import BagState
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -171,18 +170,3 @@ class Covering:
         return CoveredSegment(
             segment, np.array(numbers, np.int64), np.array(hashed, np.bool_), tuple(missing)
         )
-
-
-def shared_times(timeline: Timeline) -> list[TimeWindow]:
-    """Returns when bags of different recordings may hold copies of a message."""
-    coarse: dict[object, tuple[int, int]] = {}
-    for segment in timeline.segments:
-        for folder, span in segment.folder_spans.items():
-            before = coarse.get(folder, span)
-            coarse[folder] = (min(before[0], span[0]), max(before[1], span[1]))
-    found: list[TimeWindow] = []
-    for start, stop in overlap_spans((*span, folder) for folder, span in coarse.items()):
-        bags = timeline.overlapping(TimeWindow(start, stop))
-        spans = overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
-        found += [TimeWindow(*span) for span in spans]
-    return found

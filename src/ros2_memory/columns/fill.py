@@ -11,7 +11,6 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.coverage import shared_times
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.store import LONG_NS, BagKey
 from ros2_memory.columns.writing import PART_NS
@@ -219,7 +218,7 @@ class Filling:
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""
         if self._shared is None or self._shared[0] is not timeline:
-            spans = shared_times(timeline)
+            spans = [TimeWindow(*span) for span in timeline.shared_times]
             files = (bag.file for span in spans for bag in timeline.overlapping(span))
             self._shared = timeline, frozenset(files)
         return bag.file in self._shared[1]

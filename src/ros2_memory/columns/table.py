@@ -22,6 +22,7 @@ and where a sequence takes more than `MAX_RANGED_BYTES`.
 from __future__ import annotations
 
 import math
+import re
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -37,6 +38,11 @@ Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
 MAX_NUMBERS: Final = 9
 """Longer arrays of numbers (covariances of poses, scans, images) are no columns."""
+IN_PART: Final = "LETTERS"
+"""Begins the words of a zone that are no whole texts, but the rows of letters in them.
+
+No casefolded text begins so."""
+_LETTERS: Final = re.compile(r"[^\W\d_]+")
 MAX_RANGED_BYTES: Final = 4096
 """Of longer arrays the least and the greatest number are not looked for."""
 
@@ -50,8 +56,8 @@ class Zone(NamedTuple):
         greatest: the greatest likewise.
         nulls: how many values are NaN.
         words: of texts, the casefolded distinct ones, joined by newlines: what is not in it is in
-            no text. None of numbers, and of texts that are too many or too long to be kept here:
-            any may be there.
+            no text. Of texts that are too many or too long for that, `IN_PART` and the rows of
+            letters in them. None of numbers, and where these are too many, too: any may be there.
     """
 
     least: float | None = None
@@ -83,16 +89,28 @@ class Zone(NamedTuple):
 
     def may_have(self, text: str) -> bool:
         """Returns whether a casefolded text may be part of a value."""
-        return self.words is None or text in self.words
+        return self.words is None or may_be_in(self.words, text)
 
     @property
     def may_be_json(self) -> bool:
         """Whether a text may be a JSON array or object."""
-        return self.words is None or "[" in self.words or "{" in self.words
+        return self.words is None or any(may_be_in(self.words, mark) for mark in "[{")
 
     def divided(self, by: int) -> Zone:
         """Returns the zone of the values divided by a positive number."""
         return Zone(self.low / by, self.high / by, self.nulls)
+
+
+def letters_of(text: str) -> list[str]:
+    """Returns the rows of letters in a text, each as long as it goes on."""
+    return _LETTERS.findall(text)
+
+
+def may_be_in(words: str, text: str) -> bool:
+    """Returns whether a casefolded text may be part of a value, by the words of a zone."""
+    if not words.startswith(IN_PART):
+        return text in words
+    return all(letters in words for letters in letters_of(text))
 
 
 def as_float(number: float) -> float:

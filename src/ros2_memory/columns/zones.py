@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.table import as_float
+from ros2_memory.columns.table import as_float, may_be_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -109,12 +109,12 @@ class Zones:
 
     def may_have(self, text: str) -> Mask:
         """Returns in which parts a casefolded text may be part of a value."""
-        return self._where([text in words for words in self.words])
+        return self._where([may_be_in(words, text) for words in self.words])
 
     @property
     def may_be_json(self) -> Mask:
         """In which parts a text may be a JSON array or object."""
-        return self._where(["[" in words or "{" in words for words in self.words])
+        return self._where([any(may_be_in(words, mark) for mark in "[{") for words in self.words])
 
     @property
     def memory_bytes(self) -> int:

@@ -55,7 +55,7 @@ def scan(
         view.bags.check_deadline()
 
     if shared is None:
-        shared = () if copies else view.stream.duplicate_spans(topic, window)
+        shared = () if copies else view.snapshot.timeline.shared_times
     asked = Asked(
         topic,
         window,

@@ -13,7 +13,7 @@ import pytest
 from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.pack import FORMAT, compressed, decompressed, unpack
+from ros2_memory.columns.pack import FORMAT, compressed, decompressed, folded, unpack
 from ros2_memory.columns.parts import packed_part, part_table
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.table import Elements, Table, Texts, joined
@@ -142,9 +142,7 @@ def check_part(given: Table, back: StoredTable) -> None:
         zone = back.zone(path)
         assert zone is not None
         if isinstance(column, Texts):
-            if zone.words is not None:
-                folded = "\n".join(dict.fromkeys(word.casefold() for word in column.words))
-                assert zone.words == folded
+            assert zone.words == folded(column.words)
             continue
         numbers: Any = column
         there = numbers[~np.isnan(numbers)]
