@@ -1,8 +1,9 @@
 """Parts: the rows of one topic in some bags of a recording, stored column by column.
 
 Beside the columns of the topic's layout a part has `#log_time`, `#bag` (the number of each row's
-bag) and, where copies of a message may lie in other recordings, `#publish_time` and
-`#payload_hash`. The owners of the elements of a sequence lie under its path and `#`.
+bag) and, where copies of a message may lie in other recordings, `#publish_time`, `#payload_hash`
+and the zone of `#delay`: how much later messages were received than published. The owners of the
+elements of a sequence lie under its path and `#`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from ros2_memory.columns.pack import Packed, compressed, pack, pack_columns
 from ros2_memory.columns.stored import Lazily, StoredTable, lazy_columns
-from ros2_memory.columns.table import joined
+from ros2_memory.columns.table import Zone, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,9 @@ LOG_TIME: Final = "#log_time"
 PUBLISH_TIME: Final = "#publish_time"
 PAYLOAD_HASH: Final = "#payload_hash"
 BAG: Final = "#bag"
+DELAY: Final = "#delay"
+ZONE_ALONE: Final = "zone"
+"""The codec of a column of which there is never more than the zone."""
 DROPPED: Final = "dropped"
 """The codec of a column of which only the zone is stored: its topic is beyond its share."""
 _ALWAYS: Final = frozenset({LOG_TIME, PUBLISH_TIME, PAYLOAD_HASH, BAG})
@@ -96,6 +100,9 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     if table.payload_hashes is not None:
         columns[PUBLISH_TIME] = pack(table.publish_times)
         columns[PAYLOAD_HASH] = pack(table.payload_hashes)
+        delays = table.log_times - table.publish_times
+        zone = Zone(int(delays.min()), int(delays.max()))
+        columns[DELAY] = Packed(ZONE_ALONE, delays.size, 0.0, zone, b"")
     steps = [slot.kind.step for slot in layout.slots.values()]
     packs = pack_columns([*zip(layout.columns_of(table), steps, strict=True)])
     columns.update(zip(layout.slots, packs, strict=True))

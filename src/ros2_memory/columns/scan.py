@@ -6,10 +6,12 @@ time where recordings do. Of a table that nothing needs not even the times are u
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -18,7 +20,7 @@ from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
 from ros2_memory.columns.coverage import Covering
 from ros2_memory.columns.pack import decompressed, unpack
-from ros2_memory.columns.parts import part_table
+from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, part_table
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
 from ros2_memory.columns.zones import PartZones
@@ -141,15 +143,6 @@ class _Heads:
         return [self.heads[nth] for nth in np.flatnonzero(here).tolist()]
 
 
-@dataclass(frozen=True, slots=True)
-class Census:
-    """Log times of the earliest and latest message (inclusive), and how many there are."""
-
-    first: Ns
-    last: Ns
-    count: int
-
-
 class Scanner:
     """Scans topics of one bag directory. Thread-safe.
 
@@ -158,7 +151,6 @@ class Scanner:
         bag_dir: the bag directory.
 
     Attributes:
-        censuses: by topic, span and bags, what is stored of each type and what of it counts.
         events: by part, what happened in it; of parts of which all rows count.
     """
 
@@ -169,7 +161,6 @@ class Scanner:
         self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
         self._all_zones: ByteLru[Zones] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
-        self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
@@ -182,6 +173,14 @@ class Scanner:
             QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
         """
         return _Scan(self, asked).rows(newest_first=newest_first)
+
+    def copies(self, asked: Asked) -> Iterator[Rows]:
+        """Yields the rows of a topic that do not count, as another recording has them, too.
+
+        Raises:
+            QueryTimeoutError: as for `rows`.
+        """
+        return _Scan(self, asked).copies()
 
     def coverage(self, timeline: Timeline) -> Coverage | None:
         """Returns which bags of a timeline are stored; None without a store."""
@@ -219,6 +218,16 @@ class Scanner:
                 own = topics == number
                 zones = partial(self._zones, number, numbers[own])
                 found[own] = may_match(PartZones(topic, zones))
+        return found
+
+    def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:
+        """Returns the least and greatest value of a column by part; infinite if not stored."""
+        found: dict[int, tuple[float, float]] = {}
+        for topic in {head.topic for head in heads}:
+            parts = [head.number for head in heads if head.topic == topic]
+            zones = self._zones(topic, np.array(parts, np.int64), path)
+            bounds = zip(zones.low.tolist(), zones.high.tolist(), strict=True)
+            found.update(zip(parts, bounds, strict=True))
         return found
 
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
@@ -314,12 +323,12 @@ class _Scan:
         self._shared = [
             span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
         ]
-        self._ends = [stop for _, stop in self._shared]
         self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
         self._relatched: dict[object, IntArray] = {}
         self._relatched_since = MAX_NS
+        self._delays: dict[int, tuple[float, float]] | None = None
         reach = asked.window
         if asked.relatches:
             reach = TimeWindow.everything()
@@ -327,6 +336,12 @@ class _Scan:
             reach = reach.widened(2 * COPY_HORIZON_NS)
         found = self._settled(reach)
         self._sources = sorted(found, key=lambda source: (source.first, source.last))
+        self._firsts = np.array([source.first for source in self._sources], np.int64)
+        lasts = np.array([source.last for source in self._sources], np.int64)
+        self._latest = np.maximum.accumulate(lasts)
+        if self._shared:
+            self._shared = self._holding_copies()
+        self._ends = [stop for _, stop in self._shared]
 
     def rows(self, *, newest_first: bool) -> Iterator[Rows]:
         sources = self._sources
@@ -352,6 +367,20 @@ class _Scan:
                     rows = Rows(unit, partial(self._counting, unit))
                     if self._asked.may_be_empty or len(rows):
                         yield rows
+
+    def copies(self) -> Iterator[Rows]:
+        """Yields the rows that do not count, as another recording has their messages, too."""
+        spans = [TimeWindow(*span) for span in self._shared]
+        shared = {id(source) for span in spans for source in self._sources_in(span)}
+        for source in self._sources:
+            part = None if source.part is None else source.part.number
+            if id(source) not in shared and not (self._asked.relatches and self._may_be_late(part)):
+                continue
+            self._asked.check(source.first)
+            for unit in self._units(source):
+                repeated = self._repeated(unit)
+                if repeated.size:
+                    yield Rows.of(unit, np.unique(repeated))
 
     def _settled(self, reach: TimeWindow) -> list[_Source]:
         """Returns the sources that may have rows in a window, as the store is at one moment."""
@@ -435,6 +464,19 @@ class _Scan:
 
     # Copies
 
+    def _holding_copies(self) -> list[tuple[Ns, Ns]]:
+        """Returns the shared spans in which two sources may have messages of one publish time."""
+        known = self._bounds(PUBLISH_TIME)
+        found: list[tuple[Ns, Ns]] = []
+        for start, stop in self._shared:
+            published = sorted(
+                (-math.inf, math.inf) if source.part is None else known[source.part.number]
+                for source in self._sources_in(TimeWindow(start, stop))
+            )
+            if any(before[1] >= after[0] for before, after in pairwise(published)):
+                found.append((start, stop))
+        return found
+
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
         for start, stop in self._shared[bisect_right(self._ends, unit.first) :]:
@@ -470,7 +512,8 @@ class _Scan:
     def _received_again(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that were received before, as late messages of a latch."""
         none = np.empty(0, np.int64)
-        identities = unit.identities() if unit.table.channel.latched else None
+        may_be_late = unit.table.channel.latched and self._may_be_late(unit.part)
+        identities = unit.identities() if may_be_late else None
         if identities is None:
             return none
         published = identities[0]
@@ -497,12 +540,25 @@ class _Scan:
             self._relatched[unit.key] = some[again[begin : begin + some.size]]
             begin += some.size
 
+    def _bounds(self, path: str) -> dict[int, tuple[float, float]]:
+        heads = [source.part for source in self._sources if source.part is not None]
+        return self._scanner.bounds(heads, path)
+
+    def _may_be_late(self, part: int | None) -> bool:
+        """Returns whether a part may have messages that were received long after."""
+        if self._delays is None:
+            self._delays = self._bounds(DELAY)
+        return part is None or self._delays[part][1] > RELATCHED_NS
+
+    def _sources_in(self, window: TimeWindow) -> list[_Source]:
+        # They are in the order of their first times, and reach beyond the next ones.
+        begin = int(np.searchsorted(self._latest, window.start))
+        stop = int(np.searchsorted(self._firsts, window.stop))
+        return [source for source in self._sources[begin:stop] if source.last >= window.start]
+
     def _units_in(self, window: TimeWindow) -> Iterator[Unit]:
-        # Sources are in the order of their first times, and reach beyond the next ones.
-        stop = bisect_right(self._sources, window.stop - 1, key=lambda source: source.first)
-        for source in self._sources[:stop]:
-            if source.last >= window.start:
-                yield from self._units(source)
+        for source in self._sources_in(window):
+            yield from self._units(source)
 
     def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
         times, counting = unit.times(), unit.counting()

@@ -14,10 +14,16 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
+import numpy as np
+
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    IntArray = NDArray[np.int64]
 
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 """Messages are written out of order by less than this, also across two splits."""
@@ -120,6 +126,28 @@ DOUBTS: Final = (
 """Beginnings of notes on files that contradict themselves, and were read from end to end."""
 
 
+def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
+    """Returns count, first and last of each topic of summaries that share one schema.
+
+    Of the shape (summaries, topics, 3).
+    """
+    topics = len(summaries[0].schema.topics)
+    stored = [summary.stored for summary in summaries]
+    size = _BASE.size + topics * (_COUNT_BYTES + 2 * _TIME_BYTES)
+    if any(len(numbers) != size for numbers in stored):
+        whole = b"".join([summary.numbers for summary in summaries])
+        return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)
+    packed = np.frombuffer(b"".join(stored), np.uint8).reshape(-1, size)
+    base = np.ascontiguousarray(packed[:, : _BASE.size]).view("<i8")
+    fields = packed[:, _BASE.size :].reshape(len(stored), topics, -1)
+    wide = np.zeros((len(stored), topics, 3, 8), np.uint8)
+    wide[:, :, 0, :_COUNT_BYTES] = fields[:, :, :_COUNT_BYTES]
+    wide[:, :, 1:, :_TIME_BYTES] = fields[:, :, _COUNT_BYTES:].reshape(len(stored), topics, 2, -1)
+    numbers: IntArray = wide.view("<i8")[:, :, :, 0]
+    numbers[:, :, 1:] += base[:, :, None]
+    return numbers
+
+
 def set_back_while_written(by: Ns) -> str:
     """Returns the sentence on a clock that was set back, at least by this, within one bag."""
     return f"the clock was set back by {by / NS_PER_S:.0f} s or more while it was being written"
@@ -184,6 +212,11 @@ class BagSummary:
         made.schema = schema
         made._numbers = numbers
         return made
+
+    @property
+    def stored(self) -> bytes:
+        """The numbers as they are in memory, packed or not."""
+        return self._numbers
 
     @property
     def numbers(self) -> bytes:

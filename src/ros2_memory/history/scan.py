@@ -70,6 +70,30 @@ def scan(
     return scanner.rows(asked, newest_first=newest_first)
 
 
+def copies(view: View, topic: str) -> Iterator[Rows]:
+    """Yields the rows of a topic that do not count, as another recording has them, too.
+
+    Raises:
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
+    """
+    scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
+
+    def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
+        return view.bags.tables(bag, topic, hashed=hashed, columns=False)
+
+    return scanner.copies(
+        Asked(
+            topic,
+            TimeWindow.everything(),
+            view.snapshot.timeline,
+            decode,
+            shared=view.snapshot.timeline.shared_times,
+            relatches=view.stream.may_be_relatched([topic]),
+            check=lambda _: view.bags.check_deadline(),
+        )
+    )
+
+
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
     """Yields the messages of some rows, read from their bags: bag after bag, in log-time order."""
     times, channel = rows.times, rows.table.channel
