@@ -25,7 +25,7 @@ from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS
+from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.storage.base import RELATCHED_NS
 from ros2_memory.storage.cache import ByteLru
@@ -78,6 +78,8 @@ class Asked:
             the others are left out.
         may_be_empty: whether rows are yielded also where none of them counts. Which do is then
             found out only where that is asked.
+        within: half-open spans, in order and apart; tables that overlap none of them are left out.
+            None: none is.
         check: is called before each table with a log time that what is left does not lie behind
             (with `newest_first`: is not later than); raises where the call's time is over.
     """
@@ -90,6 +92,7 @@ class Asked:
     relatches: bool = False
     may_match: Callable[[PartZones], bool | Mask] | None = None
     may_be_empty: bool = False
+    within: Sequence[tuple[Ns, Ns]] | None = None
     check: Callable[[Ns], None] = lambda _: None
 
 
@@ -353,6 +356,8 @@ class _Scan:
             wanted = self._scanner.matching(heads, may_match)
             ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
+        if (within := self._asked.within) is not None:
+            sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
         ahead = together = 1
         for nth, source in enumerate(sources):
             if nth == ahead:

@@ -32,6 +32,7 @@ def scan(
     shared: Sequence[tuple[Ns, Ns]] | None = None,
     may_match: Callable[[PartZones], bool | Mask] | None = None,
     may_be_empty: bool = False,
+    within: Sequence[tuple[Ns, Ns]] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `Scanner.rows`.
@@ -40,7 +41,8 @@ def scan(
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. `may_match` and `may_be_empty` are as in `Asked`.
+    may hold copies, where the caller knows them. `may_match`, `may_be_empty` and `within` are as in
+    `Asked`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -64,6 +66,7 @@ def scan(
         shared=shared,
         may_match=may_match,
         may_be_empty=may_be_empty,
+        within=within,
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )

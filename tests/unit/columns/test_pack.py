@@ -223,7 +223,9 @@ def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
     assert zone.may_be_json
     found = ["label", "abel", "größe 7".casefold(), '"score": 0.5', "12345"]
     assert [zone.may_have(text) for text in found] == [True] * 5
-    assert [zone.may_have(text) for text in ("labels", "cup", "letters", "score cup")] == [False] * 4
+    assert [zone.may_have(text) for text in ("labels", "cup", "letters", "score cup")] == [
+        False
+    ] * 4
 
 
 def test_a_zone_of_too_many_different_words_keeps_none() -> None:
