@@ -119,7 +119,12 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
 
 
 def part_table(
-    topic: Topic, packed: Mapping[str, Packed], load: Callable[[str], Column]
+    topic: Topic,
+    packed: Mapping[str, Packed],
+    load: Callable[[str], Column],
+    *,
+    messages: int,
+    dropped: Sequence[str] = (),
 ) -> StoredTable:
     """Returns a part as a table whose columns are loaded when they are first asked for.
 
@@ -129,17 +134,18 @@ def part_table(
         topic: of the part.
         packed: what is known of each column; their data is not needed.
         load: returns a column by its path.
+        messages: how many rows it has.
+        dropped: the columns that are beyond the topic's share.
     """
     columns, elements = lazy_columns(topic.layout, load)
     left_out = topic.layout.left_out
-    dropped = {path for path, one in packed.items() if one.codec == DROPPED}
     if dropped:
         reason = "beyond the share of the store (store.max_share)"
         left_out = {**left_out, **dict.fromkeys(dropped, reason)}
         columns = Lazily([path for path in columns if path not in dropped], columns.__getitem__)
         there = [path for path in elements if f"{path}#" not in dropped]
         elements = Lazily(there, elements.__getitem__)
-    none = np.zeros(packed[LOG_TIME].count, np.int64)
+    none = np.zeros(messages, np.int64)
     return StoredTable(
         topic.channel,
         none,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -19,9 +20,9 @@ import numpy as np
 from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
 from ros2_memory.columns.coverage import Covering
-from ros2_memory.columns.pack import decompressed, unpack
-from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, part_table
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.pack import Packed, decompressed, unpack
+from ros2_memory.columns.parts import DELAY, LOG_TIME, PUBLISH_TIME, part_table
+from ros2_memory.columns.table import Texts, Zone
 from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.model import TimeWindow
@@ -31,13 +32,13 @@ from ros2_memory.storage.base import RELATCHED_NS
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
-    from ros2_memory.columns.pack import Packed
     from ros2_memory.columns.store import ColumnStore, PartHead
+    from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import Zones
@@ -55,6 +56,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
+_ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
+"""Stands for a column that a part does not have."""
 _ATTEMPTS: Final = 5
 """How often a scan looks what is stored, while that changes; then it reads the bags."""
 _MOST_LOOKED_UP: Final = 64
@@ -161,7 +164,7 @@ class Scanner:
         self.store = store
         self._covering = None if store is None else Covering(store, bag_dir)
         self._columns: ByteLru[Column] = ByteLru(48 << 20)
-        self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
+        self._known: ByteLru[Packed] = ByteLru(16 << 20)
         self._all_zones: ByteLru[Zones] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
@@ -245,31 +248,33 @@ class Scanner:
             self._all_zones.put(key, known, known.memory_bytes)
         return known.among(parts)
 
-    def part(self, head: PartHead, coverage: Coverage) -> PartUnit | None:
+    def part(
+        self, head: PartHead, coverage: Coverage, together: Sequence[PartHead] = ()
+    ) -> PartUnit | None:
         """Returns a part; None where no row of it counts.
+
+        What is known of its columns is read at once for the parts `together` with it.
 
         Raises:
             GoneError: it was deleted meanwhile.
         """
         assert self.store is not None  # noqa: S101 - there are no parts without one
         offset = self.store.offset
-        known = self._known.get(head.number) or self.look_up([head]).get(head.number)
         topic = self.store.topic(head.topic)
-        if not known or topic is None:
+        if topic is None:
             raise GoneError
-        columns = known
+        columns = _PartColumns(self, topic, head, together)
 
         def load(path: str) -> Column:
             return self._column(head.number, path, columns[path])
 
-        table = part_table(topic, columns, load)
+        table = part_table(topic, columns, load, messages=head.messages, dropped=head.dropped)
         counting = coverage.among(head.bags)
         if not counting.size:
             return None
 
         def integers(path: str) -> IntArray | None:
-            column = load(path) if path in columns else None
-            return None if column is None else np.asarray(column, np.int64)
+            return None if path not in columns else np.asarray(load(path), np.int64)
 
         def bag_of(number: int) -> BagFile:
             bag = coverage.bag(number + offset)
@@ -279,14 +284,21 @@ class Scanner:
 
         return PartUnit(head, table, integers, counting - offset, bag_of)
 
-    def look_up(self, heads: Iterable[PartHead]) -> Mapping[int, Mapping[str, Packed]]:
-        """Reads at once what is known of the columns of parts, where it is not known yet."""
-        missing = [head.number for head in heads if self._known.get(head.number) is None]
-        found = self.store.part_columns(missing) if self.store is not None and missing else {}
-        for number, columns in found.items():
-            if columns:
-                self._known.put(number, columns, _COLUMN_BYTES * len(columns))
-        return found
+    def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:
+        """Returns what is known of a column of a part; None where it has no such one.
+
+        It is read at once for those parts of the same topic that are `together` with it.
+        """
+        assert self.store is not None  # noqa: S101 - as above
+        key = (head.number, path)
+        known = self._known.get(key)
+        if known is None:
+            numbers = [other.number for other in together if other.topic == head.topic]
+            found = self.store.packed(head.topic, path, [head.number, *numbers])
+            for number in (head.number, *numbers):
+                self._known.put((number, path), found.get(number, _ABSENT), _COLUMN_BYTES)
+            known = found.get(head.number, _ABSENT)
+        return None if known is _ABSENT else known
 
     def split(self, number: int, topic: str) -> list[Table] | None:
         """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
@@ -316,6 +328,32 @@ class Scanner:
         return column
 
 
+class _PartColumns(Mapping[str, "Packed"]):
+    """What is known of the columns of a part, looked up when it is first asked for."""
+
+    def __init__(
+        self, scanner: Scanner, topic: Topic, head: PartHead, together: Sequence[PartHead]
+    ) -> None:
+        self._scanner = scanner
+        self._topic = topic
+        self._head = head
+        self._together = together
+
+    def __getitem__(self, path: str) -> Packed:
+        packed = self._scanner.packed(self._head, path, self._together)
+        if packed is not None:
+            return packed
+        if path == LOG_TIME or path in self._topic.layout.slots:
+            raise GoneError
+        raise KeyError(path)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._topic.layout.slots)
+
+    def __len__(self) -> int:
+        return len(self._topic.layout.slots)
+
+
 class _Scan:
     """One scan: its sources, and which rows of them are copies."""
 
@@ -332,6 +370,7 @@ class _Scan:
         self._relatched: dict[object, IntArray] = {}
         self._relatched_since = MAX_NS
         self._delays: dict[int, tuple[float, float]] | None = None
+        self._together: list[PartHead] = []
         reach = asked.window
         if asked.relatches:
             reach = TimeWindow.everything()
@@ -364,8 +403,8 @@ class _Scan:
                 # Who goes on reads many.
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
-                parts = [each.part for each in sources[nth:ahead] if each.part is not None]
-                self._scanner.look_up(parts)
+                parts = sources[nth:ahead]
+                self._together = [each.part for each in parts if each.part is not None]
             if window.overlaps(source.first, source.last):
                 self._asked.check(source.last if newest_first else source.first)
                 for unit in self._units(source):
@@ -434,7 +473,7 @@ class _Scan:
 
     def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage)
+            unit = self._scanner.part(source.part, self._coverage, self._together)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         known = self._decoded.get(source.bag.file)

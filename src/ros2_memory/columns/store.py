@@ -26,7 +26,7 @@ from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
-from ros2_memory.columns.parts import DROPPED, packed_part
+from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
@@ -88,7 +88,7 @@ CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TE
 CREATE TABLE split (bag INTEGER PRIMARY KEY, tables BLOB NOT NULL);
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  bags TEXT NOT NULL);
+  bags TEXT NOT NULL, dropped TEXT NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
 CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB,
   PRIMARY KEY (part, path)) WITHOUT ROWID;
@@ -158,6 +158,8 @@ class PartHead:
         first: the earliest log time (ns), inclusive.
         last: the latest, inclusive.
         bags: the numbers of the bags that its rows are of, ascending.
+        messages: how many rows it has.
+        dropped: the paths of its columns that are beyond the topic's share.
     """
 
     number: int
@@ -165,6 +167,8 @@ class PartHead:
     first: Ns
     last: Ns
     bags: IntArray
+    messages: int
+    dropped: tuple[str, ...]
 
 
 class ColumnStore(Database):
@@ -284,9 +288,7 @@ class ColumnStore(Database):
         def ask(connection: sqlite3.Connection) -> dict[str, Ns]:
             rows = connection.execute(
                 "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
-                " WHERE part.id IN (SELECT part FROM zone WHERE codec = ?)"
-                " GROUP BY name ORDER BY name",
-                (DROPPED,),
+                " WHERE dropped <> '' GROUP BY name ORDER BY name"
             )
             return dict(rows.fetchall())
 
@@ -359,7 +361,7 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT id, topic, first_ns, last_ns, bags FROM part"
+                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?) AND id > ?"
                 " ORDER BY first_ns, id",
                 (topic, max(after - self.offset, 0)),
@@ -371,8 +373,10 @@ class ColumnStore(Database):
                     first,
                     last,
                     np.array(json.loads(bags), np.int64) + self.offset,
+                    messages,
+                    tuple(json.loads(dropped)) if dropped else (),
                 )
-                for number, of_topic, first, last, bags in rows
+                for number, of_topic, first, last, bags, messages, dropped in rows
             ]
 
         return self.read(ask, [])
@@ -391,22 +395,19 @@ class ColumnStore(Database):
 
         return self.read(ask, Zones.of([], []))
 
-    def part_columns(self, parts: Sequence[int]) -> dict[int, dict[str, Packed]]:
-        """Returns what is known of each column of some parts, without its values."""
+    def packed(self, topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
+        """Returns what is known of a column in some parts of a topic, without its values."""
 
-        def ask(connection: sqlite3.Connection) -> dict[int, dict[str, Packed]]:
+        def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
             rows = connection.execute(
-                "SELECT id, path, codec, count, error, least, greatest, nulls, words"
-                " FROM part CROSS JOIN part_column ON part_column.part = id"
-                " CROSS JOIN zone USING (topic, path, part)"
-                " WHERE id IN (SELECT value FROM json_each(?))",
-                (json.dumps([part - self.offset for part in parts]),),
+                "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
+                " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
+                (topic, path, json.dumps([part - self.offset for part in parts])),
             )
-            found: dict[int, dict[str, Packed]] = {part: {} for part in parts}
-            for part, path, codec, count, error, *zone in rows:
-                packed = Packed(codec, count, error, zone_of(*zone), b"")
-                found[part + self.offset][path] = packed
-            return found
+            return {
+                part + self.offset: Packed(codec, count, error, zone_of(*zone), b"")
+                for part, codec, count, error, *zone in rows
+            }
 
         return self.read(ask, {})
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import pack_rows
+from ros2_memory.columns.parts import DROPPED, pack_rows
 from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -154,9 +154,12 @@ def insert_parts(connection: sqlite3.Connection, parts: Mapping[int, Sequence[Pa
 
 
 def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> None:
+    paths = [path for path, packed in part.columns.items() if packed.codec == DROPPED]
+    dropped = json.dumps(paths) if paths else ""
     cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags) VALUES (?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags)),
+        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped)"
+        " VALUES (?, ?, ?, ?, ?, ?)",
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped),
     )
     number = cursor.lastrowid
     connection.executemany(

@@ -87,7 +87,9 @@ def part(*given: Table) -> StoredTable:
         data = decompressed(one.data) if one.data else b""
         return unpack(one.codec, one.count, one.zone.least, data)
 
-    return part_table(Topic(CHANNEL, Layout.from_json(layout.to_json())), packed, load)
+    topic = Topic(CHANNEL, Layout.from_json(layout.to_json()))
+    messages = sum(map(len, given))
+    return part_table(topic, packed, load, messages=messages)
 
 
 def differences(column: Column, back: Column) -> float:
