@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.store import BagKey, relative
+from ros2_memory.columns.store import relative
 from ros2_memory.core.model import BagState
 
 if TYPE_CHECKING:
@@ -157,16 +157,17 @@ class Covering:
         ]
 
     def _segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
-        numbers, hashed = [], []
+        root, offset = str(self._bag_dir), self.store.offset
+        numbers, hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
         missing: list[BagFile] = []
-        for bag in segment.bags:
-            key = BagKey.of(bag, self._bag_dir)
-            found = stored.get(key.path)
-            if found is None or found.key != key or bag.state is not BagState.CLOSED:
+        for nth, bag in enumerate(segment.bags):
+            found = stored.get(relative(bag.file, root))
+            if (
+                found is not None
+                and found[1:4] == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+                and bag.state is BagState.CLOSED
+            ):
+                numbers[nth], hashed[nth] = offset + found.row, found.hashed
+            else:
                 missing.append(bag)
-                found = None
-            numbers.append(-1 if found is None else found.number)
-            hashed.append(found is not None and found.hashed)
-        return CoveredSegment(
-            segment, np.array(numbers, np.int64), np.array(hashed, np.bool_), tuple(missing)
-        )
+        return CoveredSegment(segment, numbers, hashed, tuple(missing))

@@ -141,11 +141,17 @@ class State(NamedTuple):
 
 
 class StoredBag(NamedTuple):
-    """A bag that is stored: its number, and whether copies of its messages can be recognised."""
+    """A bag that is stored: its key, and whether copies of its messages can be recognised.
 
-    number: int
-    key: BagKey
-    hashed: bool
+    `row` is its number less the store's `offset`: a week of these is made at once.
+    """
+
+    path: str
+    size: int
+    mtime_ns: Ns
+    sidecar_ns: Ns
+    row: int
+    hashed: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,10 +260,7 @@ class ColumnStore(Database):
                 f" WHERE definitions IN ('', ?) {among}",
                 (self._definitions, *(() if paths is None else (json.dumps(paths),))),
             )
-            return {
-                row[0]: StoredBag(self.offset + row[4], BagKey(*row[:4]), bool(row[5]))
-                for row in rows
-            }
+            return {bag.path: bag for bag in map(StoredBag._make, rows)}
 
         return self.read(ask, {})
 

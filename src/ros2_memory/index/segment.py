@@ -145,14 +145,14 @@ class Segment:
     @cached_property
     def folders(self) -> frozenset[str]:
         """The folders of the bags."""
-        return frozenset(map(_folder_of, self.bags))
+        return frozenset(map(folder_of, self.bags))
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
         spans: dict[str, Span] = {}
         for bag in self.bags:
-            folder = _folder_of(bag)
+            folder = folder_of(bag)
             spans[folder] = wider(spans.get(folder), (bag.start, bag.end))
         return spans
 
@@ -164,7 +164,7 @@ class Segment:
             counts[rows] = numbers[:, :, 0].sum(axis=1)
         found: dict[str, list[int]] = {}
         for bag, messages in zip(self.bags, counts.tolist(), strict=True):
-            tally = found.setdefault(_folder_of(bag), [0, 0, 0])
+            tally = found.setdefault(folder_of(bag), [0, 0, 0])
             tally[0] += 1
             tally[1] += messages
             tally[2] += bag.size
@@ -235,7 +235,7 @@ class Segment:
     def _recordings(self) -> tuple[list[Path], NDArray[np.uint16]]:
         """The recordings of the bags, and the number of each bag's among them."""
         known: dict[str, int] = {}
-        numbers = [known.setdefault(_folder_of(bag), len(known)) for bag in self.bags]
+        numbers = [known.setdefault(folder_of(bag), len(known)) for bag in self.bags]
         first = [numbers.index(number) for number in range(len(known))]
         # A path for each bag of a week would take longer than all else.
         return [self.bags[row].recording for row in first], np.array(numbers, np.uint16)
@@ -349,7 +349,8 @@ def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, N
     totals[type_name] = added if known is None else known | added
 
 
-def _folder_of(bag: BagFile) -> str:
+def folder_of(bag: BagFile) -> str:
+    """Returns the folder of a bag: that of its recording, as a string."""
     return bag.file[: bag.file.rfind("/")]
 
 

@@ -21,6 +21,7 @@ from ros2_memory.index.segment import (
     Segment,
     TopicTotals,
     add_totals,
+    folder_of,
     in_time,
     is_log,
     wider,
@@ -229,7 +230,7 @@ class Timeline:
         return united(
             span
             for bags in near
-            for span in overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
+            for span in overlap_spans((bag.start, bag.end, folder_of(bag)) for bag in bags)
         )
 
     def faulty(self, window: TimeWindow) -> list[BagFile]:
