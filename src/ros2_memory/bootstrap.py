@@ -391,7 +391,7 @@ def build_memory(
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
-    from ros2_memory.columns.scan import Scanner
+    from ros2_memory.columns.scanner import Scanner
     from ros2_memory.history.context import Memory
     from ros2_memory.index.scan import BAG_DIR_SETTING
     from ros2_memory.recorder.index_manager import IndexManager

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.scan import Scanner
+    from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile

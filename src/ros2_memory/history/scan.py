@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from ros2_memory.columns.scan import Asked, Scanner
+from ros2_memory.columns.scan import Asked, Scan
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def scan(
     within: Sequence[tuple[Ns, Ns]] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
-    """Yields the rows of a topic in a window; see `Scanner.rows`.
+    """Yields the rows of a topic in a window; see `columns.scan.Scan.rows`.
 
     What cannot be read is noted. `reached` is called before each table with a log time that what
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
@@ -70,7 +71,7 @@ def scan(
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )
-    return scanner.rows(asked, newest_first=newest_first)
+    return Scan(scanner, asked).rows(newest_first=newest_first)
 
 
 def copies(view: View, topic: str) -> Iterator[Rows]:
@@ -84,17 +85,16 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
         return view.bags.tables(bag, topic, hashed=hashed, columns=False)
 
-    return scanner.copies(
-        Asked(
-            topic,
-            TimeWindow.everything(),
-            view.snapshot.timeline,
-            decode,
-            shared=view.snapshot.timeline.shared_times,
-            relatches=view.stream.may_be_relatched([topic]),
-            check=lambda _: view.bags.check_deadline(),
-        )
+    asked = Asked(
+        topic,
+        TimeWindow.everything(),
+        view.snapshot.timeline,
+        decode,
+        shared=view.snapshot.timeline.shared_times,
+        relatches=view.stream.may_be_relatched([topic]),
+        check=lambda _: view.bags.check_deadline(),
     )
+    return Scan(scanner, asked).copies()
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.columns.pack import FORMAT, decompressed
-from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.table import Table
 from ros2_memory.storage.base import Channel, Schema
