@@ -191,7 +191,16 @@ class Filling:
         )
 
     def _budget(self, bags: Sequence[BagFile]) -> int:
-        """Returns how many bytes the columns of some bags may take."""
+        """Returns how many bytes the columns of some bags may take.
+
+        A robot that drives has more to store than one that stands: what other bags left of their
+        share is theirs.
+        """
+        others, taken = self.store.merged_bytes()
+        left = round(self._limits.max_share * others) - taken
+        return self._share(bags) + max(left, 0)
+
+    def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
         return max(round(self._limits.max_share * size), LEAST_BYTES_PER_S * length)
@@ -245,7 +254,7 @@ class Filling:
         oldest, used = self.store.oldest(), self.store.used_bytes()
         found: list[BagFile] = []
         for bag in bags:
-            size = 2 * self._budget([bag])
+            size = 2 * self._share([bag])
             is_newer = oldest is not None and bag.start >= oldest
             if (size if is_newer else used + size) <= most:
                 found.append(bag)

@@ -234,11 +234,12 @@ class Scanner:
         assert self.store is not None  # noqa: S101 - as above
         data = b""
         # The one value of a constant is its least, unless it is a text.
-        if not packed.codec.endswith(" constant") or packed.codec.startswith("text"):
+        is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
+        if packed.count and not is_constant:
             stored = self.store.part_data(part, path)
             if stored is None:
                 raise GoneError
-            data = decompressed(stored) if stored else b""
+            data = decompressed(stored)
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
         self._columns.put((part, path), column, _bytes_of(column))
         return column

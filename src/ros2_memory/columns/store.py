@@ -88,10 +88,10 @@ CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TE
 CREATE TABLE split (bag INTEGER PRIMARY KEY, tables BLOB NOT NULL);
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  bags TEXT NOT NULL, dropped TEXT NOT NULL);
+  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
-CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB,
-  PRIMARY KEY (part, path)) WITHOUT ROWID;
+CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB NOT NULL,
+  UNIQUE (part, path));
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
   codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
   nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
@@ -422,7 +422,7 @@ class ColumnStore(Database):
                 "SELECT data FROM part_column WHERE part = ? AND path = ?",
                 (part - self.offset, path),
             ).fetchone()
-            return None if row is None else row[0] or b""
+            return None if row is None else row[0]
 
         return self.read(ask, None)
 
@@ -550,6 +550,18 @@ class ColumnStore(Database):
     def delete(self, paths: Sequence[str]) -> bool:
         """Deletes bags, and the parts that have rows of none that is left."""
         return self.write(partial(delete_bags, paths=paths))
+
+    def merged_bytes(self) -> tuple[int, int]:
+        """Returns the bytes of the bags that are in parts, and those of the columns of parts."""
+
+        def ask(connection: sqlite3.Connection) -> tuple[int, int]:
+            [bags] = connection.execute(
+                "SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN (SELECT bag FROM split)"
+            ).fetchone()
+            [columns] = connection.execute("SELECT total(bytes) FROM part").fetchone()
+            return int(bags), int(columns)
+
+        return self.read(ask, (0, 0))
 
     def used_bytes(self) -> int:
         """Returns the bytes of the file that hold something."""

@@ -157,14 +157,14 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
     paths = [path for path, packed in part.columns.items() if packed.codec == DROPPED]
     dropped = json.dumps(paths) if paths else ""
     cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped)"
-        " VALUES (?, ?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped),
+        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?)",
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped, part.size),
     )
     number = cursor.lastrowid
     connection.executemany(
         "INSERT INTO part_column VALUES (?, ?, ?)",
-        [(number, path, packed.data or None) for path, packed in part.columns.items()],
+        [(number, path, packed.data) for path, packed in part.columns.items() if packed.data],
     )
     connection.executemany(
         "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -269,14 +269,21 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
     connection.executemany("DELETE FROM split WHERE bag = ?", [(number,) for number in numbers])
     # A part goes with the last of its bags.
     gone = connection.execute(
-        "SELECT id FROM part WHERE NOT EXISTS"
+        "SELECT id, topic FROM part WHERE NOT EXISTS"
         " (SELECT 1 FROM json_each(part.bags) JOIN bag ON bag.id = value)"
     ).fetchall()
-    connection.executemany(
-        "DELETE FROM zone WHERE (topic, path, part) IN (SELECT topic, path, part"
-        " FROM part JOIN part_column ON part_column.part = part.id WHERE part.id = ?)",
-        gone,
-    )
-    connection.executemany("DELETE FROM part_column WHERE part = ?", gone)
-    connection.executemany("DELETE FROM part WHERE id = ?", gone)
+    for topic in {topic for _, topic in gone}:
+        parts = json.dumps([part for part, of_topic in gone if of_topic == topic])
+        # By the paths that the topic has: zones are ordered by these, and parts come last.
+        connection.execute(
+            "WITH RECURSIVE known (path) AS (SELECT min(path) FROM zone WHERE topic = :topic"
+            " UNION ALL SELECT (SELECT min(path) FROM zone WHERE topic = :topic"
+            " AND path > known.path) FROM known WHERE known.path IS NOT NULL)"
+            " DELETE FROM zone WHERE topic = :topic AND path IN (SELECT path FROM known)"
+            " AND part IN (SELECT value FROM json_each(:parts))",
+            {"topic": topic, "parts": parts},
+        )
+    numbers = [(part,) for part, _ in gone]
+    connection.executemany("DELETE FROM part_column WHERE part = ?", numbers)
+    connection.executemany("DELETE FROM part WHERE id = ?", numbers)
     connection.execute("INSERT INTO deletion DEFAULT VALUES")

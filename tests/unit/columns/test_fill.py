@@ -316,6 +316,26 @@ def test_a_bag_of_several_groups_becomes_parts_at_once(tmp_path: Path) -> None:
     assert check_all(World.of(tmp_path)) == 120
 
 
+def test_bags_may_take_what_others_left_of_their_share(tmp_path: Path) -> None:
+    def moving(name: str, share: float, *, quiet: bool) -> World:
+        bag_dir = tmp_path / name
+        if quiet:
+            texts = [text(T0 + n * S, "a" * 20_000) for n in range(100)]
+            path = write_mcap(bag_dir / "quiet" / "quiet_0.mcap", texts)
+            os.utime(path, ns=(T0, T0))
+            World.of(bag_dir).fill()
+        write_bag(bag_dir, 20, rows=2000, hz=100)
+        world = World.of(bag_dir, limits=StoreLimits(max_share=share))
+        world.fill()
+        return world
+
+    whole = moving("whole", 1.0, quiet=False)
+    in_bags, needed = whole.store.merged_bytes()
+    share = 0.9 * needed / in_bags
+    assert count(moving("alone", share, quiet=False), "part", "dropped <> ''") > 0
+    assert count(moving("beside", share, quiet=True), "part", "dropped <> ''") == 0
+
+
 @pytest.mark.usefixtures("small_groups")
 def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None:
     write_bag(tmp_path, 0, rows=2000, hz=100)
