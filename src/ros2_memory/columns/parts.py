@@ -48,6 +48,7 @@ class PackedPart:
         messages: how many rows.
         bags: the numbers of the bags that its rows are of, ascending.
         columns: by their paths, packed; the data is compressed.
+        dropped_bytes: how many bytes the data took that it has no more.
     """
 
     first: Ns
@@ -55,6 +56,7 @@ class PackedPart:
     messages: int
     bags: tuple[int, ...]
     columns: Mapping[str, Packed]
+    dropped_bytes: int = 0
 
     @property
     def size(self) -> int:
@@ -69,7 +71,8 @@ class PackedPart:
             else replace(packed, codec=DROPPED, data=b"")
             for path, packed in self.columns.items()
         }
-        return replace(self, columns=columns)
+        part = replace(self, columns=columns)
+        return replace(part, dropped_bytes=self.size - part.size)
 
 
 def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:

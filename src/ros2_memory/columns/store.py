@@ -539,7 +539,7 @@ class ColumnStore(Database):
                 topic: [packed_part(topics[topic].layout, tables)]
                 for topic, tables in found.items()
             }
-            insert_parts(connection, within(packed, budget))
+            insert_parts(connection, within(connection, packed, budget))
             connection.execute(
                 "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
                 (json.dumps(numbers),),
@@ -558,7 +558,9 @@ class ColumnStore(Database):
             [bags] = connection.execute(
                 "SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN (SELECT bag FROM split)"
             ).fetchone()
-            [columns] = connection.execute("SELECT total(bytes) FROM part").fetchone()
+            [columns] = connection.execute(
+                "SELECT total(bytes) FROM part WHERE dropped = ''"
+            ).fetchone()
             return int(bags), int(columns)
 
         return self.read(ask, (0, 0))

@@ -81,7 +81,7 @@ class LongBag:
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
         budget = round(self._share * sum(len(table) for table in tables))
-        insert_parts(connection, within(packed, budget))
+        insert_parts(connection, within(connection, packed, budget))
 
     def end(self, connection: sqlite3.Connection) -> None:
         """Gives the bag its key: now it is stored."""
@@ -104,11 +104,17 @@ class LongBag:
         return self.goes_on
 
 
-def within(parts: Mapping[int, Sequence[PackedPart]], budget: int) -> dict[int, list[PackedPart]]:
-    """Returns the parts of topics; of the largest that are beyond the budget (bytes) no data."""
+def within(
+    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], budget: int
+) -> dict[int, list[PackedPart]]:
+    """Returns the parts of topics; of the largest that are beyond the budget (bytes) no data.
+
+    Those that are the largest in all parts, so that not each topic has some parts without data.
+    """
     sizes = {topic: sum(part.size for part in parts[topic]) for topic in parts}
+    usual = dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
     found: dict[int, list[PackedPart]] = {}
-    for topic in sorted(parts, key=lambda topic: sizes[topic]):
+    for topic in sorted(parts, key=lambda topic: sizes[topic] + usual.get(topic, 0)):
         budget -= sizes[topic]
         kept = budget >= 0
         found[topic] = [part if kept else part.without_data() for part in parts[topic]]
@@ -155,11 +161,11 @@ def insert_parts(connection: sqlite3.Connection, parts: Mapping[int, Sequence[Pa
 
 def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> None:
     paths = [path for path, packed in part.columns.items() if packed.codec == DROPPED]
-    dropped = json.dumps(paths) if paths else ""
+    dropped, size = json.dumps(paths) if paths else "", part.size + part.dropped_bytes
     cursor = connection.execute(
         "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped, part.size),
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped, size),
     )
     number = cursor.lastrowid
     connection.executemany(

@@ -336,6 +336,32 @@ def test_bags_may_take_what_others_left_of_their_share(tmp_path: Path) -> None:
     assert count(moving("beside", share, quiet=True), "part", "dropped <> ''") == 0
 
 
+def test_the_topic_that_is_the_largest_in_all_parts_is_dropped_first(tmp_path: Path) -> None:
+    draw = random.Random(1)
+    for number in range(4):
+        begin = T0 + number * 600 * S
+        messages = [odom(begin + n * S // 40, draw.uniform(-9, 9), 0.0) for n in range(1200)]
+        # In the oldest bag, which is stored last, there is more of them than of odometry.
+        said = [f"{draw.getrandbits(2000):x}" for _ in range(20 if number == 0 else 1)]
+        messages += [text(begin + n * S + 7, word) for n, word in enumerate(said)]
+        messages.sort(key=lambda message: message.log_time)
+        path = write_mcap(tmp_path / f"rec_{number}" / "rec_0.mcap", messages)
+        os.utime(path, ns=(T0, T0))
+    # No share: 200 bytes a second are for either of them.
+    assert World.of(tmp_path, limits=StoreLimits(max_share=0.0)).fill() == 4
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        rows = base.execute(
+            "SELECT name, part.first_ns / 600000000000, bytes, dropped <> '' FROM part"
+            " JOIN topic ON topic.id = topic ORDER BY 1, 2"
+        ).fetchall()
+    assert [dropped for name, *_, dropped in rows if name == "/chatter"] == [0, 0, 0, 0]
+    assert [dropped for name, *_, dropped in rows if name == "/odom"] == [1, 0, 0, 0]
+    odometry, said_then = (
+        next(row[2] for row in rows if row[0] == name) for name in ("/odom", "/chatter")
+    )
+    assert odometry < said_then
+
+
 @pytest.mark.usefixtures("small_groups")
 def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None:
     write_bag(tmp_path, 0, rows=2000, hz=100)
