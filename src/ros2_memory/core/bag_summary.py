@@ -132,7 +132,7 @@ def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
     Of the shape (summaries, topics, 3).
     """
     topics = len(summaries[0].schema.topics)
-    stored = [summary.stored for summary in summaries]
+    stored = [summary._numbers for summary in summaries]
     size = _BASE.size + topics * (_COUNT_BYTES + 2 * _TIME_BYTES)
     if any(len(numbers) != size for numbers in stored):
         whole = b"".join([summary.numbers for summary in summaries])
@@ -212,11 +212,6 @@ class BagSummary:
         made.schema = schema
         made._numbers = numbers
         return made
-
-    @property
-    def stored(self) -> bytes:
-        """The numbers as they are in memory, packed or not."""
-        return self._numbers
 
     @property
     def numbers(self) -> bytes:

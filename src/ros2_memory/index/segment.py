@@ -6,7 +6,7 @@ A query looks at few topics of many bags, so the numbers of their summaries are 
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache, partial, reduce
+from functools import cached_property, lru_cache, reduce
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -380,7 +380,11 @@ class _Columns:
         rows: dict[int, list[int]] = {}
         for row, bag in enumerate(bags):
             rows.setdefault(id(bag.summary.schema), []).append(row)
-        self.groups = tuple(map(partial(_group, bags), rows.values()))
+        self.groups: list[_SchemaGroup] = []
+        for own in rows.values():
+            numbers = numbers_of([bags[row].summary for row in own])
+            schema = bags[own[0]].summary.schema
+            self.groups.append(_SchemaGroup(schema, np.array(own, np.intp), numbers))
         self._columns: dict[str, _Column | None] = {}
 
     def of(self, topic: str) -> _Column | None:
@@ -400,12 +404,6 @@ class _Columns:
         merged = _Column(*map(np.concatenate, zip(*columns, strict=True)))
         order = np.argsort(merged.bags, kind="stable")
         return _Column(*(each[order] for each in merged))
-
-
-def _group(bags: Sequence[BagFile], rows: Sequence[int]) -> _SchemaGroup:
-    schema = bags[rows[0]].summary.schema
-    numbers = numbers_of([bags[row].summary for row in rows])
-    return _SchemaGroup(schema, np.array(rows, np.intp), numbers)
 
 
 @lru_cache(maxsize=_CACHED_SEGMENTS)
