@@ -239,7 +239,7 @@ class Scanner:
             stored = self.store.part_data(part, path)
             if stored is None:
                 raise GoneError
-            data = decompressed(stored)
+            data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
         self._columns.put((part, path), column, _bytes_of(column))
         return column

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import DROPPED, pack_rows
+from ros2_memory.columns.parts import DROPPED, ZONE_ALONE, pack_rows
 from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -170,7 +170,12 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
     number = cursor.lastrowid
     connection.executemany(
         "INSERT INTO part_column VALUES (?, ?, ?)",
-        [(number, path, packed.data) for path, packed in part.columns.items() if packed.data],
+        [
+            (number, path, packed.data)
+            for path, packed in part.columns.items()
+            # Numbers that are rounded to one take no bytes, but are no constant.
+            if packed.data or packed.codec.split()[-1] not in {"constant", DROPPED, ZONE_ALONE}
+        ],
     )
     connection.executemany(
         "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",

@@ -413,3 +413,13 @@ def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path:
     key = one.filling._key(bag)
     assert not one.store.put_long(key, bag, deleted_meanwhile(), hashed=False, budget=10**6)
     assert (count(one, "part"), count(one, "bag")) == (0, 0)
+
+
+def test_numbers_that_are_rounded_to_one_come_back(tmp_path: Path) -> None:
+    messages = [odom(T0 + n * S, 1.0 + n * 1e-6, 0.0) for n in range(9)]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    os.utime(path, ns=(T0, T0))
+    world = World.of(tmp_path)
+    assert world.fill() == 1
+    assert count(world, "zone", "codec GLOB '* flat 0'") == 1
+    assert check_all(world) == 9
