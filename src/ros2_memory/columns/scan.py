@@ -144,6 +144,8 @@ class Scan:
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
         window, may_match = self._asked.window, self._asked.may_match
+        # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
+        sources = [s for s in sources if window.overlaps(s.first, s.last)]
         if may_match is not None:
             heads = [source.part for source in sources if source.part is not None]
             wanted = self._scanner.matching(heads, may_match)
@@ -159,12 +161,11 @@ class Scan:
                 ahead += together
                 parts = sources[nth:ahead]
                 self._together = [each.part for each in parts if each.part is not None]
-            if window.overlaps(source.first, source.last):
-                self._asked.check(source.last if newest_first else source.first)
-                for unit in self._units(source):
-                    rows = Rows(unit, partial(self._counting, unit))
-                    if self._asked.may_be_empty or len(rows):
-                        yield rows
+            self._asked.check(source.last if newest_first else source.first)
+            for unit in self._units(source):
+                rows = Rows(unit, partial(self._counting, unit))
+                if self._asked.may_be_empty or len(rows):
+                    yield rows
 
     def copies(self) -> Iterator[Rows]:
         """Yields the rows that do not count, as another recording has their messages, too.
