@@ -18,7 +18,7 @@ from ros2_memory.columns.pack import Packed, decompressed, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
 from ros2_memory.columns.table import Texts, Zone
 from ros2_memory.columns.units import GoneError, PartUnit
-from ros2_memory.columns.zones import PartZones
+from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.columns.values import Mask
-    from ros2_memory.columns.zones import Zones
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
@@ -100,7 +99,7 @@ class Scanner:
         self._covering = None if store is None else Covering(store, bag_dir)
         self._columns: ByteLru[Column] = ByteLru(48 << 20)
         self._known: ByteLru[Packed] = ByteLru(16 << 20)
-        self._all_zones: ByteLru[Zones] = ByteLru(32 << 20)
+        self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
 
@@ -156,12 +155,15 @@ class Scanner:
         """Returns the zones of a column in some parts of a topic."""
         assert self.store is not None  # noqa: S101 - there are no parts without one
         key = (self.store.offset, topic, path)
-        known = self._all_zones.get(key)
-        newest = 0 if known is None or not known.parts.size else int(known.parts[-1])
-        if known is None or (parts.size and int(parts.max()) > newest):
-            newer = self.store.zones(topic, path, newest)
-            known = newer if known is None else known.joined(newer)
-            self._all_zones.put(key, known, known.memory_bytes)
+        known, newest = self._all_zones.get(key) or (Zones.of([], []), 0)
+        asked = int(parts.max(initial=0))
+        if asked > newest:
+            failures = self.store.failures
+            known = known.joined(self.store.zones(topic, path, newest))
+            if self.store.failures == failures:
+                # Not each part has each column, so what was asked for counts, too.
+                newest = max(asked, *known.parts[-1:].tolist())
+                self._all_zones.put(key, (known, newest), known.memory_bytes)
         return known.among(parts)
 
     def part(
@@ -204,16 +206,27 @@ class Scanner:
         """Returns what is known of a column of a part; None where it has no such one.
 
         It is read at once for those parts of the same topic that are `together` with it.
+
+        Raises:
+            GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
         assert self.store is not None  # noqa: S101 - as above
-        key = (head.number, path)
-        known = self._known.get(key)
+        known = self._known.get((head.number, path))
         if known is None:
-            numbers = [other.number for other in together if other.topic == head.topic]
-            found = self.store.packed(head.topic, path, [head.number, *numbers])
-            for number in (head.number, *numbers):
-                self._known.put((number, path), found.get(number, _ABSENT), _COLUMN_BYTES)
-            known = found.get(head.number, _ABSENT)
+            numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
+            failures = self.store.failures
+            found = self.store.packed(head.topic, path, numbers)
+            others = [number for number in numbers if number not in found]
+            # A part that is gone has no columns either: only of one that is there it says anything.
+            there = self.store.packed(head.topic, LOG_TIME, others) if others else {}
+            if self.store.failures != failures:
+                raise GoneError
+            found.update(dict.fromkeys(there, _ABSENT))
+            for number, packed in found.items():
+                self._known.put((number, path), packed, _COLUMN_BYTES)
+            known = found.get(head.number)
+            if known is None:
+                raise GoneError
         return None if known is _ABSENT else known
 
     def split(self, number: int, topic: str) -> list[Table] | None:
@@ -258,11 +271,9 @@ class _PartColumns(Mapping[str, "Packed"]):
 
     def __getitem__(self, path: str) -> Packed:
         packed = self._scanner.packed(self._head, path, self._together)
-        if packed is not None:
-            return packed
-        if path == LOG_TIME or path in self._topic.layout.slots:
-            raise GoneError
-        raise KeyError(path)
+        if packed is None:
+            raise KeyError(path)
+        return packed
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._topic.layout.slots)
