@@ -16,7 +16,7 @@ from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.coverage import Covering
 from ros2_memory.columns.pack import Packed, decompressed, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
-from ros2_memory.columns.table import Texts, Zone
+from ros2_memory.columns.table import Zone, column_bytes
 from ros2_memory.columns.units import GoneError, PartUnit
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.storage.cache import ByteLru
@@ -254,7 +254,7 @@ class Scanner:
                 raise GoneError
             data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
-        self._columns.put((part, path), column, _bytes_of(column))
+        self._columns.put((part, path), column, column_bytes(column))
         return column
 
 
@@ -280,9 +280,3 @@ class _PartColumns(Mapping[str, "Packed"]):
 
     def __len__(self) -> int:
         return len(self._topic.layout.slots)
-
-
-def _bytes_of(column: Column) -> int:
-    if isinstance(column, Texts):
-        return column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
-    return column.nbytes

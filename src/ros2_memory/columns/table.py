@@ -344,13 +344,17 @@ def _joined_elements(
     return found
 
 
+def column_bytes(column: Column) -> int:
+    """Returns about how many bytes of memory a column takes."""
+    if isinstance(column, Texts):
+        return column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
+    return column.nbytes
+
+
 def _bytes(columns: Mapping[str, Column], elements: Mapping[str, Elements]) -> int:
     size = 0
     for column in columns.values():
-        if isinstance(column, Texts):
-            size += column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
-        else:
-            size += column.nbytes
+        size += column_bytes(column)
     for inner in elements.values():
         size += inner.owners.nbytes + _bytes(inner.columns, inner.elements)
     return size

@@ -91,11 +91,6 @@ class Truth:
         return np.zeros(self.rows, np.bool_) if self.some_unsure is None else self.some_unsure
 
 
-def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
-    """Returns which rows of a table meet a condition; for several tables, see `ColumnCondition`."""
-    return ColumnCondition(condition, extractor).truth(table)
-
-
 class ColumnCondition:
     """Tests one condition on tables; remembers what it means for each type that it met.
 

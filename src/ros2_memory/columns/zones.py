@@ -29,7 +29,7 @@ _ANY: Final = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Zones:
-    """The zones of one column: what `Zone` says of one part, for each of several.
+    """The zones of one column in several parts: what `Zone` is of one.
 
     Attributes:
         parts: the numbers of the parts, ascending.
@@ -158,7 +158,8 @@ class PartZones:
 
 
 def _bounds(values: Sequence[float], away: float) -> Floats:
-    """Returns bounds as floats: of what these cannot tell apart, the next one farther out."""
+    """Returns bounds as floats: where these are rounded, the next one farther out."""
     bounds = np.array([float(value) for value in values], np.float64)
     is_rounded = (np.abs(bounds) >= _EXACT_BELOW) & np.isfinite(bounds)
-    return np.where(is_rounded, np.nextafter(bounds, away), bounds)
+    with np.errstate(over="ignore"):  # beyond the greatest float lies infinity
+        return np.where(is_rounded, np.nextafter(bounds, away), bounds)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ros2_memory.columns.store import ColumnStore
@@ -45,6 +46,7 @@ def is_exact(*numbers: float) -> bool:
 
 
 @given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
+@example([Zone(0, sys.float_info.max)], 1, "")
 def test_zones_rule_out_what_the_zone_of_each_part_does(
     given_zones: list[Zone], limit: float, text: str
 ) -> None:
