@@ -162,7 +162,7 @@ class Scanner:
             known = known.joined(self.store.zones(topic, path, newest))
             if self.store.failures == failures:
                 # Not each part has each column, so what was asked for counts, too.
-                newest = max(asked, *known.parts[-1:].tolist())
+                newest = max([asked, *known.parts[-1:].tolist()])
                 self._all_zones.put(key, (known, newest), known.memory_bytes)
         return known.among(parts)
 
