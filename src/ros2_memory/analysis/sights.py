@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ros2_memory.core.arrays import Groups, distinct_rows
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -511,7 +511,8 @@ def _bins(scores: Floats) -> Ints:
 
 def _rounded(times: Ints) -> Ints:
     """Rounds up to 1 us: a message is at or before the time that is said of it."""
-    return -(-times // _NS_PER_US) * _NS_PER_US
+    # The last microsecond is not whole: its end is no time.
+    return np.minimum(-(-times // _NS_PER_US), MAX_NS // _NS_PER_US) * _NS_PER_US
 
 
 def joined(parts: Sequence[Sights], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:

@@ -31,14 +31,12 @@ from ros2_memory.analysis.motion.standstills import (
     StandstillDigest,
     StandstillRun,
 )
-from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.analysis.motion.odometry import Vertex
-    from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import JsonValue, Vector3
+    from ros2_memory.core.model import Vector3
 
 
 def encode_poses(poses: PoseDigest) -> bytes:
@@ -179,27 +177,6 @@ def _decode_end(pace_m: float, noise_m: float, plain: bool, creep: Creep | None)
 def _decode_vector(numbers: Vector3) -> Vector3:
     x, y, z = numbers
     return x, y, z
-
-
-def encode_schema(schema: SummarySchema) -> str:
-    """Encodes a summary schema; equal ones give equal texts."""
-    topics: JsonValue = [[*header] for header in schema.topics]
-    return json.dumps([topics, [*schema.silent], schema.complete, [*schema.notes], schema.set_back])
-
-
-def decode_schema(text: str) -> SummarySchema:
-    """Decodes a summary schema.
-
-    Raises:
-        ValueError: the text is not valid.
-        TypeError: likewise.
-    """
-    topics, silent, complete, notes, set_back = json.loads(text)
-    headers = (
-        TopicHeader(topic, type_name, encoding, bool(latched))
-        for topic, type_name, encoding, latched in topics
-    )
-    return shared_schema(tuple(headers), tuple(silent), bool(complete), tuple(notes), int(set_back))
 
 
 def encode_counts(numbers: bytes) -> bytes:

@@ -27,8 +27,8 @@ from ros2_memory.columns.shown import (
     placed,
 )
 from ros2_memory.columns.table import Texts
-from ros2_memory.columns.truth import may_be_rewritten
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Values
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
+from ros2_memory.columns.zones import PartZones
 from ros2_memory.messages.detections import LISTS, MAX_DEPTH, POSITIONS, detections_of
 from ros2_memory.storage.base import Definition
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scores import Scored
     from ros2_memory.columns.shown import Node
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Floats, Ints, Level
+    from ros2_memory.columns.values import Floats, Ints, Level, Mask
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.messages.detections import Detection
@@ -157,12 +157,18 @@ class DetectionColumns:
         except UnknownShapeError:
             return None
 
-    def may_hold(self, table: Table) -> bool:
-        """Returns whether some message of a table may hold a detection."""
-        sources, values = self._sources(table), Values(table)
-        return sources is None or any(_may_hold(values, source) for source in sources)
+    def may_match(self, known: Table | PartZones) -> bool | Mask:
+        """Returns whether a message may hold a detection, as known without reading a column.
 
-    def _sources(self, table: Table) -> tuple[Source, ...] | None:
+        Of several parts for each of them, or for all.
+        """
+        sources = self._sources(known)
+        found: bool | Mask = sources is None
+        for source in sources or ():
+            found = found | (not isinstance(source, Json) or _may_be_json(known, source.leaf))
+        return found
+
+    def _sources(self, table: Table | PartZones) -> tuple[Source, ...] | None:
         if table.definition is None or "" in table.left_out:
             return None
         key = (table.definition, table.channel.type)
@@ -373,22 +379,15 @@ def _no_frames(count: int) -> Texts:
     return Texts(np.zeros(count, np.uint32), ("",))
 
 
-def _may_hold(values: Values, source: Source) -> bool:
-    """Returns whether there may be a detection at one place of the messages."""
-    if isinstance(source, Json):
-        zone = values.zone(source.leaf)
-        if zone is not None and not may_be_rewritten(zone):
-            return False
-        texts = values.texts(source.leaf)
-        return texts is None or any(word[:1] in {"[", "{"} for word in texts.words)
-    level = source.leaf.level if isinstance(source, Words) else source.scored.level
-    return values.size(level) != 0
+def _may_be_json(known: Table | PartZones, leaf: Leaf) -> bool | Mask:
+    """Returns whether a text may be JSON, by its zone, or in which parts by their zones."""
+    zone = zone_of(leaf, known.zone) if isinstance(known, PartZones) else Values(known).zone(leaf)
+    return True if zone is None else zone.may_be_json
 
 
 def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     """Yields the detections in texts that are JSON, each of which is parsed once."""
-    zone = values.zone(source.leaf)
-    if zone is not None and not may_be_rewritten(zone):
+    if not _may_be_json(values.table, source.leaf):
         return
     texts = texts_of(values, source.leaf)
     known = [_parsed(word, source.depth) for word in texts.words]

@@ -294,12 +294,12 @@ def _value(level: int, type_name: str, name: str = "", text: str = "") -> JsonVa
     return {"status": [{"level": level, "name": name, "message": text}]}
 
 
-def _repeated(rows: Ints, codes: Ints, told: Sequence[Sequence[tuple[Word, float]]]) -> Facts:
+def _repeated(rows: Ints, codes: Ints, states: Sequence[Sequence[tuple[Word, float]]]) -> Facts:
     """Returns the facts of rows, each of which tells what its code does: one fact, or none."""
-    once = Facts.of([(nth, *fact) for nth, facts in enumerate(told) for fact in facts])
+    once = Facts.of([(nth, *fact) for nth, facts in enumerate(states) for fact in facts])
     if not once.rows.size:
         return NOTHING
-    place = np.full(len(told), -1)
+    place = np.full(len(states), -1)
     place[once.rows] = np.arange(once.rows.size)
     nth = place[codes]
     kept = nth >= 0

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.columns.detections import Detections
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -70,9 +71,9 @@ class DetectionRows:
         self._view = view
         self._columns = DetectionColumns(view.memory.extractor)
 
-    def may_hold(self, table: Table) -> bool:
-        """Returns whether some message of a table may hold a detection."""
-        return self._columns.may_hold(table)
+    def may_match(self, parts: PartZones) -> bool | Mask:
+        """Returns in which parts some message may hold a detection, by their zones."""
+        return self._columns.may_match(parts)
 
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of some rows; messages that cannot be decoded are left out."""

@@ -58,8 +58,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import Transform
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Session
@@ -508,9 +509,9 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
     sessions = sessions_of(view)
     earliest, latest = at - TF_CACHE_NS, at + TF_CACHE_NS
 
-    def may_match(table: Table) -> bool:
-        zone = table.zone(_STAMPS)
-        return zone is None or (zone.low <= latest and zone.high >= earliest)
+    def may_match(parts: PartZones) -> Mask:
+        zones = parts.zone(_STAMPS)
+        return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
     for topic in _recorded(view, view.memory.limits.tf_topics):
         everything = TimeWindow.everything()

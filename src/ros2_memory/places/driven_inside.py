@@ -283,14 +283,16 @@ def _part(found: Sequence[Digested[PoseDigest]], fastest_mps: float) -> _Part:
     before = 0.0
     for digest, _, _ in found:
         frames.update(dict.fromkeys(digest.frames))
-        if digest.totals.head is not None:
-            motion.join(digest.totals)
-        elif digest.vertices:
-            motion.add([TimedPosition(time, position) for time, position, _ in digest.vertices])
         if not digest.vertices:
             continue
-        after = motion.totals.distance_m
         own, jumps = _without_parts(digest.vertices)
+        if digest.totals.head is not None:
+            jumps[0] |= motion.join(digest.totals)
+        else:  # these few are all its poses, and nothing has parted them yet
+            poses = [TimedPosition(time, position) for time, position, _ in digest.vertices]
+            for nth in motion.add(poses):
+                jumps[nth] = True
+        after = motion.totals.distance_m
         steps = [
             0.0 if jump else distance(here[1], there[1])
             for (here, there), jump in zip(pairwise(own), jumps[1:], strict=True)

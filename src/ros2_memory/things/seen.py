@@ -172,9 +172,8 @@ class Watching:
                 topic,
                 TimeWindow.everything(),
                 newest_first=True,
-                may_match=self._rows.may_hold,
+                may_match=self._rows.may_match,
             )
-            if self._rows.may_hold(rows.table)
         )
 
     def _stretch(self, number: int, own: Session, found: Sequence[tuple[str, Rows]]) -> Stretch:

@@ -214,3 +214,8 @@ def test_fixes_are_kept_where_no_detector_published() -> None:
     assert both.fixes.tolist() == [[1, 13 * SECOND, 1000, -2000, 900, 250]]
     assert both.fixes[0, Fix.SIGMA] == 250
     assert both.slices == 2
+
+
+def test_what_is_seen_at_the_end_of_64_bits_has_a_time_that_fits() -> None:
+    [spot] = sights_of_messages([Message("/detections", 2**63 - 1, HERE, [mug(1.0)])]).spots
+    assert spot[Spot.LAST] == 2**63 - 808

@@ -96,8 +96,8 @@ def test_some_rows_of_a_table_have_their_own_pairs_and_stamps(tmp_path: Path) ->
     made.fill()
     view = View(made.memory, Call())
     [rows] = scan(view, "/tf", TimeWindow(T0 + 11 * S, T0 + 12 * S))
-    assert pairs_in(rows.table, rows.index) == {("odom", "base")}
-    assert pairs_in(rows.table) == {("map", "odom"), ("odom", "base")}
+    assert pairs_in(rows.table, rows.index) == frozenset({("odom", "base")})
+    assert pairs_in(rows.table) == frozenset({("map", "odom"), ("odom", "base")})
     near = stamped_between(rows.table, None, T0 + 12 * S + 5, T0 + 12 * S + 5)
     assert near is not None
     assert near.tolist() == [12]

@@ -359,6 +359,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
             distance, _ = min(inside)
             # It is a pose, as near as the track knows.
             [(at, px, py)] = [pose for pose in poses if pose[0] == visit.closest_at]
+            assert visit.closest_m is not None
             assert visit.closest_m == pytest.approx(math.dist((px, py), place), abs=1e-4)
             assert visit.closest_m <= distance + 2 * TOLERANCE_M
             assert {visit.arrived, visit.departed} <= {t for t, *_ in poses} | {None}

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree  # type: ignore[import-untyped]
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
-from ros2_memory.analysis.motion.robot_track import RobotTrack, track_of
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, track_of
 from ros2_memory.bag_dir.moment_file import (
     SavedMoment,
     SaveRequest,
@@ -40,7 +40,6 @@ from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import moment_request, page_routes, span_request, warm_up
 from ros2_memory.serving.page.span import (
     MOST_POINTS,
-    cut,
     driven_cells,
     span_shown,
     thinned,

@@ -91,7 +91,8 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
         if thins:
             index = thinned(some[0])
             some = [column[index] for column in some]
-        return track_part(*some)
+        times, x, y, heading = some
+        return track_part(times, x, y, heading)
 
     whole = joined_track([part(0, 1500)])
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
@@ -102,8 +103,8 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
 def test_turns_on_the_spot_add_up() -> None:
     seconds = np.arange(0, 60, 0.1)
     times = START + (seconds * S).astype(np.int64)
-    heading = np.remainder(seconds, math.tau)
-    track = track_of(times, 0 * seconds, 0 * seconds, heading)
+    heading, still = np.remainder(seconds, math.tau), np.zeros(seconds.size)
+    track = track_of(times, still, still, heading)
     assert track.heading[-1] - track.heading[0] == pytest.approx(59.9, abs=1e-5)
     assert len(track.times) < 20
 
@@ -116,7 +117,7 @@ def test_a_robot_that_stands_has_two_vertices_in_ten_seconds() -> None:
 
 def test_a_long_silence_begins_a_piece() -> None:
     times = np.array([0, 1, 2, 30, 31], np.int64) * S + START
-    track = track_of(times, times * 0.0, times * 0.0, times * 0.0)
+    track = track_of(times, np.zeros(5), np.zeros(5), np.zeros(5))
     assert track.times[track.begins].tolist() == [START, START + 30 * S]
     assert [ends.tolist() for ends in track.pieces] == [
         [START, START + 30 * S],
@@ -126,13 +127,13 @@ def test_a_long_silence_begins_a_piece() -> None:
 
 def test_an_unknown_heading_stays_unknown() -> None:
     times = np.arange(3, dtype=np.int64) * S + START
-    assert np.isnan(track_of(times, times * 0.0, times * 0.0, times * np.nan).heading).all()
+    assert np.isnan(track_of(times, np.zeros(3), np.zeros(3), np.full(3, np.nan)).heading).all()
 
 
 def test_poses_that_are_no_place_are_left_out() -> None:
     times = np.arange(4, dtype=np.int64) * S + START
     x = np.array([0.0, np.nan, 1e9, 1.0])
-    assert track_of(times, x, times * 0.0, times * 0.0).x.tolist() == [0.0, 1.0]
+    assert track_of(times, x, np.zeros(4), np.zeros(4)).x.tolist() == [0.0, 1.0]
 
 
 def test_without_a_pose_there_is_no_track() -> None:
