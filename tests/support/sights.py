@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Seen, joined, no_sights, sights_of
+from ros2_memory.analysis.joined_sights import joined, packed
+from ros2_memory.analysis.sights import Seen, no_sights, sights_of
 from ros2_memory.columns.table import Texts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.sights import Sights
+    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
 
@@ -57,6 +58,11 @@ def seen_in(messages: Sequence[Message]) -> Seen:
     )
 
 
+def joined_of(parts: Sequence[Sights], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:
+    """The sights of all parts, and the epoch of each slice."""
+    return joined([packed(part) for part in parts], epochs)
+
+
 def whole(parts: Sequence[Sights]) -> Sights:
     """The sights of all parts, which are in one coordinate system."""
-    return joined(parts)[0]
+    return joined_of(parts)[0]

@@ -13,7 +13,7 @@ a thing was missed before or after it was last seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from itertools import combinations, groupby
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -140,9 +140,8 @@ class Fix(IntEnum):
 
 AHEAD_MM: Final = 2_000
 """Things are about so far away: so much do errors of heading weigh."""
-_TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
-_WITH_SLICES: Final = (0, 1, 5, 6)
-"""The tables whose rows are of a slice, which column 0 numbers."""
+TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
+"""The columns of each table of `Sights`."""
 
 
 class Seen(NamedTuple):
@@ -171,13 +170,18 @@ class Seen(NamedTuple):
 class Sights:
     """What detectors saw in some slices: column 0 of most tables is the slice.
 
-    From `sights_of` it is the slice of the clock; `joined` numbers those of all from 0 to `slices`.
+    From `sights_of` it is the slice of the clock; `joined_sights.joined` numbers those of all from
+    0 to `slices`.
     """
 
     topics: tuple[str, ...]
     labels: tuple[str, ...]
     tables: tuple[Ints, ...]
     slices: int = 0
+
+    def with_fixes(self, fixes: Ints) -> Sights:
+        """Returns these sights with other fixes."""
+        return replace(self, tables=(*self.tables[:-1], fixes))
 
     @property
     def spots(self) -> Ints:
@@ -214,15 +218,10 @@ class Sights:
         """Where odometry was in the map (`Fix`)."""
         return self.tables[6]
 
-    @property
-    def memory_bytes(self) -> int:
-        """About how much memory it takes."""
-        return 1_000 + sum(table.nbytes for table in self.tables)
-
 
 def no_sights() -> Sights:
     """Returns the sights where no detector published."""
-    return Sights((), (), tuple(np.zeros((0, len(columns)), np.int64) for columns in _TABLES))
+    return Sights((), (), tuple(np.zeros((0, len(columns)), np.int64) for columns in TABLES))
 
 
 class _Detections(NamedTuple):
@@ -278,20 +277,18 @@ def sights_of(topic: str, seen: Seen) -> Sights:
     return Sights((topic,), labels, tables)
 
 
-def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
-    """Returns where odometry was in the map at some log times.
+def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
+    """Returns where odometry was in the map at some log times (`Fix`).
 
     Args:
         times: ns.
         poses: x, y (m) and yaw (rad) at each.
         sigma_m: what the localiser says; NaN where it does not.
     """
-    said = np.where(np.isnan(sigma_m), -1, np.rint(np.minimum(sigma_m, _MAX_AWAY_M) * 1000))
+    said = np.rint(np.nan_to_num(np.minimum(sigma_m, _MAX_AWAY_M) * 1000, nan=-1)).astype(np.int64)
     x, y, yaw = poses.T
     columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), said)
-    nothing = no_sights()
-    table = np.stack(columns, axis=1).astype(np.int64).reshape(-1, len(Fix))
-    return Sights((), (), (*nothing.tables[:-1], table))
+    return np.stack(columns, axis=1)
 
 
 def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
@@ -513,71 +510,3 @@ def _rounded(times: Ints) -> Ints:
     """Rounds up to 1 us: a message is at or before the time that is said of it."""
     # The last microsecond is not whole: its end is no time.
     return np.minimum(-(-times // _NS_PER_US), MAX_NS // _NS_PER_US) * _NS_PER_US
-
-
-def joined(parts: Sequence[Sights], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:
-    """Returns the sights of all parts, with one table of names, and the epoch of each slice.
-
-    Slices are numbered in order of time. Those of one time and another epoch (the coordinate system
-    of a part) are different ones.
-    """
-    epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
-    topics = sorted({name for part in parts for name in part.topics})
-    labels = sorted({name for part in parts for name in part.labels})
-    moved = _renumbered(parts, topics, labels)
-    keys = []
-    for at in _WITH_SLICES:
-        of = np.repeat(epoch, np.array([len(part.tables[at]) for part in parts], np.int64))
-        keys.append(np.column_stack((moved[at][:, 0], of)))
-    every = np.concatenate(keys)
-    rows, number = distinct_rows((every[:, 0], every[:, 1]))
-    ends = np.cumsum([len(own) for own in keys])[:-1]
-    for at, slices in zip(_WITH_SLICES, np.split(number, ends), strict=True):
-        moved[at][:, 0] = slices
-    spots, looks, hits, scores, beside, unplaced, fixes = moved
-    spot_order = np.lexsort((spots[:, Spot.LABEL], spots[:, Spot.TOPIC], spots[:, Spot.SLICE]))
-    look_order = np.lexsort((looks[:, Look.TOPIC], looks[:, Look.SLICE]))
-    for table in (hits, scores, beside):
-        table[:, 0] = _places_of(spot_order)[table[:, 0]]
-    hits[:, Hit.LOOK] = np.append(_places_of(look_order), [-1])[hits[:, Hit.LOOK]]
-    tables = (
-        spots[spot_order],
-        looks[look_order],
-        *(table[np.lexsort(table.T[1::-1])] for table in (hits, scores, beside, unplaced)),
-        np.unique(fixes, axis=0),
-    )
-    return Sights(tuple(topics), tuple(labels), tables, len(rows)), rows[:, 1]
-
-
-def _renumbered(
-    parts: Sequence[Sights], topics: Sequence[str], labels: Sequence[str]
-) -> list[Ints]:
-    """Returns the tables of all parts, with numbers of topics, labels, spots and looks of all."""
-    topic_of = {name: nth for nth, name in enumerate(topics)}
-    label_of = {name: nth for nth, name in enumerate(labels)}
-    gathered: list[list[Ints]] = [[columns] for columns in no_sights().tables]
-    spots = looks = 0
-    for part in parts:
-        topic = np.array([topic_of[name] for name in part.topics], np.int64)
-        label = np.array([label_of[name] for name in part.labels], np.int64)
-        copies = [table.copy() for table in part.tables]
-        spot, look, hit, score, beside, unplaced, _ = copies
-        for table in (spot, look, unplaced):
-            table[:, 1] = topic[table[:, 1]]
-        for table in (spot, unplaced):
-            table[:, Spot.LABEL] = label[table[:, Spot.LABEL]]
-        hit[:, Hit.LOOK] += np.where(hit[:, Hit.LOOK] < 0, 0, looks)
-        for table in (hit, score, beside):
-            table[:, 0] += spots
-        beside[:, Beside.LABEL] = label[beside[:, Beside.LABEL]]
-        for tables, table in zip(gathered, copies, strict=True):
-            tables.append(table)
-        spots, looks = spots + len(spot), looks + len(look)
-    return [np.concatenate(tables) for tables in gathered]
-
-
-def _places_of(order: Ints) -> Ints:
-    """Returns where each row goes in an order."""
-    places = np.empty(len(order), np.int64)
-    places[order] = np.arange(len(order))
-    return places

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.robot_track import TrackPart
-    from ros2_memory.analysis.sights import Sights
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.store import ColumnStore, PartHead
@@ -37,9 +36,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
-
-Placed: TypeAlias = "tuple[str, frozenset[str] | None, tuple[Sights, ...]]"
-"""The frame of sights, the session that it is of, and the sights."""
 
 _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
@@ -102,8 +98,7 @@ class Scanner:
         static_runs: by part, when its static transforms change.
         tracks: by part, frame and transforms, where the robot was.
         statics: by session and topics, the static transforms of a timeline.
-        sights: by session and ten minutes, with all that they follow from, what detectors saw:
-            the frame, the session that it is of, and the tables.
+        sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
         things: by settings, what was estimated of all bags of a timeline.
     """
 
@@ -119,7 +114,7 @@ class Scanner:
         self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
         self.tracks: ByteLru[TrackPart] = ByteLru(32 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
-        self.sights: ByteLru[Placed] = ByteLru(48 << 20)
+        self.sights: ByteLru[bytes] = ByteLru(16 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
 
     def coverage(self, timeline: Timeline) -> Coverage | None:

@@ -112,7 +112,8 @@ class Memory:
     digests of the bags, for what does not scan yet. Every answer is the same with them and without.
     `stated` is
     set for a lake, which stores what messages state instead of the messages: it returns that, or
-    None for a message that can be decoded. The poses of a lake are thinned.
+    None for a message that can be decoded. `sights` is, too, and has what detectors saw in a bag:
+    rows have no transforms that place it. The poses of a lake are thinned.
     """
 
     index: SnapshotSource
@@ -123,6 +124,7 @@ class Memory:
     recall: DigestCache | None = None
     columns: Scanner | None = None
     stated: Callable[[Record], State | None] | None = None
+    sights: Callable[[BagFile], bytes] | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.

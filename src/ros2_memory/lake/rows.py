@@ -43,7 +43,7 @@ from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
-from ros2_memory.things.seen import Watching, may_have_detections
+from ros2_memory.things.seen import Watching, in_bytes, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -304,11 +304,13 @@ class _BagRows:
         )
 
     def _add_things(self) -> None:
-        watching = Watching(View(self._memory, Call()))
-        for stretch in watching.in_bag(self._bag):
-            for sights in stretch.sights:
+        placed = Watching(View(self._memory, Call())).in_bag(self._bag)
+        if placed:
+            self._add_digest("", "sights", in_bytes(placed))
+        for one in placed:
+            for sights in one.sights:
                 for spot in sights.spots.tolist():
-                    self._add_thing(stretch.frame_id, sights, spot)
+                    self._add_thing(one.frame_id, sights, spot)
 
     def _add_thing(self, frame: str, sights: Sights, spot: Sequence[int]) -> None:
         topic, best = sights.topics[spot[Spot.TOPIC]], spot[Spot.BEST]

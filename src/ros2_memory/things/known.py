@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.sights import joined
+from ros2_memory.analysis.joined_sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import READING_S
@@ -207,7 +207,7 @@ class _Loader:
 
 
 def _spots(part: Sequence[Stretch]) -> int:
-    return sum(len(sights.spots) for stretch in part for sights in stretch.sights)
+    return sum(stretch.spots for stretch in part)
 
 
 def _within(parts: Sequence[list[Stretch]], most: int) -> list[list[Stretch]]:

@@ -9,22 +9,27 @@ for them. Other messages of such a topic count as looks that saw nothing.
 
 from __future__ import annotations
 
-import heapq
+import json
 import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
+from hashlib import blake2b
+from itertools import accumulate, chain, pairwise
+from struct import Struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Frames, multiply
+from ros2_memory.analysis.frames import Frames, multiply, static_at
+from ros2_memory.analysis.joined_sights import packed
 from ros2_memory.analysis.motion.odometry import FARTHEST_M
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
-from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, Sights, fixes_of, sights_of
+from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, fixes_of, sights_of
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.detections import DetectionRows, joined_detected
 from ros2_memory.history.frames import frames_over
 from ros2_memory.history.poses import pose_rows
@@ -32,13 +37,15 @@ from ros2_memory.history.scan import messages_of, scan
 from ros2_memory.history.transforms import sessions_of, static_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.frames import Rotations
+    from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.history.detections import Detected
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
@@ -47,7 +54,12 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]
 
+VERSION: Final = 1
+"""Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 STRETCH_NS: Final[Ns] = 60 * SLICE_NS
+_SIZE: Final = Struct("<I")
+_MANY: Final = 64
+"""A bag that spans more stretches may have odd times."""
 _NO_DETECTIONS: Final = frozenset(
     {
         "action_msgs",
@@ -96,13 +108,44 @@ class Stretch(NamedTuple):
         frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
             lead to the map.
         session: its recordings; None where the frame is the map, which is the same for all.
-        sights: of each topic, and fixes.
+        spots: how many spots there are.
+        sights: packed, as `joined` takes them.
     """
 
     start: Ns
     frame_id: str
     session: Session | None
+    spots: int
+    sights: tuple[bytes, ...]
+
+
+class Placed(NamedTuple):
+    """What one session saw in a stretch.
+
+    Attributes:
+        nth: which of the sessions around the stretch, in the order of their names.
+        frame_id: as of a `Stretch`.
+        sights: of each topic.
+    """
+
+    nth: int
+    frame_id: str
     sights: tuple[Sights, ...]
+
+
+class _Around(NamedTuple):
+    """What the sights of a stretch depend on.
+
+    Attributes:
+        window: the stretch.
+        bags: that reach into it, or nearly so.
+        sessions: those that these are of, in the order of their names, each with the one whose
+            transforms hold for it (which is empty where none do).
+    """
+
+    window: TimeWindow
+    bags: Sequence[BagFile]
+    sessions: Sequence[tuple[Session, Session]]
 
 
 def is_named_for_detections(type_name: str) -> bool:
@@ -116,14 +159,39 @@ def may_have_detections(type_name: str) -> bool:
     return type_name == _TEXT or type_name.partition("/")[0] not in _NO_DETECTIONS
 
 
+def in_bytes(placed: Sequence[Placed]) -> bytes:
+    """Returns what was seen as bytes: of each session what there is, as JSON, then the sights."""
+    parts = [[packed(sights) for sights in one.sights] for one in placed]
+    head = [
+        (one.nth, one.frame_id, sum(len(sights.spots) for sights in one.sights), [*map(len, own)])
+        for one, own in zip(placed, parts, strict=True)
+    ]
+    described = json.dumps(head).encode()
+    return b"".join((_SIZE.pack(len(described)), described, *chain.from_iterable(parts)))
+
+
 class Watching:
-    """Reads what detectors saw in the bags of a view."""
+    """Reads what detectors saw in the bags of a view.
+
+    Args:
+        view: has the bags.
+    """
 
     def __init__(self, view: View) -> None:
         self._view = view
         self._rows = DetectionRows(view)
         self._sessions = sessions_of(view)
-        self._said: dict[Session, tuple[Ints, Floats]] = {}
+        self._of: dict[Path, Session] = {}
+        timeline = view.snapshot.timeline
+        self._topics = [
+            topic
+            for topic in timeline.topics()
+            if any(map(may_have_detections, timeline.types_of(topic)))
+        ]
+        limits = view.memory.limits
+        self._settings = repr(
+            (VERSION, limits.map_frame, view.pose_topic, limits.tf_topics, limits.tf_clock)
+        )
 
     def newest_first(self) -> Iterator[list[Stretch]]:
         """Yields the sights of all sessions in each stretch that has some.
@@ -131,96 +199,164 @@ class Watching:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        topics = [topic for topic in self._view.snapshot.timeline.topics() if self._detects(topic)]
-        for number, found in _by_stretch(self._view, topics, TimeWindow.everything()):
-            of_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
-            for topic, rows in found:
-                of_session[self._sessions.of(rows.recording)].append((topic, rows))
-            yield [self._stretch(number, own, some) for own, some in of_session.items()]
+        shipped = self._view.memory.sights
+        if shipped is not None:
+            yield from self._shipped(shipped)
+            return
+        if not self._topics:
+            return
+        bags = _Bags(self._view, self._topics)
+        for number in bags.stretches():
+            self._view.bags.check_deadline()
+            window = _window(number)
+            near, numbers = bags.around(window.widened(_AROUND_NS))
+            around = self._around(window, near)
+            data = self._known(around, numbers)
+            if found := self._stretches(window.start, [own for own, _ in around.sessions], data):
+                yield found
 
-    def in_bag(self, bag: BagFile) -> Iterator[Stretch]:
-        """Yields the sights of the messages of one bag that count.
+    def in_bag(self, bag: BagFile) -> list[Placed]:
+        """Returns the sights of the messages of one bag that count, in each stretch.
 
         Raises:
-            QueryTimeoutError: while it is iterated, when the deadline has passed.
+            QueryTimeoutError: the deadline has passed.
         """
-        topics = [
-            each.topic for each in bag.summary.schema.topics if may_have_detections(each.type)
-        ]
-        window = TimeWindow(bag.start, bag.end + 1)
-        for number, found in _by_stretch(self._view, topics, window):
-            stretch = TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS)
-            own = [
-                (topic, rows.some(positions))
-                for topic, rows in found
-                for each, positions in rows.bag_rows()
+        own = self._session(bag)
+        found: list[Placed] = []
+        for number in _numbers_of(self._view, self._topics, bag):
+            window = _window(number).intersect(TimeWindow(bag.start, bag.end + 1))
+            rows = [
+                (topic, some.some(positions))
+                for topic, some in self._found(window)
+                for each, positions in some.bag_rows()
                 if each.file == bag.file
             ]
-            if own:
-                session = self._sessions.of(bag.recording)
-                yield self._read(stretch, session, self._transforms_of(session, own[0][1]), own)
+            found += self._placed(0, window, own, self._transforms_of(own, bag, window), rows)
+        return found
 
-    def _detects(self, topic: str) -> bool:
-        """Returns whether some message of a topic holds detections, or its type is named so."""
-        types = self._view.snapshot.timeline.types_of(topic)
-        if any(map(is_named_for_detections, types)):
-            return True
-        return any(map(may_have_detections, types)) and any(
-            self._rows.of(rows).found.rows.size
-            for rows in scan(
-                self._view,
-                topic,
-                TimeWindow.everything(),
-                newest_first=True,
-                may_match=self._rows.may_match,
-            )
-        )
+    def _shipped(self, shipped: Callable[[BagFile], bytes]) -> Iterator[list[Stretch]]:
+        """Yields the sights of the bags of a lake, each as a stretch."""
+        for bag in reversed(self._view.snapshot.timeline.bags):
+            self._view.bags.check_deadline()
+            if found := self._stretches(bag.start, [self._session(bag)], shipped(bag)):
+                yield found
 
-    def _stretch(self, number: int, own: Session, found: Sequence[tuple[str, Rows]]) -> Stretch:
-        """Returns the sights of a session, from memory where they are known."""
-        window = TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS)
-        around = self._view.snapshot.timeline.overlapping(window.widened(_AROUND_NS))
-        among = self._transforms_of(own, found[0][1])
-        scanner = self._view.memory.columns
-        if scanner is None or any(bag.state is BagState.ACTIVE for bag in around):
-            return self._read(window, own, among, found)
-        limits, static = self._view.memory.limits, static_transforms(self._view, among)
-        placing = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
-        key = (number, own, among, placing, hash(tuple(static)), tuple(map(_identity, around)))
-        known = scanner.sights.get(key)
-        if known is None:
-            before = self._view.notes.added
-            stretch = self._read(window, own, among, found)
-            known = stretch.frame_id, stretch.session, stretch.sights
-            if self._view.notes.added == before:
-                size = sum(each.memory_bytes for each in stretch.sights)
-                scanner.sights.put(key, known, size + 200 * len(around))
-        return Stretch(window.start, *known)
+    def _stretches(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
+        """Returns what was seen from its bytes; see `in_bytes`."""
+        if not data:
+            return []
+        [size] = _SIZE.unpack_from(data)
+        at = _SIZE.size + size
+        found = []
+        for nth, frame, spots, lengths in json.loads(data[_SIZE.size : at]):
+            ends = [*accumulate(lengths, initial=at)]
+            parts = tuple(data[begin:end] for begin, end in pairwise(ends))
+            at = ends[-1]
+            in_map = frame == self._view.memory.limits.map_frame
+            found.append(Stretch(start, frame, None if in_map else sessions[nth], spots, parts))
+        return found
 
-    def _transforms_of(self, own: Session, rows: Rows) -> Session:
-        """Returns the session whose transforms hold for some rows; empty where none has any."""
-        if self._view.memory.columns is None:  # a lake, whose rows are placed and hold none
-            return frozenset()
+    def _session(self, bag: BagFile) -> Session:
+        if bag.recording not in self._of:
+            self._of[bag.recording] = self._sessions.of(bag.recording)
+        return self._of[bag.recording]
+
+    def _around(self, window: TimeWindow, bags: Sequence[BagFile]) -> _Around:
+        first: dict[Session, BagFile] = {}
+        for bag in bags:
+            first.setdefault(self._session(bag), bag)
+        sessions = [(own, self._transforms_of(own, bag, window)) for own, bag in first.items()]
+        return _Around(window, bags, sorted(sessions, key=lambda pair: sorted(pair[0])))
+
+    def _transforms_of(self, own: Session, bag: BagFile, window: TimeWindow) -> Session:
+        """Returns the session whose transforms hold for a bag's; empty where none has any."""
         if self._sessions.has_all_kinds(own):
             return own
-        return self._sessions.lending_to(rows.recording, int(rows.times[0]))
+        return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
-    def _read(
-        self, window: TimeWindow, own: Session, among: Session, found: Sequence[tuple[str, Rows]]
-    ) -> Stretch:
-        by_topic: dict[str, list[Detected]] = defaultdict(list)
+    def _known(self, around: _Around, numbers: Ints | None) -> bytes:
+        """Returns what was seen in a stretch, in bytes; from memory where that is known."""
+        scanner = self._view.memory.columns
+        if scanner is None or any(bag.state is BagState.ACTIVE for bag in around.bags):
+            return self._read(around)
+        key = self._key(around, numbers)
+        data = scanner.sights.get(key)
+        if data is None:
+            before = self._view.notes.added
+            data = self._read(around)
+            if self._view.notes.added == before:
+                scanner.sights.put(key, data, 200 + len(data))
+        return data
+
+    def _key(self, around: _Around, numbers: Ints | None) -> bytes:
+        """Returns what tells the sights of a stretch from others: all that they follow from.
+
+        Args:
+            around: the stretch.
+            numbers: of its bags in the store; None where not all are there.
+        """
+        window, near = around.window, {self._sessions.folder(bag.recording) for bag in around.bags}
+        told: list[object] = [self._settings, window.start]
+        for own, among in around.sessions:
+            static = static_in(static_transforms(self._view, among), window) if among else []
+            held = [
+                (one.parent, one.child, one.transform, max(one.log_time, window.start))
+                for one in static
+            ]
+            told.append((sorted(own & near), sorted(among & near), held))
+        if numbers is None:
+            told += [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
+        digest = blake2b(repr(told).encode(), digest_size=16)
+        if numbers is not None:
+            digest.update(numbers.tobytes())
+        return digest.digest()
+
+    def _read(self, around: _Around) -> bytes:
+        of_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
+        for topic, rows in self._found(around.window):
+            of_session[self._sessions.of(rows.recording)].append((topic, rows))
+        placed = [
+            one
+            for nth, (own, among) in enumerate(around.sessions)
+            for one in self._placed(nth, around.window, own, among, of_session[own])
+        ]
+        return in_bytes(placed) if placed else b""
+
+    def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
+        """Yields the rows in a window that may have detections."""
+        for topic in self._topics:
+            for rows in scan(self._view, topic, window, may_match=self._rows.may_match):
+                yield topic, rows
+
+    def _placed(
+        self,
+        nth: int,
+        window: TimeWindow,
+        own: Session,
+        among: Session,
+        found: Sequence[tuple[str, Rows]],
+    ) -> Iterator[Placed]:
+        """Yields the sights of one session, if a detector published."""
+        by_topic: dict[str, list[Rows]] = defaultdict(list)
         for topic, rows in sorted(found, key=_place_of):
-            by_topic[topic].append(self._rows.of(rows))
+            by_topic[topic].append(rows)
+        detected: dict[str, Detected] = {}
+        for topic, some in by_topic.items():
+            all_of = joined_detected([self._rows.of(rows) for rows in some])
+            if all_of.found.rows.size or any(
+                is_named_for_detections(rows.table.channel.type) for rows in some
+            ):
+                detected[topic] = all_of
+        if not detected:
+            return
         poses = self._poses(own, window)
         target, frames = self._frames(among, window, poses)
-        detected = {topic: joined_detected(parts) for topic, parts in by_topic.items()}
         sights = [sights_of(topic, _seen(each, poses, frames)) for topic, each in detected.items()]
-        in_map = target == self._view.memory.limits.map_frame
-        own_frame = poses.frames.words[0] if len(poses) else ""
-        if in_map and own_frame:
+        if target == self._view.memory.limits.map_frame and len(poses):
             times = np.concatenate([each.log_times for each in detected.values()])
-            sights.append(self._fixes(own, own_frame, frames, times))
-        return Stretch(window.start, target, None if in_map else own, tuple(sights))
+            fixes = self._fixes(own, poses.frames.words[0], frames, times)
+            sights[0] = sights[0].with_fixes(fixes)
+        yield Placed(nth, target, tuple(sights))
 
     def _poses(self, own: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
@@ -260,12 +396,15 @@ class Watching:
             return target, frames
         return own, frames_over(self._view, among, window, own)
 
-    def _fixes(self, own: Session, frame: str, frames: Frames, seen: Ints) -> Sights:
+    def _fixes(self, own: Session, frame: str, frames: Frames, seen: Ints) -> Ints:
         """Returns where odometry was in the map around detections, where that changes."""
         first, last = int(seen.min()), int(seen.max()) + _AHEAD_NS
         step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS
-        times = np.arange(first // step - 1, last // step + 2) * step
-        said, sigma = self._localised(own)
+        most = MAX_NS // step
+        begin, end = max(first // step - 1, -most), min(last // step + 2, most)
+        times = np.arange(begin, end) * step
+        around = TimeWindow(int(seen.min()), int(seen.max())).widened(_AROUND_NS)
+        said, sigma = self._localised(own, around)
         found = frames.poses(frame, times) if frame != frames.target else None
         pose = np.zeros((len(times), 3))
         if found is not None:
@@ -284,22 +423,20 @@ class Watching:
         kept &= (times >= first - step) & (times <= last)
         return fixes_of(times[kept], pose[kept], known[kept])
 
-    def _localised(self, own: Session) -> tuple[Ints, Floats]:
-        """Returns what the localiser of a session said: when, and its standard deviation (m)."""
-        if own not in self._said:
-            timeline = self._view.snapshot.timeline
-            topics = [
-                topic for topic in timeline.topics() if _LOCALISER in timeline.types_of(topic)
-            ]
-            found = sorted(each for topic in topics for each in self._covariances(topic, own))
-            times = np.array([time for time, _ in found], np.int64)
-            self._said[own] = times, np.array([sigma for _, sigma in found], np.float64)
-        return self._said[own]
+    def _localised(self, own: Session, window: TimeWindow) -> tuple[Ints, Floats]:
+        """Returns what the localiser said: when, and its standard deviation (m)."""
+        timeline = self._view.snapshot.timeline
+        topics = [topic for topic in timeline.topics() if _LOCALISER in timeline.types_of(topic)]
+        found = sorted(each for topic in topics for each in self._covariances(topic, own, window))
+        times = np.array([time for time, _ in found], np.int64)
+        return times, np.array([sigma for _, sigma in found], np.float64)
 
-    def _covariances(self, topic: str, own: Session) -> Iterator[tuple[Ns, float]]:
+    def _covariances(
+        self, topic: str, own: Session, window: TimeWindow
+    ) -> Iterator[tuple[Ns, float]]:
         """Yields what a localiser says, now and then: covariances have no columns."""
         memory = self._view.memory
-        for rows in scan(self._view, topic, TimeWindow.everything()):
+        for rows in scan(self._view, topic, window):
             if self._sessions.of(rows.recording) != own:
                 continue
             numbers = rows.times // _SAID_NS
@@ -315,32 +452,70 @@ class Watching:
                     yield found.time, sigma
 
 
-def _by_stretch(
-    view: View, topics: Sequence[str], window: TimeWindow
-) -> Iterator[tuple[int, list[tuple[str, Rows]]]]:
-    """Yields the rows of some topics by stretches of the clock, the newest first."""
+class _Bags:
+    """The bags of a view as arrays, without those of carried messages that nothing is seen by.
 
-    def of(topic: str) -> Iterator[tuple[str, Rows]]:
-        for rows in scan(view, topic, window, newest_first=True):
-            yield topic, rows
+    Args:
+        view: has the bags.
+        topics: those that may have detections.
+    """
 
-    waiting: dict[int, list[tuple[str, Rows]]] = defaultdict(list)
-    for topic, rows in heapq.merge(*map(of, topics), key=lambda found: -found[1].last):
-        for number in sorted((n for n in waiting if n > rows.last // STRETCH_NS), reverse=True):
-            yield number, waiting.pop(number)
-        for number, some in _divided(rows):
-            waiting[number].append((topic, some))
-    for number in sorted(waiting, reverse=True):
-        yield number, waiting[number]
+    def __init__(self, view: View, topics: Sequence[str]) -> None:
+        self._view = view
+        self._topics = topics
+        limits, timeline = view.memory.limits, view.snapshot.timeline
+        needed = (*topics, view.pose_topic, *limits.tf_topics)
+        self._bags = [
+            bag
+            for bag in timeline.bags
+            if not is_carried(bag.file) or any(map(bag.summary.of, needed))
+        ]
+        count = len(self._bags)
+        self._starts = np.fromiter((bag.start for bag in self._bags), np.int64, count)
+        self._ends = np.fromiter((bag.end for bag in self._bags), np.int64, count)
+        self._latest = np.maximum.accumulate(self._ends)
+        scanner = view.memory.columns
+        coverage = None if scanner is None else scanner.coverage(timeline)
+        self._numbers: Ints | None = None
+        if coverage is not None and count == len(timeline.bags):
+            self._numbers = np.concatenate([part.numbers for part in coverage.segments])
+
+    def stretches(self) -> list[int]:
+        """Returns the numbers of the stretches in which there may be messages, the newest first."""
+        first, last = self._starts // STRETCH_NS, self._ends // STRETCH_NS
+        long = np.flatnonzero(last - first > 1)
+        more = [_numbers_of(self._view, self._topics, self._bags[nth]) for nth in long.tolist()]
+        every = np.concatenate([first, last, *(np.array([*some], np.int64) for some in more)])
+        numbers: list[int] = np.unique(every)[::-1].tolist()
+        return numbers
+
+    def around(self, window: TimeWindow) -> tuple[list[BagFile], Ints | None]:
+        """Returns the bags that reach into a window, and their numbers if all are stored."""
+        begin = int(np.searchsorted(self._latest, window.start))
+        end = int(np.searchsorted(self._starts, window.stop))
+        here = begin + np.flatnonzero(self._ends[begin:end] >= window.start)
+        bags = [self._bags[nth] for nth in here.tolist()]
+        if self._numbers is None or (self._numbers[here] < 0).any():
+            return bags, None
+        return bags, self._numbers[here]
 
 
-def _divided(rows: Rows) -> Iterator[tuple[int, Rows]]:
-    if rows.first // STRETCH_NS == rows.last // STRETCH_NS:
-        yield rows.first // STRETCH_NS, rows
-        return
-    numbers = rows.times // STRETCH_NS
-    for number in np.unique(numbers).tolist():
-        yield number, rows.some(np.flatnonzero(numbers == number))
+def _window(number: int) -> TimeWindow:
+    """Returns when a stretch is."""
+    begin = number * STRETCH_NS
+    return TimeWindow(max(begin, MIN_NS), min(begin + STRETCH_NS, MAX_NS))
+
+
+def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Sequence[int]:
+    """Returns the numbers of the stretches in which a bag may have messages of some topics."""
+    numbers = range(bag.start // STRETCH_NS, bag.end // STRETCH_NS + 1)
+    if len(numbers) <= _MANY:
+        return numbers
+    # Its times are odd: centuries may lie between two messages.
+    window = TimeWindow(bag.start, bag.end).widened(1)
+    every = [rows.times // STRETCH_NS for topic in topics for rows in scan(view, topic, window)]
+    found: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *every])).tolist()
+    return found
 
 
 def _place_of(found: tuple[str, Rows]) -> tuple[Ns, Ns, str]:
@@ -349,8 +524,11 @@ def _place_of(found: tuple[str, Rows]) -> tuple[Ns, Ns, str]:
     return rows.first, rows.last, str(rows.recording)
 
 
-def _identity(bag: BagFile) -> tuple[str, int, int, int | None]:
-    return bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns
+def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[StampedTransform]:
+    """Returns the static transforms of a session that hold in a window."""
+    return static_at(static, window.start) + [
+        one for one in static if window.contains(one.log_time)
+    ]
 
 
 def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:

@@ -16,10 +16,9 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
     fixes_of,
-    joined,
     no_sights,
 )
-from tests.support.sights import Message, PlacedDetection, sights_of_messages
+from tests.support.sights import Message, PlacedDetection, joined_of, sights_of_messages
 
 HERE = (0.0, 0.0, 0.0)
 SECOND = 10**9
@@ -133,7 +132,7 @@ def test_joined_sights_number_slices_and_name_topics_and_labels_once() -> None:
     other = sights_of_messages(
         [Message("/a", 12 * SECOND, HERE, [PlacedDetection("cup", (3, 0, 0)), mug(1.0)])]
     )
-    both, epochs = joined([other, one], [1, 0])
+    both, epochs = joined_of([other, one], [1, 0])
     assert both.topics == ("/a", "/detections")
     assert both.labels == ("cup", "mug")
     assert both.spots[:, Spot.SLICE].tolist() == [0, 0, 1, 1]
@@ -144,7 +143,7 @@ def test_joined_sights_number_slices_and_name_topics_and_labels_once() -> None:
 
 
 def test_one_slice_in_two_coordinate_systems_is_two() -> None:
-    both, epochs = joined([sights_of([mug(1.0)]), sights_of([mug(1.0)])], [0, 1])
+    both, epochs = joined_of([sights_of([mug(1.0)]), sights_of([mug(1.0)])], [0, 1])
     assert both.spots[:, Spot.SLICE].tolist() == [0, 1]
     assert epochs.tolist() == [0, 1]
 
@@ -188,7 +187,7 @@ def test_sights_are_joined_in_any_order(
     other: list[tuple[int, None, list[PlacedDetection]]],
 ) -> None:
     parts = [built("/a", one), built("/b", other), no_sights()]
-    forward, backward = joined(parts)[0], joined(parts[::-1])[0]
+    forward, backward = joined_of(parts)[0], joined_of(parts[::-1])[0]
     assert forward.topics == backward.topics
     for table, same in zip(forward.tables, backward.tables, strict=True):
         assert table.tolist() == same.tolist()
@@ -202,7 +201,7 @@ def test_sights_cut_between_slices_are_those_of_the_whole(
         built("/a", [each for each in seen if each[0] // (10 * SECOND) == number])
         for number in range(7)
     ]
-    whole, cut = joined([built("/a", seen)])[0], joined(parts)[0]
+    whole, cut = joined_of([built("/a", seen)])[0], joined_of(parts)[0]
     for table, same in zip(whole.tables, cut.tables, strict=True):
         assert table.tolist() == same.tolist()
 
@@ -210,7 +209,7 @@ def test_sights_cut_between_slices_are_those_of_the_whole(
 def test_fixes_are_kept_where_no_detector_published() -> None:
     poses, sigma = np.array([[1.0, -2.0, math.pi / 2]]), np.array([0.25])
     alone = fixes_of(np.array([13 * SECOND]), poses, sigma)
-    both, _ = joined([sights_of([mug(1.0)]), alone])
+    both, _ = joined_of([sights_of([mug(1.0)]), no_sights().with_fixes(alone)])
     assert both.fixes.tolist() == [[1, 13 * SECOND, 1000, -2000, 900, 250]]
     assert both.fixes[0, Fix.SIGMA] == 250
     assert both.slices == 2

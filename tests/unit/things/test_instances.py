@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.sights import SLICE_NS, Sights, Spot, joined, no_sights
+from ros2_memory.analysis.sights import SLICE_NS, Sights, Spot, no_sights
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.instances import Estimate, estimate, most_at_once
 from ros2_memory.things.labels import Labels
-from tests.support.sights import Message, PlacedDetection, sights_of_messages, whole
+from tests.support.sights import Message, PlacedDetection, joined_of, sights_of_messages, whole
 from tests.support.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def test_a_thing_that_is_rarely_seen_beside_another_is_a_thing() -> None:
 
 def test_odometry_of_another_run_is_another_place() -> None:
     bags = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(4)]
-    sights, epochs = joined(bags, [0, 0, 1, 1])
+    sights, epochs = joined_of(bags, [0, 0, 1, 1])
     assert len(estimate(sights, LABELS, epochs).instances) == 2
     assert len(estimate(whole(bags), LABELS).instances) == 1
 

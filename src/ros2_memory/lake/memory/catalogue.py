@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.store import BagKey
+    from ros2_memory.core.model import BagFile
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeIndex
     from ros2_memory.lake.partitions import Days
@@ -113,6 +114,11 @@ class LakeCatalogue(Catalogue):
             return {}
         found = self._digests("labels", topic, numbers)
         return {number: words if isinstance(words, str) else "" for number, words in found}
+
+    def sights(self, bag: BagFile) -> bytes:
+        """Returns what detectors saw in a bag, as `things.seen.in_bytes` has it; or nothing."""
+        number = bag.sidecar_ns
+        return self._packed("sights", "", [number]).get(number, b"")
 
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns that all messages could be decoded: rows are made of those alone."""
