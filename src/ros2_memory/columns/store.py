@@ -32,6 +32,7 @@ from ros2_memory.columns.writing import (
     PART_NS,
     Layouts,
     LongBag,
+    Share,
     delete_bags,
     insert_bag,
     insert_parts,
@@ -47,7 +48,7 @@ from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
@@ -190,6 +191,8 @@ class ColumnStore(Database):
         definition_of: returns the definition of a channel, as `BagReader.definition`.
         definitions: tells the configured message definitions apart. Bags with messages that these
             could not decode are stored only for them.
+        first: types of messages whose columns are stored before those of other large topics: what
+            places the robot, without which hardly any question is answered fast.
     """
 
     def __init__(
@@ -198,12 +201,14 @@ class ColumnStore(Database):
         definition_of: DefinitionOf,
         *,
         definitions: str = "",
+        first: Collection[str] = (),
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
     ) -> None:
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
         self._definition_of = definition_of
         self._definitions = definitions
+        self._first = first
         self._topics: tuple[int, dict[int, Topic]] = (0, {})
         self._layouts = Layouts()
 
@@ -497,7 +502,7 @@ class ColumnStore(Database):
             budget: how many bytes the parts may take, as for `merge`.
             is_current: as for `put`, asked with each group.
         """
-        long = LongBag(key, bag, self._definitions, is_current, budget)
+        long = LongBag(key, bag, self._definitions, is_current, Share(budget, self._first))
         if not (self.write(partial(long.begin, hashed=hashed)) and long.goes_on):
             return False
         is_whole = False
@@ -539,7 +544,7 @@ class ColumnStore(Database):
                 topic: [packed_part(topics[topic].layout, tables)]
                 for topic, tables in found.items()
             }
-            insert_parts(connection, within(connection, packed, budget))
+            insert_parts(connection, within(connection, packed, Share(budget, self._first)))
             connection.execute(
                 "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
                 (json.dumps(numbers),),

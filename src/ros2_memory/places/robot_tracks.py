@@ -6,6 +6,7 @@ not change any more are remembered, so a week is asked again in a tenth of a sec
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -405,27 +406,39 @@ def _within(edges: Edges, window: TimeWindow) -> Edges:
     return found
 
 
+class _Pieces(NamedTuple):
+    """When a recording places a robot: from each of the starts to a stop (ns, inclusive)."""
+
+    starts: Times
+    stops: Times
+    first: Ns
+    last: Ns
+
+
 def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
     """Returns the parts of the track in order of time, and of others what lies beside it.
 
     Where several recordings place a robot at a time, that which began first is in the track.
     """
-    parts = [(recording, part) for recording, part in found[::-1] if len(part.times)]
+    parts = [(str(recording), part) for recording, part in found[::-1] if len(part.times)]
     parts.sort(key=lambda one: int(one[1].times[0]))
-    recordings = [*dict.fromkeys(recording for recording, _ in parts)]
-    if len(recordings) < 2:
+    by_recording: dict[str, list[TrackPart]] = defaultdict(list)
+    for recording, part in parts:
+        by_recording[recording].append(part)
+    if len(by_recording) < 2:
         return [[part for _, part in parts]]
     others: list[list[TrackPart]] = []
     kept: list[TrackPart] = []
-    pieces: list[tuple[Times, Times]] = []
-    for recording in recordings:
-        own = [part for each, part in parts if each == recording]
+    placed: list[_Pieces] = []
+    for own in by_recording.values():
         beside: list[TrackPart] = []
         for part in own:
+            first, last = int(part.times[0]), int(part.times[-1])
             fresh = np.ones(len(part.times), np.bool_)
-            for starts, stops in pieces:
-                nth = np.searchsorted(starts, part.times, side="right") - 1
-                fresh &= (nth < 0) | (part.times > stops[nth])
+            for pieces in placed:
+                if pieces.first <= last and pieces.last >= first:
+                    nth = np.searchsorted(pieces.starts, part.times, side="right") - 1
+                    fresh &= (nth < 0) | (part.times > pieces.stops[nth])
             kept.append(part if fresh.all() else part.some(np.flatnonzero(fresh)))
             if not fresh.all():
                 beside.append(part.some(np.flatnonzero(~fresh)))
@@ -434,7 +447,8 @@ def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
         times = np.concatenate([part.times for part in own])
         times.sort()
         new = np.diff(times) > SILENCE_NS
-        pieces.append((times[np.append([True], new)], times[np.append(new, [True])]))
+        starts, stops = times[np.append([True], new)], times[np.append(new, [True])]
+        placed.append(_Pieces(starts, stops, int(starts[0]), int(stops[-1])))
     return [kept, *others]
 
 
