@@ -129,7 +129,9 @@ def within(
     )
     weights = {topic: _WEIGHT_OF_FIRST for (topic,) in rows}
     sizes = {topic: sum(part.size for part in parts[topic]) for topic in parts}
-    usual = dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
+    usual: dict[int, float] = dict(
+        connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic")
+    )
     budget = share.size
     found: dict[int, list[PackedPart]] = {}
 
