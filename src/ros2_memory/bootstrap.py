@@ -508,7 +508,6 @@ def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) 
         settings.reader.max_chunk_mb,
         _definitions_of(settings),
         settings.data.max_array_length,
-        settings.data.max_plausible_speed_mps,
         settings.data.pose_topic,
         settings.data.map_frame,
         settings.data.tf_topics,
@@ -555,7 +554,6 @@ def build_digester(memory: Memory) -> Digester:
     return Digester(
         memory.reader,
         memory.extractor,
-        limits.max_plausible_speed_mps,
         map_settings(limits),
         partial(DetectorSights, memory.reader, memory.extractor),
     )

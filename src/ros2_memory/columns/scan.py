@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.motion.standstills import Stands
+    from ros2_memory.analysis.motion.trajectory import PathSlice
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.pack import Packed
@@ -157,6 +159,8 @@ class Scanner:
     Attributes:
         censuses: by topic, span and bags, what is stored of each type and what of it counts.
         events: by part, what happened in it; of parts of which all rows count.
+        paths: by slice of the clock and such parts, the path of the poses in it.
+        stands: likewise, where the robot may have stood.
     """
 
     def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
@@ -167,6 +171,8 @@ class Scanner:
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
+        self.paths: ByteLru[PathSlice] = ByteLru(24 << 20)
+        self.stands: ByteLru[Stands] = ByteLru(24 << 20)
 
     def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of a topic in a window.

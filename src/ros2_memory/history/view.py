@@ -30,7 +30,6 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.bag_fold import counted_once
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import bag_overlaps, deduplicate_forward
@@ -192,18 +191,12 @@ class View:
 
     def _census(self, topic: str) -> dict[str, Census]:
         everything = TimeWindow.everything()
-        if self.memory.columns is not None and self.stream.may_be_relatched([topic]):
+        if self.stream.may_be_relatched([topic]):
             return _tallied_rows(scan(self, topic, everything, columns=False))
         counted = {
             type_name: Census(*stated)
             for type_name, stated in self.snapshot.timeline.totals(topic).items()
         }
-        if self.stream.may_be_relatched([topic]):
-            newest = self.stream.newest(topic, everything)
-            if len(counted) != 1 or newest is None:
-                return _counted(self.stream.messages([topic], everything))
-            [(type_name, known)] = counted.items()
-            return {type_name: Census(known.first, newest.time, counted_once(self, topic))}
         for span in self.stream.duplicate_spans(topic, everything):
             for type_name, (stored, once) in self._overlap_census(topic, TimeWindow(*span)).items():
                 known = counted[type_name]

@@ -9,36 +9,33 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import chain, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.dwell import FLICKER_NS, Approach, DwellBuilder, Unread
-from ros2_memory.analysis.motion.odometry import is_place
+from ros2_memory.analysis.motion.dwell import FLICKER_NS, Approach, DwellBuilder
+from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
-from ros2_memory.core.spans import COPY_HORIZON_NS
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
-from ros2_memory.history.bag_groups import StoredDigests, groups_of
+from ros2_memory.core.timebase import MAX_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.driven_path import (
-    POSES,
-    add_poses,
     driven_path,
     pose_frame,
     positions_of,
     resolve_path_topic,
 )
 from ros2_memory.history.no_data import require_recorded
+from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
@@ -49,13 +46,11 @@ from ros2_memory.places.where import Where, note_other_frame, parse_where, place
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from ros2_memory.analysis.motion.dwell import Dwell
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.core.model import JsonValue, Pose, Vector3
+    from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.core.regions import Region
-    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
@@ -338,7 +333,6 @@ class _VisitSearch:
         self._placement = placement
         circle = region if isinstance(region, Circle) else Circle(0.0, 0.0, 0.0)
         self._x, self._y, self._radius = circle.x, circle.y, circle.radius_m
-        self._digests = StoredDigests(view, topic, POSES, window)
         self._decoder = motion_decoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
         self.is_all = True
@@ -427,12 +421,10 @@ class _VisitSearch:
     def _add_approaches(
         self, approaches: list[Approach], window: TimeWindow, target: tuple[float, float]
     ) -> None:
-        def add(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
-            if is_place(pose.position):
-                approaches.append(Approach(_away(pose.position, target), time))
-
-        messages = self._view.stream.messages([self._topic], window)
-        add_poses(self._view, add, self._decoder, messages, [])
+        for block in pose_rows(self._view, self._topic, window, []):
+            poses = block.poses.rows(np.flatnonzero(are_places(block.poses.positions)))
+            for time, (x, y, z) in zip(poses.times.tolist(), poses.positions.tolist(), strict=True):
+                approaches.append(Approach(_away((x, y, z), target), time))
 
     def _parts(self) -> Iterator[TimeWindow]:
         """Yields the times in which the robot may have been near, newest first.
@@ -473,15 +465,7 @@ class _VisitSearch:
                 return
 
     def _add_part(self, visits: DwellBuilder, part: TimeWindow) -> None:
-        """Adds the poses of a part: by their digest where that is enough, else one by one."""
-        groups = groups_of(self._view.stream, self._topic, part)
-        alone = len(groups) == 1 and groups[0].is_whole and not self._may_have_duplicates(part)
-        alone = alone and self._window.covers(part.start, part.stop - 1)
-        target = self._target_in(groups[0].bags[0]) if alone else None
-        if target is not None:
-            known = self._digests.of(groups[0])
-            if known is not None and self._add_digest(visits, groups[0], *known, target):
-                return
+        """Adds the poses of a part: one by one."""
         self._placement.use_window(part)
         for found, position in self._positions(part):
             self._check_counting()
@@ -491,54 +475,6 @@ class _VisitSearch:
                 visits.near(Approach(distance if counts else math.inf, found.time))
             else:
                 visits.away(found.time)
-
-    def _add_digest(
-        self,
-        visits: DwellBuilder,
-        group: Group,
-        digest: PoseDigest,
-        span: tuple[Ns, Ns],
-        target: tuple[float, float],
-    ) -> bool:
-        """Adds a whole group by the digest of its poses; False where that is not enough to know."""
-        if digest.invalid or not digest.vertices:
-            return False
-        path = [vertex[1] for vertex in digest.vertices]
-        first, last = digest.vertices[0][0], digest.vertices[-1][0]
-        error_m = digest.error_m + _ROUNDING_M
-        bound_m = _off_path(path, target) - error_m
-        if bound_m > self._radius:
-            visits.away(first, last)
-            return True
-        near = all(_away(position, target) + error_m <= self._radius for position in path)
-        if not near or not self._unbroken(group, digest, span):
-            return False
-        if digest.error_m == 0 and len({*path}) == 1:
-            # The robot stood still: the digest has the exact position of all poses.
-            visits.near(Approach(_away(path[0], target), first), last)
-            return True
-        bound = Approach(max(bound_m, 0.0), span[0])
-        visits.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), target))
-        return True
-
-    def _unbroken(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
-        """Whether no silence between two poses of a group is long enough to end a visit."""
-        first, last = span
-        if last - first <= SILENCE_NS:
-            return True
-        if len(group.bags) > 1:
-            return False
-        bag, window = group.bags[0].bag, TimeWindow(first, last + 1)
-        times = self._view.bags.log_times(bag, self._topic, window)
-        return len(times) == digest.poses and all(
-            after - before <= SILENCE_NS for before, after in pairwise(times)
-        )
-
-    def _may_have_duplicates(self, part: TimeWindow) -> bool:
-        """Whether another recording may hold the original of a pose in a part."""
-        wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
-        bags = self._view.stream.overlapping_bags([self._topic], wider)
-        return len({each.bag.recording for each in bags}) > 1
 
     def _target_in(self, held: BagSpan) -> tuple[float, float] | None:
         """Returns the target in the frame of a bag's poses; None where that frame moves."""
@@ -562,11 +498,3 @@ class _VisitSearch:
 def _away(position: Vector3, target: tuple[float, float]) -> float:
     """Returns how far (m, in the plane) a position is from a place of the same frame."""
     return math.dist(position[:2], target)
-
-
-def _off_path(path: Sequence[Vector3], target: tuple[float, float]) -> float:
-    """Returns how far (m, in the plane) a place is from a path of the same frame."""
-    # Each vertex by itself too: a part of the path may be a single vertex.
-    pairs = chain(zip(path, path, strict=True), pairwise(path))
-    gaps = [off_segment(target, before[:2], after[:2]) for before, after in pairs]
-    return min(gap for gap in gaps if not math.isnan(gap))

@@ -52,7 +52,7 @@ class OneByOne(McapReader):
 
 def both(path: Path) -> tuple[Digest, Digest]:
     readers = (McapReader(), OneByOne())
-    at_once, singly = (Digester(reader, extractor(), 10.0).digest(path) for reader in readers)
+    at_once, singly = (Digester(reader, extractor()).digest(path) for reader in readers)
     return at_once, singly
 
 

@@ -44,7 +44,7 @@ def digests(memory: Memory) -> list[tuple[MapDigest, MapDigest]]:
     """Of each closed bag, what the digester makes, and what a query makes of it."""
     view = View(memory, Call())
     limits = memory.limits
-    digester = Digester(memory.reader, memory.extractor, 10.0, map_settings(limits))
+    digester = Digester(memory.reader, memory.extractor, map_settings(limits))
     maps, statics, found = MapDigests(view), BagStatics(view), []
     for bag in view.snapshot.timeline.bags:
         stored = digester.digest(bag.path, statics.of(bag)).in_map
@@ -189,7 +189,7 @@ def test_sights_are_collected_with_frames_and_stored(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 3, seconds=20)
     memory = memory_of(tmp_path)
     view = View(memory, Call())
-    digester = Digester(memory.reader, extractor(), 10.0, MapSettings(), Sights)
+    digester = Digester(memory.reader, extractor(), MapSettings(), Sights)
     for bag in view.snapshot.timeline.bags:
         statics = BagStatics(view).of(bag)
         stored = digester.digest(bag.path, statics).in_map

@@ -9,9 +9,8 @@ is drawn between them.
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.core.geometry import distance, simplify_to, simplifying
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
@@ -19,10 +18,13 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.motion.odometry import Vertex
+    from ros2_memory.core.model import Vector3
 
-PARTED: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
-"""Separates two pieces of a path that are stored in one row; no pose has NaN coordinates."""
+Vertex: TypeAlias = "tuple[Ns, Vector3, float | None]"
+"""A pose on a drawn path: log time (ns), place (m), and a number that is carried along.
+
+Of most this is the heading (rad), if it is known.
+"""
 
 _BLOCK: Final = 4096
 _MAX_VERTICES: Final = 20_000
@@ -37,21 +39,14 @@ class Drawn(NamedTuple):
     pieces: list[list[Vertex]]
     error_m: float
 
-    def row(self) -> tuple[Vertex, ...]:
-        """Returns all vertices in one row, `PARTED` between the pieces."""
-        row: list[Vertex] = []
-        for piece in self.pieces:
-            row += [PARTED, *piece] if row else piece
-        return tuple(row)
-
 
 class DrawnPath:
     """Draws a path with few vertices, and bounds how far any pose is from it.
 
     Simplifies a simplification: the deviations add up and do no more, since a vertex that the
     second drops is beside the same kept segment as its neighbours. A quarter of the tolerance goes
-    to merging small steps, a quarter to the blocks, and the rest to the whole; paths that were
-    stored for bags have used an eighth of it. Where too many vertices remain, the first two
+    to merging small steps, a quarter to the blocks, and the rest to the whole; paths that are
+    drawn already have used some of it. Where too many vertices remain, the first two
     quarters are doubled.
     """
 
@@ -104,10 +99,7 @@ class DrawnPath:
         """Takes a path that is drawn already, from which poses are `error_m` off at most."""
         self._given_m = max(self._given_m, error_m)
         for vertex in row:
-            if math.isnan(vertex[1][0]):
-                self.part()
-            else:
-                self.add(vertex)
+            self.add(vertex)
 
     def drawn(self, at_most: int) -> Drawn:
         """Returns the path with so many vertices at most; then only the longest jumps split it."""
