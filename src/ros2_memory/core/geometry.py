@@ -239,6 +239,48 @@ def _simplified_by_levels(
     return None
 
 
+def refined(
+    points: NDArray[np.float64],
+    clock: Numbers,
+    kept: NDArray[np.intp],
+    tolerance_m: float,
+    at_most: int,
+) -> tuple[NDArray[np.intp], float]:
+    """Adds points to those that draw a path until no other lies farther off than a tolerance.
+
+    Deviations are those of `simplify_to`.
+
+    Args:
+        points: x, y and z (m) of each as a row; finite.
+        clock: the time of each (s).
+        kept: the indices of those that draw the path, ascending; the first and the last of all are
+            among them.
+        tolerance_m: see above.
+        at_most: so many points draw the path, unless `kept` are more.
+
+    Returns:
+        The indices of the kept points, ascending, and the largest deviation (m) of another one.
+    """
+    columns, found = points.T.copy(), [kept]
+    starts, ends = kept[:-1], kept[1:]
+    count, error = len(kept), 0.0
+    while True:
+        inner = ends - starts > 1
+        starts, ends = starts[inner], ends[inner]
+        farthest = _farthest_of_each(columns, clock, starts, ends) if len(starts) else None
+        if farthest is None:
+            return np.sort(np.concatenate(found)), math.sqrt(error)
+        most, where = farthest
+        splits = most > tolerance_m * tolerance_m
+        if count + np.count_nonzero(splits) > at_most:
+            splits[:] = False
+        error = max(error, float(most[~splits].max(initial=0.0)))
+        where, count = where[splits], count + np.count_nonzero(splits)
+        found.append(where)
+        starts, ends = np.stack([starts[splits], where], 1), np.stack([where, ends[splits]], 1)
+        starts, ends = starts.reshape(-1), ends.reshape(-1)
+
+
 def _farthest_of_each(
     columns: NDArray[np.float64],
     clock: Numbers | None,

@@ -11,12 +11,13 @@ import numpy as np
 from ros2_memory.analysis.poses import Frames, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
+from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import decoded_rows, messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -251,6 +252,9 @@ class _Reader:
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
+        if found is None and isinstance(rows.table, StoredTable):
+            # Of a topic beyond its share no columns are stored.
+            return joined_poses([self.poses(each) for each in decoded_rows(self._view, rows)])
         return poses_of(self._decoded(rows)) if found is None else found
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ros2_memory.columns.scan import Asked, Scanner
+from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
@@ -66,6 +68,17 @@ def scan(
         check=check,
     )
     return scanner.rows(asked, newest_first=newest_first)
+
+
+def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
+    """Yields some rows as their bags have them."""
+    for bag, positions in rows.bag_rows():
+        wanted = rows.times[positions]
+        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
+            index = np.flatnonzero(np.isin(table.log_times, wanted))
+            if table.channel.type == rows.table.channel.type and index.size:
+                unit = BagUnit(bag, table, nth)
+                yield Rows.of(unit, index)
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:

@@ -20,7 +20,7 @@ from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, are_place
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.motion.polyline import DrawnPath
 from ros2_memory.analysis.poses import headings, joined_poses
-from ros2_memory.core.geometry import simplify_to
+from ros2_memory.core.geometry import refined
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -40,8 +40,10 @@ TOLERANCE_M: Final = 0.05
 MAX_WAYPOINTS: Final = 50
 """Vertices of the path that is returned, unless more or fewer are asked for."""
 
-_MOST_VERTICES: Final = 240
+_MOST_VERTICES: Final = 600
 """Vertices of the path that is kept of a slice."""
+_MOST_LOOKED_AT: Final = 1500
+"""Poses of a slice that it is drawn by, at about this most."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
@@ -230,17 +232,22 @@ NO_LINE: Final = Line(
 
 
 def _drawn(poses: Poses, parted: Sequence[int], tolerance_m: float) -> tuple[IntArray, float]:
-    """Returns which poses draw the path, and how far (m) any other is from it."""
-    path = DrawnPath(tolerance_m)
-    for begin, end in zip([0, *parted], [*parted, len(poses)], strict=True):
-        points = [(x, y, z) for x, y, z in poses.positions[begin:end].tolist()]
-        seconds = ((poses.times[begin:end] - poses.times[begin]) / NS_PER_S).tolist()
-        kept, error_m = simplify_to(points, tolerance_m / 4, max(len(points), 2), seconds)
-        if begin:
+    """Returns which poses draw the path, and how far (m) any other is from it.
+
+    Drawn by the first pose of each second, and by those that lie off the lines between these.
+    """
+    ends = np.array([0, len(poses) - 1, *parted, *(nth - 1 for nth in parted)])
+    begins = np.flatnonzero(np.diff(poses.times // NS_PER_S)) + 1
+    seconds = (poses.times - poses.times[0]) / NS_PER_S
+    some = np.unique(np.concatenate((ends, begins)))
+    kept, error_m = refined(poses.positions, seconds, some, tolerance_m / 2, _MOST_LOOKED_AT)
+    path, jumps = DrawnPath(tolerance_m), {*parted}
+    places = poses.positions[kept].tolist()
+    for nth, time, (x, y, z) in zip(kept.tolist(), poses.times[kept].tolist(), places, strict=True):
+        if nth in jumps:
             path.part()
         # Which pose a vertex is stands where others have their heading.
-        times = poses.times[begin:end].tolist()
-        path.extend([(times[nth], points[nth], float(begin + nth)) for nth in kept], error_m)
+        path.extend([(time, (x, y, z), float(nth))], error_m)
     drawn = path.drawn(_MOST_VERTICES)
     kept_rows = [int(nth or 0) for piece in drawn.pieces for *_, nth in piece]
     return np.array(kept_rows, np.int64), drawn.error_m
