@@ -85,9 +85,7 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(both: list[dict[st
         assert apart <= float(str(row["error_m"])) + 1e-9
 
 
-def test_digests_are_what_the_memory_answers(
-    memory: Memory, both: list[dict[str, Table]]
-) -> None:
+def test_digests_are_what_the_memory_answers(memory: Memory, both: list[dict[str, Table]]) -> None:
     packed = {
         (str(row["topic"]), str(row["kind"])): row["packed"]
         for row in both[0]["digests"]

@@ -175,7 +175,7 @@ def test_a_handover_has_only_those_bags_digested_again_that_it_changes(tmp_path:
             at = paths[0].stat().st_mtime + number
             os.utime(folder / HANDOVER_FILE, (at, at))
         memory = recalling(bags)
-        digester = Counting(memory.reader, memory.extractor, 10.0)
+        digester = Counting(memory.reader, memory.extractor)
         backfill = backfill_of(memory, bags, digester)
         assert fill_catalogue(backfill) == Progress(4, 0, 0)
         assert getattr(digester, "names", []) == [paths[each].name for each in digested]

@@ -119,7 +119,7 @@ class Blocks:
         numbers: which block, counted from the epoch.
         firsts: log times (ns) of the first pose of each, in the chain that it is of.
         lasts: of the last one.
-        noises: the highest standard deviation (m) of a slot's mean that the noise of poses explains.
+        noises: the highest standard deviation (m) of a slot's mean that noise of poses explains.
         lows: x, y, z (m) of the lower corner of the box around the slots' means, as rows.
         highs: of the upper corner.
         starts: where a chain begins in the block, the log time of the first pose at that place;

@@ -40,10 +40,8 @@ TOLERANCE_M: Final = 0.05
 MAX_WAYPOINTS: Final = 50
 """Vertices of the path that is returned, unless more or fewer are asked for."""
 
-_MOST_VERTICES: Final = 600
-"""Vertices of the path that is kept of a slice."""
-_MOST_LOOKED_AT: Final = 1500
-"""Poses of a slice that it is drawn by, at about this most."""
+_MOST_VERTICES: Final = 400
+"""Vertices of the path that is kept of a slice, but for the ends of jumps."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
@@ -234,23 +232,20 @@ NO_LINE: Final = Line(
 def _drawn(poses: Poses, parted: Sequence[int], tolerance_m: float) -> tuple[IntArray, float]:
     """Returns which poses draw the path, and how far (m) any other is from it.
 
-    Drawn by the first pose of each second, and by those that lie off the lines between these.
+    By the first poses of some seconds, and by those that lie off the lines between these.
     """
-    ends = np.array([0, len(poses) - 1, *parted, *(nth - 1 for nth in parted)])
+    ends = np.unique([0, len(poses) - 1, *parted, *(nth - 1 for nth in parted)])
     begins = np.flatnonzero(np.diff(poses.times // NS_PER_S)) + 1
+    some = np.union1d(ends, begins)
     seconds = (poses.times - poses.times[0]) / NS_PER_S
-    some = np.unique(np.concatenate((ends, begins)))
-    kept, error_m = refined(poses.positions, seconds, some, tolerance_m / 2, _MOST_LOOKED_AT)
-    path, jumps = DrawnPath(tolerance_m), {*parted}
-    places = poses.positions[kept].tolist()
-    for nth, time, (x, y, z) in zip(kept.tolist(), poses.times[kept].tolist(), places, strict=True):
-        if nth in jumps:
-            path.part()
-        # Which pose a vertex is stands where others have their heading.
-        path.extend([(time, (x, y, z), float(nth))], error_m)
-    drawn = path.drawn(_MOST_VERTICES)
-    kept_rows = [int(nth or 0) for piece in drawn.pieces for *_, nth in piece]
-    return np.array(kept_rows, np.int64), drawn.error_m
+    coarse, _ = refined(
+        poses.positions[some],
+        seconds[some],
+        np.searchsorted(some, ends),
+        tolerance_m,
+        _MOST_VERTICES,
+    )
+    return refined(poses.positions, seconds, some[coarse], tolerance_m, _MOST_VERTICES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
