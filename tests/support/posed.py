@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def posed(
-    rows: Iterable[tuple[int, Vector3]],
+    rows: Iterable[tuple[int, Vector3 | list[float]]],
     turns: Sequence[Quaternion] | None = None,
     speeds: Sequence[float] | None = None,
 ) -> Poses:

@@ -272,10 +272,10 @@ def refined(
             return np.sort(np.concatenate(found)), math.sqrt(error)
         most, where = farthest
         splits = most > tolerance_m * tolerance_m
-        if count + np.count_nonzero(splits) > at_most:
+        if count + int(splits.sum()) > at_most:
             splits[:] = False
         error = max(error, float(most[~splits].max(initial=0.0)))
-        where, count = where[splits], count + np.count_nonzero(splits)
+        where, count = where[splits], count + int(splits.sum())
         found.append(where)
         starts, ends = np.stack([starts[splits], where], 1), np.stack([where, ends[splits]], 1)
         starts, ends = starts.reshape(-1), ends.reshape(-1)

@@ -205,7 +205,7 @@ class Failing(Digester):
 def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader, memory.extractor, 10.0))
+    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader, memory.extractor))
     [waiting] = backfill.waiting()
     assert not backfill.digest(waiting)
     assert memory.recall is not None
@@ -215,7 +215,7 @@ def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
 def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path, Failing(memory.reader, memory.extractor, 10.0))
+    backfill = backfill_of(memory, tmp_path, Failing(memory.reader, memory.extractor))
     assert fill_catalogue(backfill) == Progress(1, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 

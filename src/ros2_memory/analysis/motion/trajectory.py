@@ -42,6 +42,8 @@ MAX_WAYPOINTS: Final = 50
 
 _MOST_VERTICES: Final = 400
 """Vertices of the path that is kept of a slice, but for the ends of jumps."""
+_FINER: Final = 6
+"""The metres driven up to a time are known to about ten times the tolerance over this."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
@@ -242,7 +244,7 @@ def _drawn(poses: Poses, parted: Sequence[int], tolerance_m: float) -> tuple[Int
         poses.positions[some],
         seconds[some],
         np.searchsorted(some, ends),
-        tolerance_m,
+        tolerance_m / _FINER,
         _MOST_VERTICES,
     )
     return refined(poses.positions, seconds, some[coarse], tolerance_m, _MOST_VERTICES)
