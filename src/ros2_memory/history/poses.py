@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
-    from ros2_memory.storage.cache import ByteLru
 
 
 _MOST_SLICES: Final = 64
@@ -41,6 +40,16 @@ class Sized(Protocol):
 
 
 T = TypeVar("T", bound=Sized)
+
+
+class Known(Protocol[T]):
+    """A bounded cache of them."""
+
+    def get(self, key: Hashable) -> T | None:
+        """Returns what is remembered under a key; None where it is not."""
+
+    def put(self, key: Hashable, value: T, size: int) -> None:
+        """Remembers a value, which takes about so many bytes."""
 
 
 class PoseRows:
@@ -142,7 +151,7 @@ class PoseSlice:
         return joined_poses([block.poses.between(start, stop) for block in self._blocks])
 
     def remembered(
-        self, known: ByteLru[T] | None, make: Callable[[PoseSlice], T], settings: Hashable = None
+        self, known: Known[T] | None, make: Callable[[PoseSlice], T], settings: Hashable = None
     ) -> T:
         """Returns what is made of it, and remembers that where it follows from whole parts alone.
 
