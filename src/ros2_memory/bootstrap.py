@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.fill import Filling
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.telemetry import Observer
     from ros2_memory.extract import SchemaExtractor
@@ -391,7 +391,7 @@ def build_memory(
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
-    from ros2_memory.columns.scan import Scanner
+    from ros2_memory.columns.scanner import Scanner
     from ros2_memory.history.context import Memory
     from ros2_memory.index.scan import BAG_DIR_SETTING
     from ros2_memory.recorder.index_manager import IndexManager
@@ -407,20 +407,26 @@ def build_memory(
         sources=() if settings.data.recording else (bag_dir / FOLDER / FILE,),
         waits_for=bag_dir,
     )
+    columns = build_columns(settings, reader)
+
+    def known_files() -> dict[str, BagFile]:
+        stored = {} if columns is None else columns.known_files(bag_dir)
+        return {**stored, **catalogue.known_files(bag_dir)}
+
     index = IndexManager(
         bag_dir,
         reader,
         clock,
         refresh_s=settings.reader.index_refresh_s,
         split_duration_s=settings.recording.split_duration_s,
-        known=partial(catalogue.known_files, bag_dir),
+        known=known_files,
         include_active=settings.reader.include_active,
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
         only=settings.data.recording,
         setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
-    scanner = Scanner(build_columns(settings, reader), bag_dir)
+    scanner = Scanner(columns, bag_dir)
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, recall, scanner)
 

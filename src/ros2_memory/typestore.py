@@ -337,23 +337,31 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
         root: the name of the type.
     """
     known: dict[str, Definition] = {}
+    waiting = [root]
+    while waiting:
+        described = definitions[waiting[-1]][1]
+        nested = {_nested_type(field) for _, field in described} - known.keys() - {None}
+        if nested:
+            waiting += sorted(filter(None, nested))
+            continue
+        fields: list[Field] = []
+        for name, field in described:
+            if field[0] == Nodetype.BASE or field[0] == Nodetype.NAME:
+                fields.append(Field(name, _kind(field, known)))
+            else:
+                element, length = field[1]
+                stated = length if field[0] == Nodetype.ARRAY else SEQUENCE
+                fields.append(Field(name, _kind(element, known), stated))
+        finished = waiting.pop()
+        known[finished] = Definition(finished, tuple(fields))
+    return known[root]
 
-    def described(name: str, field: FieldDesc) -> Field:
-        if field[0] == Nodetype.BASE:
-            return Field(name, str(field[1][0]))
-        if field[0] == Nodetype.NAME:
-            return Field(name, of(str(field[1])))
-        element, length = field[1]
-        stated = length if field[0] == Nodetype.ARRAY else SEQUENCE
-        return Field(name, described(name, element).kind, stated)
 
-    def of(name: str) -> Definition:
-        if name not in known:
-            fields = definitions[name][1]
-            known[name] = Definition(name, tuple(described(*field) for field in fields))
-        return known[name]
-
-    return of(root)
+def _kind(field: FieldDesc, known: Mapping[str, Definition]) -> str | Definition:
+    """Returns what a field that is no array holds: the name of a primitive, or a known type."""
+    if field[0] == Nodetype.BASE:
+        return str(field[1][0])
+    return known[str(field[1])]
 
 
 def _nested_type(field: FieldDesc) -> str | None:

@@ -11,7 +11,7 @@ import numpy as np
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.columns.fill import Filling, StoreLimits
-from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.core.errors import UndecodableError

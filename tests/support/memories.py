@@ -19,7 +19,7 @@ from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.columns.fill import Filling, StoreLimits
-from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE as COLUMNS
 from ros2_memory.columns.store import BagKey, ColumnStore
 from ros2_memory.core.errors import BagError, EpisodicError

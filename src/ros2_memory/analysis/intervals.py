@@ -231,7 +231,7 @@ def _stored_scores(scores: NDArray[np.float64]) -> NDArray[np.int64]:
     # The least number stands for no score.
     most = -_NO_SCORE - 1
     with np.errstate(invalid="ignore"):
-        stored = np.rint(np.clip(scores * _SCORES, -most, most))
+        stored = np.rint(np.clip(scores, -most / _SCORES, most / _SCORES) * _SCORES)
     return np.where(np.isnan(scores), _NO_SCORE, stored).astype(np.int64)
 
 

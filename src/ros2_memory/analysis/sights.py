@@ -26,6 +26,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ros2_memory.core.timebase import MAX_NS
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
@@ -548,7 +550,8 @@ class SlicedSights:
 
 def _rounded(time: Ns) -> Ns:
     """Rounds up to 1 us: a message is at or before the time that is stored of it."""
-    return -(-time // _NS_PER_US) * _NS_PER_US
+    # The last microsecond is not whole: its end is no time.
+    return min(-(-time // _NS_PER_US), MAX_NS // _NS_PER_US) * _NS_PER_US
 
 
 def _is_near(place: Vector3) -> bool:

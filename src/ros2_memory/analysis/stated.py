@@ -268,13 +268,11 @@ def _errors(facts: Facts, times: Ints) -> tuple[ReportedError, ...]:
 
 def _changes(stated: Stated) -> StateChanges:
     known, changes = _held(stated.levels, stated.times)
-    reports = stated.reports
-    told = joined_reports(
-        Report(reports.words[code][0], time, time, 1)
-        for code, time in zip(
-            reports.codes.tolist(), stated.times[reports.rows].tolist(), strict=True
-        )
+    facts = stated.reports
+    reports = joined_reports(
+        Report(facts.words[code][0], time, time, 1)
+        for code, time in zip(facts.codes.tolist(), stated.times[facts.rows].tolist(), strict=True)
     )
-    if not (known or told or stated.more_levels):
+    if not (known or reports or stated.more_levels):
         return NO_CHANGES
-    return StateChanges(tuple(known), tuple(changes), tuple(told), stated.more_levels)
+    return StateChanges(tuple(known), tuple(changes), tuple(reports), stated.more_levels)

@@ -1,40 +1,13 @@
-"""Encodes what bags hold of their topics as the bytes and texts in the catalogue."""
+"""Encodes the numbers of bags as the bytes in the catalogue."""
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.core.bag_summary import TopicHeader, shared_schema
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import JsonValue
-
-
-def encode_schema(schema: SummarySchema) -> str:
-    """Encodes a summary schema; equal ones give equal texts."""
-    topics: JsonValue = [[*header] for header in schema.topics]
-    return json.dumps([topics, [*schema.silent], schema.complete, [*schema.notes], schema.set_back])
-
-
-def decode_schema(text: str) -> SummarySchema:
-    """Decodes a summary schema.
-
-    Raises:
-        ValueError: the text is not valid.
-        TypeError: likewise.
-    """
-    topics, silent, complete, notes, set_back = json.loads(text)
-    headers = (
-        TopicHeader(topic, type_name, encoding, bool(latched))
-        for topic, type_name, encoding, latched in topics
-    )
-    return shared_schema(tuple(headers), tuple(silent), bool(complete), tuple(notes), int(set_back))
 
 
 def encode_counts(numbers: bytes) -> bytes:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.catalogue.codec import (
     encode_counts,
-    encode_schema,
 )
 from ros2_memory.catalogue.map_digest import encode_map_track
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
@@ -219,7 +218,7 @@ def insert_entry(
     connection: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
 ) -> None:
     """Inserts an entry; `key` is path, size, mtime and sidecar's mtime."""
-    schema = _id_of(connection, "shapes", "text", encode_schema(digest.summary.schema))
+    schema = _id_of(connection, "shapes", "text", digest.summary.schema.to_json())
     counts = encode_counts(digest.summary.numbers)
     own = _id_of(connection, "configs", "text", config)
     cursor = connection.execute(

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.catalogue.codec import (
     decode_counts,
-    decode_schema,
 )
 from ros2_memory.catalogue.digest_config import may_be_one
 from ros2_memory.catalogue.map_digest import decode_map_tracks
@@ -48,7 +47,7 @@ from ros2_memory.catalogue.sql import (
 from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.columns.database import Database
 from ros2_memory.columns.store import BagKey
-from ros2_memory.core.bag_summary import BagSummary
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.storage.base import Channel, Record, Schema
 
@@ -127,7 +126,7 @@ class Catalogue(Database):
             found: dict[str, BagFile] = {}
             configs, offset = self._usable(connection), self.offset
             for number, text in connection.execute("SELECT id, text FROM shapes").fetchall():
-                schema = decode_schema(text)
+                schema = SummarySchema.from_json(text)
                 model = model_of(connection, number, COUNTS)
                 cursor = connection.execute(
                     "SELECT path, size, mtime, sidecar, counts, id FROM bags"  # noqa: S608
@@ -463,7 +462,8 @@ def _summary_of(connection: sqlite3.Connection, row_id: int) -> BagSummary:
         "SELECT shape, text, counts FROM bags JOIN shapes ON shapes.id = shape WHERE bags.id = ?",
         (row_id,),
     ).fetchone()
-    schema, plain = decode_schema(text), unpacked(counts, model_of(connection, number, COUNTS))
+    schema = SummarySchema.from_json(text)
+    plain = unpacked(counts, model_of(connection, number, COUNTS))
     [numbers] = decode_counts([plain], len(schema.topics))
     return BagSummary.decoded(schema, numbers.tobytes())
 

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.store import BagKey, relative
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import overlap_spans
+from ros2_memory.columns.store import relative
+from ros2_memory.core.model import BagState
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -158,31 +157,17 @@ class Covering:
         ]
 
     def _segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
-        numbers, hashed = [], []
+        root, offset = str(self._bag_dir), self.store.offset
+        numbers, hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
         missing: list[BagFile] = []
-        for bag in segment.bags:
-            key = BagKey.of(bag, self._bag_dir)
-            found = stored.get(key.path)
-            if found is None or found.key != key or bag.state is not BagState.CLOSED:
+        for nth, bag in enumerate(segment.bags):
+            found = stored.get(relative(bag.file, root))
+            if (
+                found is not None
+                and found[1:4] == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+                and bag.state is BagState.CLOSED
+            ):
+                numbers[nth], hashed[nth] = offset + found.row, found.hashed
+            else:
                 missing.append(bag)
-                found = None
-            numbers.append(-1 if found is None else found.number)
-            hashed.append(found is not None and found.hashed)
-        return CoveredSegment(
-            segment, np.array(numbers, np.int64), np.array(hashed, np.bool_), tuple(missing)
-        )
-
-
-def shared_times(timeline: Timeline) -> list[TimeWindow]:
-    """Returns when bags of different recordings may hold copies of a message."""
-    coarse: dict[object, tuple[int, int]] = {}
-    for segment in timeline.segments:
-        for folder, span in segment.folder_spans.items():
-            before = coarse.get(folder, span)
-            coarse[folder] = (min(before[0], span[0]), max(before[1], span[1]))
-    found: list[TimeWindow] = []
-    for start, stop in overlap_spans((*span, folder) for folder, span in coarse.items()):
-        bags = timeline.overlapping(TimeWindow(start, stop))
-        spans = overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
-        found += [TimeWindow(*span) for span in spans]
-    return found
+        return CoveredSegment(segment, numbers, hashed, tuple(missing))

@@ -11,7 +11,6 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.coverage import shared_times
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.store import LONG_NS, BagKey
 from ros2_memory.columns.writing import PART_NS
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.scan import Scanner
+    from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
@@ -192,7 +191,16 @@ class Filling:
         )
 
     def _budget(self, bags: Sequence[BagFile]) -> int:
-        """Returns how many bytes the columns of some bags may take."""
+        """Returns how many bytes the columns of some bags may take.
+
+        A robot that drives has more to store than one that stands: what other bags left of their
+        share is theirs.
+        """
+        others, taken = self.store.merged_bytes()
+        left = round(self._limits.max_share * others) - taken
+        return self._share(bags) + max(left, 0)
+
+    def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
         return max(round(self._limits.max_share * size), LEAST_BYTES_PER_S * length)
@@ -219,7 +227,7 @@ class Filling:
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""
         if self._shared is None or self._shared[0] is not timeline:
-            spans = shared_times(timeline)
+            spans = [TimeWindow(*span) for span in timeline.shared_times]
             files = (bag.file for span in spans for bag in timeline.overlapping(span))
             self._shared = timeline, frozenset(files)
         return bag.file in self._shared[1]
@@ -246,7 +254,7 @@ class Filling:
         oldest, used = self.store.oldest(), self.store.used_bytes()
         found: list[BagFile] = []
         for bag in bags:
-            size = 2 * self._budget([bag])
+            size = 2 * self._share([bag])
             is_newer = oldest is not None and bag.start >= oldest
             if (size if is_newer else used + size) <= most:
                 found.append(bag)

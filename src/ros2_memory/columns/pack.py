@@ -51,7 +51,7 @@ import numpy as np
 import zstandard
 
 from ros2_memory.columns.steps import EXACT, MOST_RELATIVE, Step
-from ros2_memory.columns.table import Column, Numbers, Texts, Zone
+from ros2_memory.columns.table import IN_PART, Column, Numbers, Texts, Zone, letters_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -63,8 +63,8 @@ if TYPE_CHECKING:
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Values = TypeVar("Values", "IntArray", "Floats")
 
-FORMAT: Final = 2
-"""Version of the bytes. Raise it with every change of what this module or `blob` writes."""
+FORMAT: Final = 3
+"""Version of the file. Raise it with every change of its tables and of their bytes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4
 """Of zstd. A blob of 10 s takes 0.5 ms; level 1 half of that and 7 % more bytes, level 6 0.8 ms and
@@ -557,12 +557,25 @@ def _in_use(column: Texts) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
 
 
 def folded(words: Collection[str]) -> str | None:
-    """Returns the words as a zone has them; None if they are too many or too long to be kept."""
-    if sum(map(len, words)) + len(words) > MOST_WORDS_BYTES:
-        return None
-    folded = "\n".join(dict.fromkeys(word.casefold() for word in words))
-    small = len(folded.encode("utf-8", "surrogatepass")) <= MOST_WORDS_BYTES
-    return folded if small else None
+    """Returns the words as a zone has them: whole, else what letters are in them, else None.
+
+    JSON with numbers is another text each time, and has few names.
+    """
+    if sum(map(len, words)) + len(words) <= MOST_WORDS_BYTES:
+        whole = "\n".join(dict.fromkeys(word.casefold() for word in words))
+        if _is_small(whole):
+            return whole
+    names: set[str] = set()
+    for word in words:
+        names.update(letters_of(word.casefold()))
+        if len(names) > MOST_WORDS_BYTES // 2:
+            return None
+    in_part = "\n".join([IN_PART, *sorted(names)])
+    return in_part if _is_small(in_part) else None
+
+
+def _is_small(text: str) -> bool:
+    return len(text.encode("utf-8", "surrogatepass")) <= MOST_WORDS_BYTES
 
 
 def _unpack_texts(arrangement: str, count: int, data: bytes) -> Texts:

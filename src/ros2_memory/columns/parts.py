@@ -1,8 +1,9 @@
 """Parts: the rows of one topic in some bags of a recording, stored column by column.
 
 Beside the columns of the topic's layout a part has `#log_time`, `#bag` (the number of each row's
-bag) and, where copies of a message may lie in other recordings, `#publish_time` and
-`#payload_hash`. The owners of the elements of a sequence lie under its path and `#`.
+bag) and, where copies of a message may lie in other recordings, `#publish_time`, `#payload_hash`
+and the zone of `#delay`: how much later messages were received than published. The owners of the
+elements of a sequence lie under its path and `#`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from ros2_memory.columns.pack import Packed, compressed, pack, pack_columns
 from ros2_memory.columns.stored import Lazily, StoredTable, lazy_columns
-from ros2_memory.columns.table import joined
+from ros2_memory.columns.table import Zone, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,9 @@ LOG_TIME: Final = "#log_time"
 PUBLISH_TIME: Final = "#publish_time"
 PAYLOAD_HASH: Final = "#payload_hash"
 BAG: Final = "#bag"
+DELAY: Final = "#delay"
+ZONE_ALONE: Final = "zone"
+"""The codec of a column of which there is never more than the zone."""
 DROPPED: Final = "dropped"
 """The codec of a column of which only the zone is stored: its topic is beyond its share."""
 _ALWAYS: Final = frozenset({LOG_TIME, PUBLISH_TIME, PAYLOAD_HASH, BAG})
@@ -44,6 +48,7 @@ class PackedPart:
         messages: how many rows.
         bags: the numbers of the bags that its rows are of, ascending.
         columns: by their paths, packed; the data is compressed.
+        dropped_bytes: how many bytes the data took that it has no more.
     """
 
     first: Ns
@@ -51,6 +56,7 @@ class PackedPart:
     messages: int
     bags: tuple[int, ...]
     columns: Mapping[str, Packed]
+    dropped_bytes: int = 0
 
     @property
     def size(self) -> int:
@@ -65,7 +71,8 @@ class PackedPart:
             else replace(packed, codec=DROPPED, data=b"")
             for path, packed in self.columns.items()
         }
-        return replace(self, columns=columns)
+        part = replace(self, columns=columns)
+        return replace(part, dropped_bytes=self.size - part.size)
 
 
 def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:
@@ -96,6 +103,9 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     if table.payload_hashes is not None:
         columns[PUBLISH_TIME] = pack(table.publish_times)
         columns[PAYLOAD_HASH] = pack(table.payload_hashes)
+        delays = table.log_times - table.publish_times
+        zone = Zone(int(delays.min()), int(delays.max()))
+        columns[DELAY] = Packed(ZONE_ALONE, delays.size, 0.0, zone, b"")
     steps = [slot.kind.step for slot in layout.slots.values()]
     packs = pack_columns([*zip(layout.columns_of(table), steps, strict=True)])
     columns.update(zip(layout.slots, packs, strict=True))
@@ -112,7 +122,12 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
 
 
 def part_table(
-    topic: Topic, packed: Mapping[str, Packed], load: Callable[[str], Column]
+    topic: Topic,
+    packed: Mapping[str, Packed],
+    load: Callable[[str], Column],
+    *,
+    messages: int,
+    dropped: Sequence[str] = (),
 ) -> StoredTable:
     """Returns a part as a table whose columns are loaded when they are first asked for.
 
@@ -122,17 +137,18 @@ def part_table(
         topic: of the part.
         packed: what is known of each column; their data is not needed.
         load: returns a column by its path.
+        messages: how many rows it has.
+        dropped: the columns that are beyond the topic's share.
     """
     columns, elements = lazy_columns(topic.layout, load)
     left_out = topic.layout.left_out
-    dropped = {path for path, one in packed.items() if one.codec == DROPPED}
     if dropped:
         reason = "beyond the share of the store (store.max_share)"
         left_out = {**left_out, **dict.fromkeys(dropped, reason)}
         columns = Lazily([path for path in columns if path not in dropped], columns.__getitem__)
         there = [path for path in elements if f"{path}#" not in dropped]
         elements = Lazily(there, elements.__getitem__)
-    none = np.zeros(packed[LOG_TIME].count, np.int64)
+    none = np.zeros(messages, np.int64)
     return StoredTable(
         topic.channel,
         none,

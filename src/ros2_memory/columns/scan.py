@@ -6,38 +6,34 @@ time where recordings do. Of a table that nothing needs not even the times are u
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
-from ros2_memory.columns.coverage import Covering
-from ros2_memory.columns.pack import decompressed, unpack
-from ros2_memory.columns.parts import part_table
-from ros2_memory.columns.table import Texts
-from ros2_memory.columns.units import BagUnit, GoneError, PartUnit, Rows, Unit
+from ros2_memory.columns.parts import DELAY, PUBLISH_TIME
+from ros2_memory.columns.units import BagUnit, Rows, Unit
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS
+from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.storage.base import RELATCHED_NS
-from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.standstills import Stands
-    from ros2_memory.analysis.motion.trajectory import PathSlice
-    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
-    from ros2_memory.columns.pack import Packed
-    from ros2_memory.columns.store import ColumnStore, PartHead
-    from ros2_memory.columns.table import Column, Table
+    from ros2_memory.columns.scanner import Scanner
+    from ros2_memory.columns.store import PartHead
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
@@ -48,10 +44,6 @@ Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
 
 _SLICE_NS: Final = 600 * NS_PER_S
 """How much of overlapping recordings is compared at a time."""
-_HEAD_BYTES: Final = 400
-"""About how much memory what is known of a part takes."""
-_COLUMN_BYTES: Final = 300
-"""About how much memory what is known of a column takes."""
 _ATTEMPTS: Final = 5
 """How often a scan looks what is stored, while that changes; then it reads the bags."""
 _MOST_LOOKED_UP: Final = 64
@@ -71,9 +63,12 @@ class Asked:
         decode: decodes a topic of a bag that is not stored.
         shared: the half-open spans in which different recordings may hold copies, in order.
         relatches: whether recordings may have received a message again, as of a latched topic.
-        may_match: whether rows of a part may be wanted, told by its zones; others are left out.
+        may_match: says by zones which parts may have rows that are wanted, of each or of all;
+            the others are left out.
         may_be_empty: whether rows are yielded also where none of them counts. Which do is then
             found out only where that is asked.
+        within: half-open spans, in order and apart; tables that overlap none of them are left out.
+            None: none is.
         check: is called before each table with a log time that what is left does not lie behind
             (with `newest_first`: is not later than); raises where the call's time is over.
     """
@@ -84,8 +79,9 @@ class Asked:
     decode: Decode
     shared: Sequence[tuple[Ns, Ns]] = ()
     relatches: bool = False
-    may_match: Callable[[Table], bool] = lambda _: True
+    may_match: Callable[[PartZones], bool | Mask] | None = None
     may_be_empty: bool = False
+    within: Sequence[tuple[Ns, Ns]] | None = None
     check: Callable[[Ns], None] = lambda _: None
 
 
@@ -99,195 +95,13 @@ class _Source(NamedTuple):
     number: int = -1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Heads:
-    """The parts of a topic, in order of their first log times.
-
-    Attributes:
-        coverage: of the timeline that they were compared with.
-        heads: the parts.
-        firsts: their first log times.
-        lasts: their last ones.
-        live: of how many of its bags the rows of each count.
-    """
-
-    coverage: Coverage
-    heads: Sequence[PartHead]
-    firsts: IntArray
-    lasts: IntArray
-    live: IntArray
-
-    @classmethod
-    def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
-        """Returns the parts as of a coverage."""
-        live = np.zeros(len(heads), np.int64)
-        if heads:
-            sizes = np.cumsum([0, *(head.bags.size for head in heads)])
-            positions = coverage.positions(np.concatenate([head.bags for head in heads]))
-            live = np.add.reduceat(positions >= 0, sizes[:-1]).astype(np.int64)
-        return cls(
-            coverage,
-            heads,
-            np.array([head.first for head in heads], np.int64),
-            np.array([head.last for head in heads], np.int64),
-            live,
-        )
-
-    def within(self, window: TimeWindow) -> Iterator[PartHead]:
-        """Yields the parts that may have rows in a window."""
-        here = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
-        for nth in np.flatnonzero(here).tolist():
-            yield self.heads[nth]
-
-
-@dataclass(frozen=True, slots=True)
-class Census:
-    """Log times of the earliest and latest message (inclusive), and how many there are."""
-
-    first: Ns
-    last: Ns
-    count: int
-
-
-class Scanner:
-    """Scans topics of one bag directory. Thread-safe.
+class Scan:
+    """One scan of a topic: its sources, and which rows of them are copies.
 
     Args:
-        store: the store; None where nothing is stored.
-        bag_dir: the bag directory.
-
-    Attributes:
-        censuses: by topic, span and bags, what is stored of each type and what of it counts.
-        events: by part, what happened in it; of parts of which all rows count.
-        paths: by slice of the clock and such parts, the path of the poses in it.
-        stands: likewise, where the robot may have stood.
+        scanner: has what is stored.
+        asked: what it is of.
     """
-
-    def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
-        self.store = store
-        self._covering = None if store is None else Covering(store, bag_dir)
-        self._columns: ByteLru[Column] = ByteLru(48 << 20)
-        self._known: ByteLru[Mapping[str, Packed]] = ByteLru(16 << 20)
-        self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
-        self.censuses: ByteLru[Mapping[str, tuple[Census, Census]]] = ByteLru(8 << 20)
-        self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
-        self.paths: ByteLru[PathSlice] = ByteLru(24 << 20)
-        self.stands: ByteLru[Stands] = ByteLru(24 << 20)
-
-    def rows(self, asked: Asked, *, newest_first: bool = False) -> Iterator[Rows]:
-        """Yields what counts of a topic in a window.
-
-        In the order of the first log time of each table, or with `newest_first` of the last, from
-        the newest on.
-
-        Raises:
-            QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
-        """
-        return _Scan(self, asked).rows(newest_first=newest_first)
-
-    def coverage(self, timeline: Timeline) -> Coverage | None:
-        """Returns which bags of a timeline are stored; None without a store."""
-        return None if self._covering is None else self._covering.of(timeline)
-
-    def parts(self, topic: str, window: TimeWindow, coverage: Coverage) -> Iterator[PartHead]:
-        """Yields the parts of a topic that may have rows in a window."""
-        if self.store is None:
-            return
-        state = coverage.state
-        known = self._heads.get(topic)
-        if known is None or known.coverage is not coverage:
-            failures = self.store.failures
-            heads: list[PartHead] = []
-            if known is not None and known.coverage.state.deletion == state.deletion:
-                heads = [*known.heads]
-            if known is None or known.coverage.state != state:
-                heads += self.store.parts(topic, max((head.number for head in heads), default=0))
-                heads.sort(key=lambda head: (head.first, head.number))
-            known = _Heads.of(heads, coverage)
-            if self.store.failures == failures:
-                self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
-        yield from known.within(window)
-
-    def part(
-        self,
-        head: PartHead,
-        coverage: Coverage,
-        may_match: Callable[[Table], bool] = lambda _: True,
-    ) -> PartUnit | None:
-        """Returns a part; None where no row of it counts, or none may match.
-
-        Raises:
-            GoneError: it was deleted meanwhile.
-        """
-        assert self.store is not None  # noqa: S101 - there are no parts without one
-        offset = self.store.offset
-        known = self._known.get(head.number) or self.look_up([head]).get(head.number)
-        topic = self.store.topic(head.topic)
-        if not known or topic is None:
-            raise GoneError
-        columns = known
-
-        def load(path: str) -> Column:
-            return self._column(head.number, path, columns[path])
-
-        table = part_table(topic, columns, load)
-        if not may_match(table):
-            return None
-        counting = coverage.among(head.bags)
-        if not counting.size:
-            return None
-
-        def integers(path: str) -> IntArray | None:
-            column = load(path) if path in columns else None
-            return None if column is None else np.asarray(column, np.int64)
-
-        def bag_of(number: int) -> BagFile:
-            bag = coverage.bag(number + offset)
-            if bag is None:
-                raise GoneError
-            return bag
-
-        return PartUnit(head, table, integers, counting - offset, bag_of)
-
-    def look_up(self, heads: Iterable[PartHead]) -> Mapping[int, Mapping[str, Packed]]:
-        """Reads at once what is known of the columns of parts, where it is not known yet."""
-        missing = [head.number for head in heads if self._known.get(head.number) is None]
-        found = self.store.part_columns(missing) if self.store is not None and missing else {}
-        for number, columns in found.items():
-            if columns:
-                self._known.put(number, columns, _COLUMN_BYTES * len(columns))
-        return found
-
-    def split(self, number: int, topic: str) -> list[Table] | None:
-        """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
-        assert self.store is not None  # noqa: S101 - there are no splits without one
-        failures = self.store.failures
-        data = self.store.split_data(number)
-        topics = self.store.topics()
-        if data is None or self.store.failures != failures:
-            return None
-        tables = unpack_tables(data, topics)
-        return [table for number, table in tables if topics[number].channel.topic == topic]
-
-    def _column(self, part: int, path: str, packed: Packed) -> Column:
-        column = self._columns.get((part, path))
-        if column is not None:
-            return column
-        assert self.store is not None  # noqa: S101 - as above
-        data = b""
-        # The one value of a constant is its least, unless it is a text.
-        if not packed.codec.endswith(" constant") or packed.codec.startswith("text"):
-            stored = self.store.part_data(part, path)
-            if stored is None:
-                raise GoneError
-            data = decompressed(stored) if stored else b""
-        column = unpack(packed.codec, packed.count, packed.zone.least, data)
-        self._columns.put((part, path), column, _bytes_of(column))
-        return column
-
-
-class _Scan:
-    """One scan: its sources, and which rows of them are copies."""
 
     def __init__(self, scanner: Scanner, asked: Asked) -> None:
         self._scanner = scanner
@@ -296,12 +110,13 @@ class _Scan:
         self._shared = [
             span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
         ]
-        self._ends = [stop for _, stop in self._shared]
         self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
         self._relatched: dict[object, IntArray] = {}
         self._relatched_since = MAX_NS
+        self._delays: dict[int, tuple[float, float]] | None = None
+        self._together: list[PartHead] = []
         reach = asked.window
         if asked.relatches:
             reach = TimeWindow.everything()
@@ -309,26 +124,66 @@ class _Scan:
             reach = reach.widened(2 * COPY_HORIZON_NS)
         found = self._settled(reach)
         self._sources = sorted(found, key=lambda source: (source.first, source.last))
+        self._firsts = np.array([source.first for source in self._sources], np.int64)
+        lasts = np.array([source.last for source in self._sources], np.int64)
+        self._latest = np.maximum.accumulate(lasts)
+        if self._shared:
+            self._shared = self._holding_copies()
+        self._ends = [stop for _, stop in self._shared]
 
-    def rows(self, *, newest_first: bool) -> Iterator[Rows]:
+    def rows(self, *, newest_first: bool = False) -> Iterator[Rows]:
+        """Yields what counts of the topic in the window.
+
+        In the order of the first log time of each table, or with `newest_first` of the last, from
+        the newest on.
+
+        Raises:
+            QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
+        """
         sources = self._sources
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
-        window = self._asked.window
+        window, may_match = self._asked.window, self._asked.may_match
+        # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
+        sources = [s for s in sources if window.overlaps(s.first, s.last)]
+        if may_match is not None:
+            heads = [source.part for source in sources if source.part is not None]
+            wanted = self._scanner.matching(heads, may_match)
+            ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
+            sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
+        if (within := self._asked.within) is not None:
+            sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
         ahead = together = 1
         for nth, source in enumerate(sources):
             if nth == ahead:
                 # Who goes on reads many.
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
-                parts = [each.part for each in sources[nth:ahead] if each.part is not None]
-                self._scanner.look_up(parts)
-            if window.overlaps(source.first, source.last):
-                self._asked.check(source.last if newest_first else source.first)
-                for unit in self._units(source, self._asked.may_match):
-                    rows = Rows(unit, partial(self._counting, unit))
-                    if self._asked.may_be_empty or len(rows):
-                        yield rows
+                parts = sources[nth:ahead]
+                self._together = [each.part for each in parts if each.part is not None]
+            self._asked.check(source.last if newest_first else source.first)
+            for unit in self._units(source):
+                rows = Rows(unit, partial(self._counting, unit))
+                if self._asked.may_be_empty or len(rows):
+                    yield rows
+
+    def copies(self) -> Iterator[Rows]:
+        """Yields the rows that do not count, as another recording has their messages, too.
+
+        Raises:
+            QueryTimeoutError: as for `rows`.
+        """
+        spans = [TimeWindow(*span) for span in self._shared]
+        shared = {id(source) for span in spans for source in self._sources_in(span)}
+        for source in self._sources:
+            part = None if source.part is None else source.part.number
+            if id(source) not in shared and not (self._asked.relatches and self._may_be_late(part)):
+                continue
+            self._asked.check(source.first)
+            for unit in self._units(source):
+                repeated = self._repeated(unit)
+                if repeated.size:
+                    yield Rows.of(unit, np.unique(repeated))
 
     def _settled(self, reach: TimeWindow) -> list[_Source]:
         """Returns the sources that may have rows in a window, as the store is at one moment."""
@@ -375,11 +230,9 @@ class _Scan:
             if reach.overlaps(bag.start, bag.end) and bag.summary.of(topic):
                 yield _Source(*bag.summary.span_of([topic]), None, bag)
 
-    def _units(
-        self, source: _Source, may_match: Callable[[Table], bool] = lambda _: True
-    ) -> Iterable[Unit]:
+    def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage, may_match)
+            unit = self._scanner.part(source.part, self._coverage, self._together)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         known = self._decoded.get(source.bag.file)
@@ -413,6 +266,19 @@ class _Scan:
         return None if counting is None or counting.all() else np.flatnonzero(counting)
 
     # Copies
+
+    def _holding_copies(self) -> list[tuple[Ns, Ns]]:
+        """Returns the shared spans in which two sources may have messages of one publish time."""
+        known = self._bounds(PUBLISH_TIME)
+        found: list[tuple[Ns, Ns]] = []
+        for start, stop in self._shared:
+            published = sorted(
+                (-math.inf, math.inf) if source.part is None else known[source.part.number]
+                for source in self._sources_in(TimeWindow(start, stop))
+            )
+            if any(before[1] >= after[0] for before, after in pairwise(published)):
+                found.append((start, stop))
+        return found
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
@@ -449,7 +315,8 @@ class _Scan:
     def _received_again(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that were received before, as late messages of a latch."""
         none = np.empty(0, np.int64)
-        identities = unit.identities() if unit.table.channel.latched else None
+        may_be_late = unit.table.channel.latched and self._may_be_late(unit.part)
+        identities = unit.identities() if may_be_late else None
         if identities is None:
             return none
         published = identities[0]
@@ -476,12 +343,25 @@ class _Scan:
             self._relatched[unit.key] = some[again[begin : begin + some.size]]
             begin += some.size
 
+    def _bounds(self, path: str) -> dict[int, tuple[float, float]]:
+        heads = [source.part for source in self._sources if source.part is not None]
+        return self._scanner.bounds(heads, path)
+
+    def _may_be_late(self, part: int | None) -> bool:
+        """Returns whether a part may have messages that were received long after."""
+        if self._delays is None:
+            self._delays = self._bounds(DELAY)
+        return part is None or self._delays[part][1] > RELATCHED_NS
+
+    def _sources_in(self, window: TimeWindow) -> list[_Source]:
+        # They are in the order of their first times, and reach beyond the next ones.
+        begin = int(np.searchsorted(self._latest, window.start))
+        stop = int(np.searchsorted(self._firsts, window.stop))
+        return [source for source in self._sources[begin:stop] if source.last >= window.start]
+
     def _units_in(self, window: TimeWindow) -> Iterator[Unit]:
-        # Sources are in the order of their first times, and reach beyond the next ones.
-        stop = bisect_right(self._sources, window.stop - 1, key=lambda source: source.first)
-        for source in self._sources[:stop]:
-            if source.last >= window.start:
-                yield from self._units(source)
+        for source in self._sources_in(window):
+            yield from self._units(source)
 
     def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
         times, counting = unit.times(), unit.counting()
@@ -522,9 +402,3 @@ class _Scan:
                     published[rows] = table.publish_times
                     hashes[rows] = table.payload_hashes
         return published, hashes
-
-
-def _bytes_of(column: Column) -> int:
-    if isinstance(column, Texts):
-        return column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
-    return column.nbytes

@@ -45,7 +45,6 @@ from ros2_memory.columns.shown import (
     placed,
 )
 from ros2_memory.columns.table import Texts
-from ros2_memory.columns.truth import may_be_rewritten
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
 from ros2_memory.messages.detections import LISTS, MAX_DEPTH, detections_of
 
@@ -336,7 +335,7 @@ def _labelled(values: Values, leaf: Leaf, name: Texts, among: Ints, scores: Floa
 def _json(values: Values, source: _Json) -> Facts:
     """Returns the labels in texts that are JSON, each of which is parsed once."""
     zone = values.zone(source.leaf)
-    if zone is not None and not may_be_rewritten(zone):
+    if zone is not None and not zone.may_be_json:
         return NOTHING
     texts = _texts(values, source.leaf)
     known: dict[int, list[tuple[str, float]]] = {}
@@ -414,12 +413,12 @@ def _value(level: int, type_name: str, name: str = "", text: str = "") -> JsonVa
     return {"status": [{"level": level, "name": name, "message": text}]}
 
 
-def _repeated(rows: Ints, codes: Ints, told: Sequence[Sequence[tuple[Word, float]]]) -> Facts:
+def _repeated(rows: Ints, codes: Ints, states: Sequence[Sequence[tuple[Word, float]]]) -> Facts:
     """Returns the facts of rows, each of which tells what its code does: one fact, or none."""
-    once = Facts.of([(nth, *fact) for nth, facts in enumerate(told) for fact in facts])
+    once = Facts.of([(nth, *fact) for nth, facts in enumerate(states) for fact in facts])
     if not once.rows.size:
         return NOTHING
-    place = np.full(len(told), -1)
+    place = np.full(len(states), -1)
     place[once.rows] = np.arange(once.rows.size)
     nth = place[codes]
     kept = nth >= 0

@@ -3,8 +3,9 @@
 Everything here is derived: deleting the file changes no answer, only how long it takes. A bag is
 stored whole or not at all. Until the ten minutes that it begins in are over, its columns lie in one
 row (`split`). Then those of one recording become parts, one for each topic (`part`), column by
-column (`part_column`). A part has rows of several bags, and names them: rows of a bag that is not
-in `bag` any more do not count.
+column (`part_column`). What is known of a column without unpacking it lies apart from the parts
+(`zone`), next to that of the same column in the other parts: a search reads it at once. A part has
+rows of several bags, and names them: rows of a bag that is not in `bag` any more do not count.
 
 A bag is known by its path below the bag directory, its size and mtime, and the mtime of the sidecar
 that says which of its messages count. Its number is never used twice.
@@ -25,7 +26,7 @@ from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
-from ros2_memory.columns.parts import DROPPED, packed_part
+from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
@@ -39,6 +40,9 @@ from ros2_memory.columns.writing import (
     within,
     zone_of,
 )
+from ros2_memory.columns.zones import Zones
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
@@ -47,7 +51,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Definition, IntArray
 
@@ -57,14 +60,26 @@ LONG_NS: Final[Ns] = 2 * PART_NS
 
 TABLES: Final = Tables(
     version=FORMAT,
-    names=("bag", "topic", "definition", "split", "part", "part_column", "deletion"),
+    names=(
+        "bag",
+        "summary",
+        "topic",
+        "definition",
+        "split",
+        "part",
+        "part_column",
+        "zone",
+        "deletion",
+    ),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
     pragmas=("page_size = 4096", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
     statements="""
 CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQUE,
   size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  hashed INTEGER NOT NULL, definitions TEXT NOT NULL);
+  hashed INTEGER NOT NULL, definitions TEXT NOT NULL, summary INTEGER NOT NULL,
+  counts BLOB NOT NULL);
+CREATE TABLE summary (id INTEGER PRIMARY KEY, topics TEXT NOT NULL UNIQUE);
 CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, encoding TEXT NOT NULL,
   latched INTEGER NOT NULL, definition INTEGER NOT NULL, layout TEXT NOT NULL,
   UNIQUE (name, encoding, latched, definition, layout));
@@ -73,11 +88,13 @@ CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TE
 CREATE TABLE split (bag INTEGER PRIMARY KEY, tables BLOB NOT NULL);
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  bags TEXT NOT NULL);
+  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
-CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, codec TEXT NOT NULL,
-  count INTEGER NOT NULL, least, greatest, nulls INTEGER NOT NULL, error REAL NOT NULL,
-  words TEXT, data BLOB, PRIMARY KEY (part, path)) WITHOUT ROWID;
+CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB NOT NULL,
+  UNIQUE (part, path));
+CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
+  codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
+  nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
 CREATE TABLE deletion (id INTEGER PRIMARY KEY AUTOINCREMENT);
 """,
 )
@@ -124,11 +141,17 @@ class State(NamedTuple):
 
 
 class StoredBag(NamedTuple):
-    """A bag that is stored: its number, and whether copies of its messages can be recognised."""
+    """A bag that is stored: its key, and whether copies of its messages can be recognised.
 
-    number: int
-    key: BagKey
-    hashed: bool
+    `row` is its number less the store's `offset`: a week of these is made at once.
+    """
+
+    path: str
+    size: int
+    mtime_ns: Ns
+    sidecar_ns: Ns
+    row: int
+    hashed: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,6 +164,8 @@ class PartHead:
         first: the earliest log time (ns), inclusive.
         last: the latest, inclusive.
         bags: the numbers of the bags that its rows are of, ascending.
+        messages: how many rows it has.
+        dropped: the paths of its columns that are beyond the topic's share.
     """
 
     number: int
@@ -148,6 +173,8 @@ class PartHead:
     first: Ns
     last: Ns
     bags: IntArray
+    messages: int
+    dropped: tuple[str, ...]
 
 
 class ColumnStore(Database):
@@ -195,6 +222,34 @@ class ColumnStore(Database):
 
         return self.read(ask, State(-1, -1, (-1, -1)))
 
+    def known_files(self, bag_dir: Path) -> dict[str, BagFile]:
+        """Returns every bag that is stored as it was indexed, by its whole path."""
+        root = f"{bag_dir}{os.sep}"
+
+        def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
+            schemas = {
+                number: SummarySchema.from_json(topics)
+                for number, topics in connection.execute("SELECT id, topics FROM summary")
+            }
+            rows = connection.execute(
+                "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns"
+                " FROM bag WHERE size >= 0"
+            )
+            return {
+                file: BagFile(
+                    file,
+                    size,
+                    mtime,
+                    BagState.CLOSED,
+                    BagSummary.decoded(schemas[schema], counts),
+                    *rest,
+                )
+                for path, size, mtime, schema, counts, *rest in rows
+                for file in [root + path]
+            }
+
+        return self.read(ask, {})
+
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
 
@@ -205,10 +260,7 @@ class ColumnStore(Database):
                 f" WHERE definitions IN ('', ?) {among}",
                 (self._definitions, *(() if paths is None else (json.dumps(paths),))),
             )
-            return {
-                row[0]: StoredBag(self.offset + row[4], BagKey(*row[:4]), bool(row[5]))
-                for row in rows
-            }
+            return {bag.path: bag for bag in map(StoredBag._make, rows)}
 
         return self.read(ask, {})
 
@@ -239,9 +291,7 @@ class ColumnStore(Database):
         def ask(connection: sqlite3.Connection) -> dict[str, Ns]:
             rows = connection.execute(
                 "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
-                " WHERE part.id IN (SELECT part FROM part_column WHERE codec = ?)"
-                " GROUP BY name ORDER BY name",
-                (DROPPED,),
+                " WHERE dropped <> '' GROUP BY name ORDER BY name"
             )
             return dict(rows.fetchall())
 
@@ -314,7 +364,7 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT id, topic, first_ns, last_ns, bags FROM part"
+                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?) AND id > ?"
                 " ORDER BY first_ns, id",
                 (topic, max(after - self.offset, 0)),
@@ -326,26 +376,41 @@ class ColumnStore(Database):
                     first,
                     last,
                     np.array(json.loads(bags), np.int64) + self.offset,
+                    messages,
+                    tuple(json.loads(dropped)) if dropped else (),
                 )
-                for number, of_topic, first, last, bags in rows
+                for number, of_topic, first, last, bags, messages, dropped in rows
             ]
 
         return self.read(ask, [])
 
-    def part_columns(self, parts: Sequence[int]) -> dict[int, dict[str, Packed]]:
-        """Returns what is known of each column of some parts, without its values."""
+    def zones(self, topic: int, path: str, after: int = 0) -> Zones:
+        """Returns the zones of a column in all parts of a topic that are newer than a part."""
 
-        def ask(connection: sqlite3.Connection) -> dict[int, dict[str, Packed]]:
+        def ask(connection: sqlite3.Connection) -> Zones:
             rows = connection.execute(
-                "SELECT part, path, codec, count, error, least, greatest, nulls, words"
-                " FROM part_column WHERE part IN (SELECT value FROM json_each(?))",
-                (json.dumps([part - self.offset for part in parts]),),
+                "SELECT part, least, greatest, nulls, words FROM zone"
+                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
+                (topic, path, max(after - self.offset, 0)),
+            ).fetchall()
+            parts = [self.offset + part for part, *_ in rows]
+            return Zones.of(parts, [zone_of(*zone) for _, *zone in rows])
+
+        return self.read(ask, Zones.of([], []))
+
+    def packed(self, topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
+        """Returns what is known of a column in some parts of a topic, without its values."""
+
+        def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
+            rows = connection.execute(
+                "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
+                " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
+                (topic, path, json.dumps([part - self.offset for part in parts])),
             )
-            found: dict[int, dict[str, Packed]] = {part: {} for part in parts}
-            for part, path, codec, count, error, *zone in rows:
-                packed = Packed(codec, count, error, zone_of(*zone), b"")
-                found[part + self.offset][path] = packed
-            return found
+            return {
+                part + self.offset: Packed(codec, count, error, zone_of(*zone), b"")
+                for part, codec, count, error, *zone in rows
+            }
 
         return self.read(ask, {})
 
@@ -357,7 +422,7 @@ class ColumnStore(Database):
                 "SELECT data FROM part_column WHERE part = ? AND path = ?",
                 (part - self.offset, path),
             ).fetchone()
-            return None if row is None else row[0] or b""
+            return None if row is None else row[0]
 
         return self.read(ask, None)
 
@@ -474,7 +539,7 @@ class ColumnStore(Database):
                 topic: [packed_part(topics[topic].layout, tables)]
                 for topic, tables in found.items()
             }
-            insert_parts(connection, within(packed, budget))
+            insert_parts(connection, within(connection, packed, budget))
             connection.execute(
                 "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
                 (json.dumps(numbers),),
@@ -485,6 +550,20 @@ class ColumnStore(Database):
     def delete(self, paths: Sequence[str]) -> bool:
         """Deletes bags, and the parts that have rows of none that is left."""
         return self.write(partial(delete_bags, paths=paths))
+
+    def merged_bytes(self) -> tuple[int, int]:
+        """Returns the bytes of the bags that are in parts, and those of the columns of parts."""
+
+        def ask(connection: sqlite3.Connection) -> tuple[int, int]:
+            [bags] = connection.execute(
+                "SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN (SELECT bag FROM split)"
+            ).fetchone()
+            [columns] = connection.execute(
+                "SELECT total(bytes) FROM part WHERE dropped = ''"
+            ).fetchone()
+            return int(bags), int(columns)
+
+        return self.read(ask, (0, 0))
 
     def used_bytes(self) -> int:
         """Returns the bytes of the file that hold something."""

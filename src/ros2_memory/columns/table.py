@@ -22,6 +22,7 @@ and where a sequence takes more than `MAX_RANGED_BYTES`.
 from __future__ import annotations
 
 import math
+import re
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -37,6 +38,11 @@ Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
 MAX_NUMBERS: Final = 9
 """Longer arrays of numbers (covariances of poses, scans, images) are no columns."""
+IN_PART: Final = "LETTERS"
+"""Begins the words of a zone that are no whole texts, but the rows of letters in them.
+
+No casefolded text begins so."""
+_LETTERS: Final = re.compile(r"[^\W\d_]+")
 MAX_RANGED_BYTES: Final = 4096
 """Of longer arrays the least and the greatest number are not looked for."""
 
@@ -50,8 +56,8 @@ class Zone(NamedTuple):
         greatest: the greatest likewise.
         nulls: how many values are NaN.
         words: of texts, the casefolded distinct ones, joined by newlines: what is not in it is in
-            no text. None of numbers, and of texts that are too many or too long to be kept here:
-            any may be there.
+            no text. Of texts that are too many or too long for that, `IN_PART` and the rows of
+            letters in them. None of numbers, and where these are too many, too: any may be there.
     """
 
     least: float | None = None
@@ -68,6 +74,51 @@ class Zone(NamedTuple):
     def high(self) -> float:
         """The greatest value; minus infinity where there is none."""
         return -math.inf if self.greatest is None else self.greatest
+
+    def spans(self, number: float) -> bool:
+        """Returns whether a number may be a value."""
+        return self.low <= number <= self.high
+
+    def reaches(self, limit: float, *, above: bool) -> bool:
+        """Returns whether some value lies above a limit, or below it."""
+        return self.high > limit if above else self.low < limit
+
+    def is_near(self, place: float, distance: float) -> bool:
+        """Returns whether some value may be within a distance of a place."""
+        return as_float(self.low) - place <= distance and place - as_float(self.high) <= distance
+
+    def may_have(self, text: str) -> bool:
+        """Returns whether a casefolded text may be part of a value."""
+        return self.words is None or may_be_in(self.words, text)
+
+    @property
+    def may_be_json(self) -> bool:
+        """Whether a text may be a JSON array or object."""
+        return self.words is None or any(may_be_in(self.words, mark) for mark in "[{")
+
+    def divided(self, by: int) -> Zone:
+        """Returns the zone of the values divided by a positive number."""
+        return Zone(self.low / by, self.high / by, self.nulls)
+
+
+def letters_of(text: str) -> list[str]:
+    """Returns the rows of letters in a text, each as long as it goes on."""
+    return _LETTERS.findall(text)
+
+
+def may_be_in(words: str, text: str) -> bool:
+    """Returns whether a casefolded text may be part of a value, by the words of a zone."""
+    if not words.startswith(IN_PART):
+        return text in words
+    return all(letters in words for letters in letters_of(text))
+
+
+def as_float(number: float) -> float:
+    """Returns the float nearest to a number; infinite where it is too large for one."""
+    try:
+        return float(number)
+    except OverflowError:
+        return math.copysign(math.inf, 1 if number > 0 else -1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,13 +344,17 @@ def _joined_elements(
     return found
 
 
+def column_bytes(column: Column) -> int:
+    """Returns about how many bytes of memory a column takes."""
+    if isinstance(column, Texts):
+        return column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
+    return column.nbytes
+
+
 def _bytes(columns: Mapping[str, Column], elements: Mapping[str, Elements]) -> int:
     size = 0
     for column in columns.values():
-        if isinstance(column, Texts):
-            size += column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
-        else:
-            size += column.nbytes
+        size += column_bytes(column)
     for inner in elements.values():
         size += inner.owners.nbytes + _bytes(inner.columns, inner.elements)
     return size

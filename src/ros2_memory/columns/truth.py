@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -34,20 +34,25 @@ from ros2_memory.columns.shown import (
     placed,
     unknown,
 )
-from ros2_memory.columns.table import MAX_NUMBERS, Texts
-from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values
+from ros2_memory.columns.table import MAX_NUMBERS, Texts, as_float
+from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values, zone_of
+from ros2_memory.columns.zones import PartZones
 from ros2_memory.messages.detections import MAX_DEPTH, without_low_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.shown import Limits, Node
     from ros2_memory.columns.table import Table, Zone
     from ros2_memory.columns.values import Mask, Numeric
+    from ros2_memory.columns.zones import Zones
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import Definition
+
+ZoneOf: TypeAlias = "Callable[[Leaf], Zone | Zones | None]"
+"""Returns what is known of a leaf without reading it, of one part or of several."""
 
 _EXACT_BELOW: Final = 2**53
 _ROUNDING: Final = 1e-9
@@ -86,11 +91,6 @@ class Truth:
         return np.zeros(self.rows, np.bool_) if self.some_unsure is None else self.some_unsure
 
 
-def truth(condition: Condition, table: Table, extractor: SchemaExtractor) -> Truth:
-    """Returns which rows of a table meet a condition; for several tables, see `ColumnCondition`."""
-    return ColumnCondition(condition, extractor).truth(table)
-
-
 class ColumnCondition:
     """Tests one condition on tables; remembers what it means for each type that it met.
 
@@ -110,7 +110,7 @@ class ColumnCondition:
         if plan is None:
             return _truth(rows, unknown(rows))
         values = Values(table)
-        if rows == 0 or not plan.may_match(values):
+        if rows == 0 or not plan.may_match(values.zone):
             return Truth(rows)
         if plan.counted is None:
             return _truth(rows, _any_of(plan.whole, values))
@@ -125,12 +125,19 @@ class ColumnCondition:
         surely, perhaps = counted.surely & whole.surely, counted.perhaps & whole.perhaps
         return _truth(rows, Kept(surely, perhaps))
 
-    def may_match(self, table: Table) -> bool:
-        """Returns whether a row may meet the condition, as known without reading a column."""
-        plan = self._plan_of(table)
-        return plan is None or plan.may_match(Values(table))
+    def may_match(self, known: Table | PartZones) -> bool | Mask:
+        """Returns whether a row may meet the condition, as known without reading a column.
 
-    def _plan_of(self, table: Table) -> _Plan | None:
+        Of several parts for each of them, or for all.
+        """
+        plan = self._plan_of(known)
+        if plan is None:
+            return True
+        if isinstance(known, PartZones):
+            return plan.may_match(lambda leaf: zone_of(leaf, known.zone))
+        return plan.may_match(Values(known).zone)
+
+    def _plan_of(self, table: Table | PartZones) -> _Plan | None:
         definition, type_name = table.definition, table.channel.type
         if definition is None or "" in table.left_out:
             return None
@@ -156,8 +163,13 @@ class _Plan(NamedTuple):
     whole: Sequence[_LeafTest | _PlaceTest]
     counted: Sequence[_LeafTest | _PlaceTest] | None
 
-    def may_match(self, values: Values) -> bool:
-        return any(test.may_match(values) for test in self.whole)
+    def may_match(self, zone_of: ZoneOf) -> bool | Mask:
+        found: bool | Mask = False
+        for test in self.whole:
+            found = found | test.may_match(zone_of)
+            if found is True:
+                break
+        return found
 
 
 def _truth(rows: int, kept: Kept) -> Truth:
@@ -169,7 +181,7 @@ def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
     """Returns which rows pass any of the tests."""
     surely, perhaps = np.zeros(values.rows, np.bool_), np.zeros(values.rows, np.bool_)
     for test in tests:
-        if not test.may_match(values):
+        if not test.may_match(values.zone):
             continue
         for level, found, limits in test.found(values):
             if found is None:
@@ -245,22 +257,23 @@ class _LeafTest:
             return True
         return isinstance(self.test, Contains) and self.is_element and self.test.has_element(value)
 
-    def may_match(self, values: Values) -> bool:
+    def may_match(self, zone_of: ZoneOf) -> bool | Mask:
         """Returns whether some value may pass, as far as it is known without reading any."""
-        zone = values.zone(self.leaf)
-        if zone is None or (self.leaf.json_depth and may_be_rewritten(zone)):
+        zone = zone_of(self.leaf)
+        if zone is None:
             return True
         if self.leaf.kind is Kind.TEXT:
-            return zone.words is None or (self._folded or "") in zone.words
+            has = zone.may_have(self._folded or "")
+            return has | zone.may_be_json if self.leaf.json_depth else has
+        if self.leaf.kind is not Kind.BOOLEAN and isinstance(self.test, Beyond):
+            return zone.reaches(self.test.limit, above=self.test.above)
+        numbers: Sequence[float] = self.numbers
         if self.leaf.kind is Kind.BOOLEAN:
-            return any(
-                zone.low <= value <= zone.high and self.passes(value=value)
-                for value in (False, True)
-            )
-        if isinstance(self.test, Beyond):
-            limit = self.test.limit
-            return zone.high > limit if self.test.above else zone.low < limit
-        return any(zone.low <= number <= zone.high for number in self.numbers)
+            numbers = [value for value in (False, True) if self.passes(value=value)]
+        found: bool | Mask = False
+        for number in numbers:
+            found = found | zone.spans(number)
+        return found
 
     def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level pass; None where the table cannot say."""
@@ -301,7 +314,7 @@ class _LeafTest:
         near = np.isinf(error) | np.zeros(len(column), np.bool_)
         for bound in (self.test.limit,) if isinstance(self.test, Beyond) else self.numbers:
             with np.errstate(invalid="ignore"):  # infinity less infinity
-                near |= (np.abs(column - _as_float(bound)) <= error) & (error > 0.0)
+                near |= (np.abs(column - as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
             return Kept(passed & ~near, passed | near)
         among = np.flatnonzero(near)
@@ -353,7 +366,7 @@ class _LeafTest:
             perhaps |= beyond(greatest + error if above else least - error, limit, above=above)
             perhaps |= is_real  # infinities are not among the finite ones
         for number in self.numbers:
-            at = _as_float(number)
+            at = as_float(number)
             if error == 0.0:
                 surely |= equal_to_any(least, (number,)) | equal_to_any(greatest, (number,))
             perhaps |= (least - error <= at) & (at <= greatest + error)
@@ -361,11 +374,6 @@ class _LeafTest:
         if not is_real:
             surely &= ~is_rounded
         return Kept(surely, perhaps | surely)
-
-
-def may_be_rewritten(zone: Zone) -> bool:
-    """Returns whether a text of a zone may be JSON."""
-    return zone.words is None or "[" in zone.words or "{" in zone.words
 
 
 def _without_low(word: str, least: float, depth: int) -> str:
@@ -384,11 +392,11 @@ def _without_low(word: str, least: float, depth: int) -> str:
 
 def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
     """Returns which numbers lie beyond a limit, compared as Python does: exactly."""
-    if column.dtype.kind in "iu" and math.isfinite(_as_float(limit)):
+    if column.dtype.kind in "iu" and math.isfinite(as_float(limit)):
         whole = math.floor(limit) if above else math.ceil(limit)
         return column > whole if above else column < whole
     # Not a Python float, to which float32 would be compared as float32.
-    nearest = _as_float(limit)
+    nearest = as_float(limit)
     bound = np.float64(nearest)
     if above:
         return column >= bound if nearest > limit else column > bound
@@ -399,21 +407,13 @@ def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
     """Returns which numbers equal one of these, compared as Python does: exactly."""
     found = np.zeros(len(column), np.bool_)
     for number in numbers:
-        as_float = _as_float(number)
+        nearest = as_float(number)
         if column.dtype.kind in "iu":
-            if math.isfinite(as_float) and number == math.floor(number):
+            if math.isfinite(nearest) and number == math.floor(number):
                 found |= column == int(number)
-        elif as_float == number:
-            found |= column == np.float64(as_float)
+        elif nearest == number:
+            found |= column == np.float64(nearest)
     return found
-
-
-def _as_float(number: float) -> float:
-    """Returns the float nearest to a number; infinite where it is too large for one."""
-    try:
-        return float(number)
-    except OverflowError:
-        return math.copysign(math.inf, 1 if number > 0 else -1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -424,16 +424,14 @@ class _PlaceTest:
     leaves: tuple[Leaf, ...]
     limits: Limits
 
-    def may_match(self, values: Values) -> bool:
+    def may_match(self, zone_of: ZoneOf) -> bool | Mask:
         """Returns whether some position may be near, as far as known without reading any."""
         reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
+        found: bool | Mask = True
         for leaf, center in zip(self.leaves, self._center, strict=False):
-            zone = values.zone(leaf)
-            if zone is not None and not (
-                _as_float(zone.low) - center <= reach and center - _as_float(zone.high) <= reach
-            ):
-                return False
-        return True
+            zone = zone_of(leaf)
+            found = found if zone is None else found & zone.is_near(center, reach)
+        return found
 
     def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level are near; None where the table cannot say."""

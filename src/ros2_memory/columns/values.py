@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, Texts, Zone
+from ros2_memory.columns.zones import Zones
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.messages.conversions import ANGLES, channels_of, euler_of
@@ -65,6 +66,8 @@ class Made(Enum):
     CHANNELS = auto()  # of an image's encoding; NaN where that has no fixed number
     CONSTANT = auto()
 
+
+Z = TypeVar("Z", Zone, Zones)
 
 _ANGLES: Final = {Made.ROLL: 0, Made.PITCH: 1, Made.YAW: 2}
 
@@ -235,17 +238,7 @@ class Values:
 
     def zone(self, leaf: Leaf) -> Zone | None:
         """Returns what is known of a leaf without reading it."""
-        if leaf.made is Made.CONSTANT:
-            return Zone(leaf.constant, leaf.constant, 0)
-        if leaf.made in _ANGLES:
-            most = 90.0 if leaf.made is Made.PITCH else 180.0
-            return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
-        if len(leaf.sources) > 1 or leaf.made is Made.CHANNELS:
-            return None
-        zone = self.table.zone(leaf.level.full(leaf.sources[0]))
-        if zone is None or leaf.made is not Made.SECONDS:
-            return zone
-        return Zone(zone.low / NS_PER_S, zone.high / NS_PER_S, zone.nulls)
+        return zone_of(leaf, self.table.zone)
 
     def _turned(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
         """Returns one of the angles (degrees) of quaternions."""
@@ -273,6 +266,26 @@ class Values:
         # Zero is zero everywhere, and a robot in the plane has nothing else.
         off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
         return Numbers(angles[which], off, exactly)
+
+
+def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
+    """Returns what is known of a leaf by the zones of its sources.
+
+    Args:
+        leaf: the leaf.
+        zone: returns the zone of a column of a table, or its zones in some parts, by its path.
+    """
+    if leaf.made is Made.CONSTANT:
+        return Zone(leaf.constant, leaf.constant, 0)
+    if leaf.made in _ANGLES:
+        most = 90.0 if leaf.made is Made.PITCH else 180.0
+        return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
+    if len(leaf.sources) > 1 or leaf.made is Made.CHANNELS:
+        return None
+    found = zone(leaf.level.full(leaf.sources[0]))
+    if found is None or leaf.made is not Made.SECONDS:
+        return found
+    return found.divided(NS_PER_S)
 
 
 def seconds(times: Numeric) -> Floats:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import pack_rows
+from ros2_memory.columns.parts import DROPPED, ZONE_ALONE, pack_rows
 from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -81,7 +81,7 @@ class LongBag:
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
         budget = round(self._share * sum(len(table) for table in tables))
-        insert_parts(connection, within(packed, budget))
+        insert_parts(connection, within(connection, packed, budget))
 
     def end(self, connection: sqlite3.Connection) -> None:
         """Gives the bag its key: now it is stored."""
@@ -104,11 +104,17 @@ class LongBag:
         return self.goes_on
 
 
-def within(parts: Mapping[int, Sequence[PackedPart]], budget: int) -> dict[int, list[PackedPart]]:
-    """Returns the parts of topics; of the largest that are beyond the budget (bytes) no data."""
+def within(
+    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], budget: int
+) -> dict[int, list[PackedPart]]:
+    """Returns the parts of topics; of the largest that are beyond the budget (bytes) no data.
+
+    Those that are the largest in all parts, so that not each topic has some parts without data.
+    """
     sizes = {topic: sum(part.size for part in parts[topic]) for topic in parts}
+    usual = dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
     found: dict[int, list[PackedPart]] = {}
-    for topic in sorted(parts, key=lambda topic: sizes[topic]):
+    for topic in sorted(parts, key=lambda topic: sizes[topic] + usual.get(topic, 0)):
         budget -= sizes[topic]
         kept = budget >= 0
         found[topic] = [part if kept else part.without_data() for part in parts[topic]]
@@ -136,10 +142,12 @@ def insert_bag(
     connection: sqlite3.Connection, key: BagKey, bag: BagFile, definitions: str, *, hashed: bool
 ) -> int:
     """Inserts a bag; returns its number."""
+    summary = _number_of(connection, "summary", {"topics": bag.summary.schema.to_json()})
+    times = (bag.start, bag.end, _messages_of(bag))
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
-        " definitions) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, bag.start, bag.end, _messages_of(bag), hashed, definitions),
+        " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (*key, *times, hashed, definitions, summary, bag.summary.packed),
     )
     return int(cursor.lastrowid or 0)
 
@@ -152,24 +160,37 @@ def insert_parts(connection: sqlite3.Connection, parts: Mapping[int, Sequence[Pa
 
 
 def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> None:
+    paths = [path for path, packed in part.columns.items() if packed.codec == DROPPED]
+    dropped, size = json.dumps(paths) if paths else "", part.size + part.dropped_bytes
     cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags) VALUES (?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags)),
+        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?)",
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped, size),
+    )
+    number = cursor.lastrowid
+    connection.executemany(
+        "INSERT INTO part_column VALUES (?, ?, ?)",
+        [
+            (number, path, packed.data)
+            for path, packed in part.columns.items()
+            # Numbers that are rounded to one take no bytes, but are no constant.
+            if packed.data or packed.codec.split()[-1] not in {"constant", DROPPED, ZONE_ALONE}
+        ],
     )
     connection.executemany(
-        "INSERT INTO part_column VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
             (
-                cursor.lastrowid,
+                topic,
                 path,
+                number,
                 packed.codec,
                 packed.count,
+                packed.error,
                 _storable(packed.zone.least),
                 _storable(packed.zone.greatest),
                 packed.zone.nulls,
-                packed.error,
                 packed.zone.words,
-                packed.data or None,
             )
             for path, packed in part.columns.items()
         ],
@@ -259,9 +280,21 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
     connection.executemany("DELETE FROM split WHERE bag = ?", [(number,) for number in numbers])
     # A part goes with the last of its bags.
     gone = connection.execute(
-        "SELECT id FROM part WHERE NOT EXISTS"
+        "SELECT id, topic FROM part WHERE NOT EXISTS"
         " (SELECT 1 FROM json_each(part.bags) JOIN bag ON bag.id = value)"
     ).fetchall()
-    connection.executemany("DELETE FROM part_column WHERE part = ?", gone)
-    connection.executemany("DELETE FROM part WHERE id = ?", gone)
+    for topic in {topic for _, topic in gone}:
+        parts = json.dumps([part for part, of_topic in gone if of_topic == topic])
+        # By the paths that the topic has: zones are ordered by these, and parts come last.
+        connection.execute(
+            "WITH RECURSIVE known (path) AS (SELECT min(path) FROM zone WHERE topic = :topic"
+            " UNION ALL SELECT (SELECT min(path) FROM zone WHERE topic = :topic"
+            " AND path > known.path) FROM known WHERE known.path IS NOT NULL)"
+            " DELETE FROM zone WHERE topic = :topic AND path IN (SELECT path FROM known)"
+            " AND part IN (SELECT value FROM json_each(:parts))",
+            {"topic": topic, "parts": parts},
+        )
+    numbers = [(part,) for part, _ in gone]
+    connection.executemany("DELETE FROM part_column WHERE part = ?", numbers)
+    connection.executemany("DELETE FROM part WHERE id = ?", numbers)
     connection.execute("INSERT INTO deletion DEFAULT VALUES")

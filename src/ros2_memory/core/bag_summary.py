@@ -7,16 +7,23 @@ it is asked for.
 
 from __future__ import annotations
 
+import json
 import struct
 import sys
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
+import numpy as np
+
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
+
+    from numpy.typing import NDArray
+
+    IntArray = NDArray[np.int64]
 
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 """Messages are written out of order by less than this, also across two splits."""
@@ -86,6 +93,26 @@ class SummarySchema:
         """The layout of a bag's numbers in bytes."""
         return struct.Struct(f"<{3 * len(self.topics)}q")
 
+    def to_json(self) -> str:
+        """Returns the schema as JSON; equal ones give equal texts."""
+        topics = [[*header] for header in self.topics]
+        return json.dumps([topics, self.silent, self.complete, self.notes, self.set_back])
+
+    @staticmethod
+    def from_json(text: str) -> SummarySchema:
+        """Returns the schema that `to_json` returned so.
+
+        Raises:
+            ValueError: the text is not valid.
+            TypeError: likewise.
+        """
+        topics, silent, complete, notes, set_back = json.loads(text)
+        headers = tuple(
+            TopicHeader(topic, type_name, encoding, bool(latched))
+            for topic, type_name, encoding, latched in topics
+        )
+        return shared_schema(headers, tuple(silent), bool(complete), tuple(notes), int(set_back))
+
 
 WRONG_STATISTICS: Final = "its own statistics are wrong"
 READ_WITHOUT_INDEXES: Final = "its messages were read without its indexes"
@@ -97,6 +124,28 @@ DOUBTS: Final = (
     "its chunk indexes ",
 )
 """Beginnings of notes on files that contradict themselves, and were read from end to end."""
+
+
+def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
+    """Returns count, first and last of each topic of summaries that share one schema.
+
+    Of the shape (summaries, topics, 3).
+    """
+    topics = len(summaries[0].schema.topics)
+    stored = [summary._numbers for summary in summaries]
+    size = _BASE.size + topics * (_COUNT_BYTES + 2 * _TIME_BYTES)
+    if any(len(numbers) != size for numbers in stored):
+        whole = b"".join([summary.numbers for summary in summaries])
+        return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)
+    packed = np.frombuffer(b"".join(stored), np.uint8).reshape(-1, size)
+    base = np.ascontiguousarray(packed[:, : _BASE.size]).view("<i8")
+    fields = packed[:, _BASE.size :].reshape(len(stored), topics, -1)
+    wide = np.zeros((len(stored), topics, 3, 8), np.uint8)
+    wide[:, :, 0, :_COUNT_BYTES] = fields[:, :, :_COUNT_BYTES]
+    wide[:, :, 1:, :_TIME_BYTES] = fields[:, :, _COUNT_BYTES:].reshape(len(stored), topics, 2, -1)
+    numbers: IntArray = wide.view("<i8")[:, :, :, 0]
+    numbers[:, :, 1:] += base[:, :, None]
+    return numbers
 
 
 def set_back_while_written(by: Ns) -> str:
@@ -158,7 +207,7 @@ class BagSummary:
 
     @classmethod
     def decoded(cls, schema: SummarySchema, numbers: bytes) -> Self:
-        """Returns the summary of these numbers, which must be as many as the schema has."""
+        """Returns the summary of these numbers, packed or not, as many as the schema has."""
         made = cls.__new__(cls)
         made.schema = schema
         made._numbers = numbers
@@ -172,6 +221,11 @@ class BagSummary:
 
     def pack(self) -> None:
         """Takes about half of the memory from now on, and some microseconds for each look."""
+        self._numbers = self.packed
+
+    @property
+    def packed(self) -> bytes:
+        """The numbers in about half of the bytes, where they fit; `decoded` takes them, too."""
         numbers = self._unpacked()
         base = min(numbers[1::3], default=0)
         parts = [_BASE.pack(base)]
@@ -182,9 +236,8 @@ class BagSummary:
                 parts.append((first - base).to_bytes(_TIME_BYTES, "little"))
                 parts.append((last - base).to_bytes(_TIME_BYTES, "little"))
         except OverflowError:
-            return
-        if numbers:
-            self._numbers = b"".join(parts)
+            return self.numbers
+        return b"".join(parts) if numbers else b""
 
     def _unfolded(self, packed: bytes) -> bytes:
         (base,) = _BASE.unpack_from(packed)

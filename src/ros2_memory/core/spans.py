@@ -49,6 +49,12 @@ def lies_inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
     return index >= 0 and moment < spans[index][1]
 
 
+def overlaps_any(spans: Sequence[tuple[Ns, Ns]], first: Ns, last: Ns) -> bool:
+    """Returns whether a time (inclusive) overlaps one of spans that are sorted and apart."""
+    nth = bisect_right(spans, first, key=lambda span: span[1])
+    return nth < len(spans) and spans[nth][0] <= last
+
+
 def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
     """Returns the half-open spans in which different recordings can hold copies.
 

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.units import Rows
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
@@ -117,10 +118,10 @@ class CandidateRows:
             yield rows.last, self._candidates(rows)
         self._left[topic] = MIN_NS
 
-    def _may_match(self, table: Table) -> bool:
-        found = self._test.may_match(table)
+    def _may_match(self, parts: PartZones) -> bool | Mask:
+        found = self._test.may_match(parts)
         self.has_looked = True
-        self.ruled_out |= not found
+        self.ruled_out |= not np.all(found)
         return found
 
     def _candidates(self, rows: Rows) -> IntArray:
@@ -183,7 +184,7 @@ class CandidateTables:
         ):
             yield min(rows.last, self._until - 1), rows.first, topic
 
-    def _may_match(self, table: Table) -> bool:
-        found = self._test.may_match(table)
-        self.ruled_out |= not found
+    def _may_match(self, parts: PartZones) -> bool | Mask:
+        found = self._test.may_match(parts)
+        self.ruled_out |= not np.all(found)
         return found

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import State
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
-    from ros2_memory.columns.scan import Scanner
+    from ros2_memory.columns.scanner import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.text import Reason

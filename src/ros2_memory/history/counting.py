@@ -1,7 +1,7 @@
 """How many messages of a topic there are in pieces of a window, each counted once.
 
 The index knows that of every bag in which no piece ends, where no other recording may hold copies.
-Of the rest the times of messages are read, and where recordings overlap those that count.
+Of the rest the times of messages are looked at, and where recordings overlap those that count.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
@@ -51,32 +52,25 @@ def count_messages(
         QueryTimeoutError: the call's time is over.
     """
     if view.stream.may_be_relatched([topic]):
-        yield from _scanned(view, topic, window, edges)
-        return
-    shared = view.stream.duplicate_spans(topic, window)
-    ends = [stop for _, stop in shared]
-    for span in view.stream.overlapping_bags([topic], window):
-        near = bisect_right(ends, span.first)
-        is_shared = near < len(shared) and shared[near][0] <= span.last
-        piece, until = np.searchsorted(edges, [span.first, span.last], side="right").tolist()
-        if piece == until and not is_shared and window.covers(span.first, span.last):
-            messages = sum(known.count for known in span.bag.summary.of(topic))
-            yield Counted(piece, messages, span.first, span.last)
-            continue
-        times = np.sort(np.array(view.bags.log_times(span.bag, topic, window), np.int64))
-        for start, stop in shared[near:]:
-            if start > span.last:
-                break
-            times = times[(times < start) | (times >= stop)]
-        yield from _in_pieces(times, edges)
-    for start, stop in shared:
-        yield from _scanned(view, topic, TimeWindow(start, stop).intersect(window), edges)
-
-
-def _scanned(view: View, topic: str, window: TimeWindow, edges: IntArray) -> Iterator[Counted]:
-    if not window.empty:
         for rows in scan(view, topic, window, columns=False):
             yield from _in_pieces(rows.times, edges)
+        return
+    shared = view.snapshot.timeline.shared_times
+    ends = [stop for _, stop in shared]
+    to_read: dict[str, tuple[Ns, Ns]] = {}
+    for first, last, bag in view.stream.overlapping_bags([topic], window):
+        near = bisect_right(ends, first)
+        is_shared = near < len(shared) and shared[near][0] <= last
+        piece, until = np.searchsorted(edges, [first, last], side="right").tolist()
+        if piece == until and not is_shared and window.covers(first, last):
+            yield Counted(piece, sum(known.count for known in bag.summary.of(topic)), first, last)
+        else:
+            to_read[bag.file] = (first, last + 1)
+    near_those = united(sorted(to_read.values()))
+    for rows in scan(view, topic, window, columns=False, within=near_those):
+        for bag, positions in rows.bag_rows():
+            if bag.file in to_read:
+                yield from _in_pieces(rows.times[positions], edges)
 
 
 def _in_pieces(times: IntArray, edges: IntArray) -> Iterator[Counted]:

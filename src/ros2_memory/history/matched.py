@@ -108,7 +108,11 @@ class Matching:
         self.ruled_out |= truth.is_none
         first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
         if truth.is_none:
-            return Block(topic, first, last, has_match=False, test=lambda: _none_met(rows.times))
+
+            def none_met() -> Tested:
+                return Tested(rows.times, np.zeros(len(rows), np.uint8))
+
+            return Block(topic, first, last, has_match=False, test=none_met)
         met, unsure = truth.met, truth.unsure
         if rows.index is not None:
             met, unsure = met[rows.index], unsure[rows.index]
@@ -137,10 +141,6 @@ class Matching:
             read[each.time].append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
         return [read[time].pop() if read[time] else NOT_MET for time in times.tolist()]
-
-
-def _none_met(times: IntArray) -> Tested:
-    return Tested(times, np.zeros(times.size, np.uint8))
 
 
 def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:

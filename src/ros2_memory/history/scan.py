@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.columns.scan import Asked, Scanner
+from ros2_memory.columns.scan import Asked, Scan
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.model import TimeWindow
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
@@ -30,17 +33,19 @@ def scan(
     columns: bool = True,
     copies: bool = False,
     shared: Sequence[tuple[Ns, Ns]] | None = None,
-    may_match: Callable[[Table], bool] = lambda _: True,
+    may_match: Callable[[PartZones], bool | Mask] | None = None,
     may_be_empty: bool = False,
+    within: Sequence[tuple[Ns, Ns]] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
-    """Yields the rows of a topic in a window; see `Scanner.rows`.
+    """Yields the rows of a topic in a window; see `columns.scan.Scan.rows`.
 
     What cannot be read is noted. `reached` is called before each table with a log time that what
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. `may_match` and `may_be_empty` are as in `Asked`.
+    may hold copies, where the caller knows them. `may_match`, `may_be_empty` and `within` are as in
+    `Asked`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -55,7 +60,7 @@ def scan(
         view.bags.check_deadline()
 
     if shared is None:
-        shared = () if copies else view.stream.duplicate_spans(topic, window)
+        shared = () if copies else view.snapshot.timeline.shared_times
     asked = Asked(
         topic,
         window,
@@ -64,10 +69,34 @@ def scan(
         shared=shared,
         may_match=may_match,
         may_be_empty=may_be_empty,
+        within=within,
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )
-    return scanner.rows(asked, newest_first=newest_first)
+    return Scan(scanner, asked).rows(newest_first=newest_first)
+
+
+def copies(view: View, topic: str) -> Iterator[Rows]:
+    """Yields the rows of a topic that do not count, as another recording has them, too.
+
+    Raises:
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
+    """
+    scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
+
+    def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
+        return view.bags.tables(bag, topic, hashed=hashed, columns=False)
+
+    asked = Asked(
+        topic,
+        TimeWindow.everything(),
+        view.snapshot.timeline,
+        decode,
+        shared=view.snapshot.timeline.shared_times,
+        relatches=view.stream.may_be_relatched([topic]),
+        check=lambda _: view.bags.check_deadline(),
+    )
+    return Scan(scanner, asked).copies()
 
 
 def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:

@@ -7,17 +7,15 @@ Unix seconds or of a duration. "Ago" counts from the wall clock or, for replayed
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_left
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ros2_memory.columns.scan import Census
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
@@ -32,16 +30,14 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import bag_overlaps, deduplicate_forward
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import only_pose_topic, require_bags
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import copies, scan
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.columns.units import Rows
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
@@ -50,9 +46,16 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 
-_CENSUS_BYTES: Final = 1_000
-"""About how much memory the census of a shared span takes."""
 _CENSUSES: Final[WeakKeyDictionary[Timeline, dict[str, dict[str, Census]]]] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, slots=True)
+class Census:
+    """Log times of the earliest and latest message (inclusive), and how many there are."""
+
+    first: Ns
+    last: Ns
+    count: int
 
 
 class View:
@@ -133,30 +136,12 @@ class View:
         return np.sort(np.concatenate(parts))
 
     def count_in(self, topic: str, group: Group) -> int:
-        """Returns how many messages of the window a group of the topic's bags holds.
-
-        Where whole recordings overlap it is what their bags hold, less what the catalogue counted
-        twice: only what it does not know is read. Where it counted nothing twice, the messages of
-        the group are found without reading all of them.
-        """
-        if group.has_duplicates and self.memory.columns is not None:
+        """Returns how many messages of the window a group of the topic's bags holds."""
+        if group.has_duplicates:
             return self._times_in(topic, group).size
         if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
             return group.count()
-        files = {each.bag.file for each in group.bags}
-        count = _stated(topic, group.bags)
-        twice = 0
-        for span in bag_overlaps(group.bags):
-            window = TimeWindow(*span)
-            if not files.issuperset(
-                each.bag.file for each in self.stream.overlapping_bags([topic], window)
-            ):
-                return group.count()
-            for stored, once in self._overlap_census(topic, window).values():
-                twice += stored.count - once.count
-        if not twice:
-            group.has_duplicates = False
-        return count - twice
+        return _stated(topic, group.bags)
 
     def apart(self, topic: str, group: Group) -> Sequence[Group]:
         """Returns a group for each bag of one whose bags follow each other and hold no copy.
@@ -190,110 +175,31 @@ class View:
         return found
 
     def _census(self, topic: str) -> dict[str, Census]:
-        everything = TimeWindow.everything()
-        if self.stream.may_be_relatched([topic]):
-            return _tallied_rows(scan(self, topic, everything, columns=False))
         counted = {
             type_name: Census(*stated)
             for type_name, stated in self.snapshot.timeline.totals(topic).items()
         }
-        for span in self.stream.duplicate_spans(topic, everything):
-            for type_name, (stored, once) in self._overlap_census(topic, TimeWindow(*span)).items():
-                known = counted[type_name]
-                last = once.last if stored.last == known.last else known.last
-                count = known.count - stored.count + once.count
-                counted[type_name] = Census(known.first, last, count)
-        return counted
+        for rows in copies(self, topic):
+            type_name = rows.table.channel.type
+            known = counted[type_name]
+            last = known.last if rows.span[1] < known.last else self._last_of(topic, type_name)
+            counted[type_name] = Census(known.first, last, known.count - len(rows))
+        return {type_name: known for type_name, known in counted.items() if known.count}
 
-    def _overlap_census(
-        self, topic: str, window: TimeWindow
-    ) -> Mapping[str, tuple[Census, Census]]:
-        """Returns, by type, the messages stored in overlapping bags, and those that count."""
-        bags = self.stream.overlapping_bags([topic], window)
-        scanner = self.memory.columns
-        if scanner is not None:
-            key = (topic, window, *((each.bag.file, each.bag.mtime_ns) for each in bags))
-            known = scanner.censuses.get(key)
-            if known is None:
-                known = self._census_of_rows(topic, window)
-                if self.notes.complete and not self.call.used_active:
-                    scanner.censuses.put(key, known, _CENSUS_BYTES + 200 * len(bags))
-            return known
-        question = f"overlap {topic} {window.start:x} {window.stop - window.start:x}"
-        answered = self.bags.cached_answer(question, bags, partial(_decode_overlap, window.start))
-        if answered is not None:
-            return answered
-        stored: dict[str, Census] = {}
-        everywhere = [(window.start, window.stop)]
-        with self.notes.isolated():
-            merged = self.stream.merged(bags, [topic], window, newest_first=False)
-            once = _counted(deduplicate_forward(_tallied(merged, stored), everywhere))
-            counted = {type_name: (stored[type_name], once[type_name]) for type_name in once}
-            # From the window's start: thousands of these are stored, and most of each is digits.
-            answer = {
-                type_name: [
-                    (each.first - window.start, each.last - window.start, each.count)
-                    for each in both
-                ]
-                for type_name, both in counted.items()
-            }
-            self.bags.cache_answer(question, bags, json.dumps(answer))
-        return counted
-
-    def _census_of_rows(self, topic: str, window: TimeWindow) -> dict[str, tuple[Census, Census]]:
-        """Returns the same by the rows of a shared span."""
-        span = [(window.start, window.stop)]
-        once = _tallied_rows(scan(self, topic, window, columns=False, shared=span))
-        stored = _tallied_rows(scan(self, topic, window, columns=False, copies=True))
-        return {type_name: (stored[type_name], once[type_name]) for type_name in once}
+    def _last_of(self, topic: str, type_name: str) -> Ns:
+        """Returns the log time of the newest message of a type that counts."""
+        newest = MIN_NS
+        for rows in scan(self, topic, TimeWindow.everything(), newest_first=True, columns=False):
+            if rows.last < newest:
+                break
+            if rows.table.channel.type == type_name:
+                newest = max(newest, rows.span[1])
+        return newest
 
 
 def _stated(topic: str, bags: Sequence[BagSpan]) -> int:
     """Returns how many messages of a topic bags hold, duplicates too."""
     return sum(known.count for each in bags for known in each.bag.summary.of(topic))
-
-
-def _decode_overlap(start: Ns, answer: str) -> dict[str, tuple[Census, Census]]:
-    return {
-        type_name: (_census_from(start, *stored), _census_from(start, *once))
-        for type_name, (stored, once) in json.loads(answer).items()
-    }
-
-
-def _census_from(start: Ns, first: Ns, last: Ns, count: int) -> Census:
-    return Census(start + first, start + last, count)
-
-
-def _tallied_rows(found: Iterable[Rows]) -> dict[str, Census]:
-    """Returns a census by message type of rows in any order."""
-    counted: dict[str, Census] = {}
-    for rows in found:
-        first, last = rows.span
-        type_name = rows.table.channel.type
-        known = counted.get(type_name, Census(first, last, 0))
-        counted[type_name] = Census(
-            min(known.first, first), max(known.last, last), known.count + len(rows)
-        )
-    return counted
-
-
-def _counted(messages: Iterable[StoredMessage]) -> dict[str, Census]:
-    """Returns a census by message type of an ascending stream."""
-    counted: dict[str, Census] = {}
-    for _ in _tallied(messages, counted):
-        pass
-    return counted
-
-
-def _tallied(
-    messages: Iterable[StoredMessage], counted: dict[str, Census]
-) -> Iterator[StoredMessage]:
-    """Yields the messages of an ascending stream, and adds each to a census by message type."""
-    for each in messages:
-        type_name = each.record.channel.type
-        known = counted.get(type_name, Census(each.time, each.time, 0))
-        counted[type_name] = Census(known.first, each.time, known.count + 1)
-        yield each
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from ros2_memory.analysis.clock_steps import SHORTEST_BY_STAMPS_NS
 from ros2_memory.analysis.silences import usual_period
+from ros2_memory.core.bag_summary import numbers_of
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
 
@@ -113,8 +114,7 @@ def bags_with_holes(bags: Sequence[BagFile], rates: Rates) -> Iterator[Suspected
         groups.setdefault(id(bag.summary.schema), []).append(bag)
     for group in groups.values():
         schema = group[0].summary.schema
-        data = b"".join([bag.summary.numbers for bag in group])
-        numbers = np.frombuffer(data, "<i8").reshape(len(group), len(schema.topics), 3)
+        numbers = numbers_of([bag.summary for bag in group])
         lengths = np.array([bag.end - bag.start for bag in group], np.int64)
         limit = np.maximum(_LACKING_NS, lengths * _UNSTEADY)
         lacking, through = np.full(len(group), True), np.full(len(group), False)

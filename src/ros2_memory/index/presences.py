@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Presence, Spacing
+from ros2_memory.core.bag_summary import numbers_of
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
@@ -57,8 +58,7 @@ def _tables(bags: Sequence[BagFile], column: dict[str, int]) -> tuple[_Times, _T
         groups.setdefault(id(bag.summary.schema), []).append(row)
     for rows in groups.values():
         schema = bags[rows[0]].summary.schema
-        data = b"".join([bags[row].summary.numbers for row in rows])
-        numbers = np.frombuffer(data, "<i8").reshape(len(rows), len(schema.topics), 3)
+        numbers = numbers_of([bags[row].summary for row in rows])
         columns = [column[header.topic] for header in schema.topics]
         if len(schema.positions) == len(columns):
             here = np.ix_(rows, columns)

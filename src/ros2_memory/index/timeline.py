@@ -14,12 +14,14 @@ from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.spans import overlap_spans, united
 from ros2_memory.index.segment import (
     Pace,
     Segment,
     TopicTotals,
     add_totals,
+    folder_of,
     in_time,
     is_log,
     wider,
@@ -30,7 +32,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.segment import Span, TopicExtent
 
@@ -212,6 +215,22 @@ class Timeline:
             for segment in self.segments_in(window)
             for bag in segment.bags
             if window.overlaps(bag.start, bag.end)
+        )
+
+    @cached_property
+    def shared_times(self) -> Spans:
+        """The half-open spans in which bags of different recordings may hold copies, in order."""
+        folders: dict[str, Span] = {}
+        for segment in self.segments:
+            for folder, span in segment.folder_spans.items():
+                folders[folder] = wider(folders.get(folder), span)
+        # First by whole recordings, which are few; then by bags, where these overlap.
+        coarse = overlap_spans((*span, folder) for folder, span in folders.items())
+        near = [self.overlapping(TimeWindow(*span)) for span in coarse]
+        return united(
+            span
+            for bags in near
+            for span in overlap_spans((bag.start, bag.end, folder_of(bag)) for bag in bags)
         )
 
     def faulty(self, window: TimeWindow) -> list[BagFile]:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.stated import Stated
     from ros2_memory.analysis.topic_events import State
     from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Group
@@ -56,7 +57,7 @@ def events_back(
     topic: str,
     window: TimeWindow,
     *,
-    may_match: Callable[[Table], bool] | None = None,
+    may_match: Callable[[Table], bool | Mask] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[TopicEvents]:
     """Yields the events in times that do not overlap, the newest first.
@@ -107,7 +108,7 @@ def _events(
     view: View,
     columns: StatedColumns,
     together: list[Rows],
-    may_match: Callable[[Table], bool] | None,
+    may_match: Callable[[Table], bool | Mask] | None,
 ) -> Iterator[TopicEvents]:
     """Yields the events of tables that overlap in time; those of a whole part are kept."""
     part = together[0].part if len(together) == 1 else None

@@ -222,3 +222,10 @@ def test_a_bag_without_a_detector_costs_nothing() -> None:
     assert encode_sights(no_sights()) == b""
     assert decode_sights(b"") == no_sights()
     assert np.array_equal(no_sights().spots, np.zeros((0, len(Spot))))
+
+
+def test_what_is_seen_at_the_end_of_64_bits_has_a_time_that_fits() -> None:
+    builder = SightsBuilder()
+    builder.add("/detections", 2**63 - 1, HERE, [mug(1.0)])
+    [spot] = builder.sights().spots
+    assert spot[Spot.LAST] == 2**63 - 808

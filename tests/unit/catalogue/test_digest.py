@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ros2_memory.catalogue.codec import decode_schema, encode_schema
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.topic_digest import MAX_STORED
+from ros2_memory.core.bag_summary import SummarySchema
 from tests.support.bags import Msg, odom, text, tf, transform
 from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
@@ -70,4 +70,4 @@ def test_few_latched_messages_are_stored_whole_and_many_are_not() -> None:
 
 def test_a_summary_schema_is_the_same_after_it_was_encoded() -> None:
     summary = digest_of([odom(T0, 0, 0), text(T0 + S, "a"), text(T0 + 2 * S, "b")]).summary
-    assert decode_schema(encode_schema(summary.schema)) == summary.schema
+    assert SummarySchema.from_json(summary.schema.to_json()) == summary.schema

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS

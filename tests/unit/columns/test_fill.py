@@ -136,8 +136,8 @@ def test_columns_beyond_the_share_are_dropped_and_times_and_zones_stay(tmp_path:
         write_bag(tmp_path, number, rows=2000, hz=100)
     world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
     world.fill()
-    assert count(world, "part_column", "codec = 'dropped' AND path = 'pose.pose.position.x'") == 1
-    assert count(world, "part_column", "codec = 'dropped' AND path GLOB '#*'") == 0
+    assert count(world, "zone", "codec = 'dropped' AND path = 'pose.pose.position.x'") == 1
+    assert count(world, "zone", "codec = 'dropped' AND path GLOB '#*'") == 0
     assert times(world, "/odom") == times(world.unstored(), "/odom")
     view = View(world.memory, Call())
     [rows] = scan(view, "/odom", EVERYTHING)
@@ -316,12 +316,58 @@ def test_a_bag_of_several_groups_becomes_parts_at_once(tmp_path: Path) -> None:
     assert check_all(World.of(tmp_path)) == 120
 
 
+def test_bags_may_take_what_others_left_of_their_share(tmp_path: Path) -> None:
+    def moving(name: str, share: float, *, quiet: bool) -> World:
+        bag_dir = tmp_path / name
+        if quiet:
+            texts = [text(T0 + n * S, "a" * 20_000) for n in range(100)]
+            path = write_mcap(bag_dir / "quiet" / "quiet_0.mcap", texts)
+            os.utime(path, ns=(T0, T0))
+            World.of(bag_dir).fill()
+        write_bag(bag_dir, 20, rows=2000, hz=100)
+        world = World.of(bag_dir, limits=StoreLimits(max_share=share))
+        world.fill()
+        return world
+
+    whole = moving("whole", 1.0, quiet=False)
+    in_bags, needed = whole.store.merged_bytes()
+    share = 0.9 * needed / in_bags
+    assert count(moving("alone", share, quiet=False), "part", "dropped <> ''") > 0
+    assert count(moving("beside", share, quiet=True), "part", "dropped <> ''") == 0
+
+
+def test_the_topic_that_is_the_largest_in_all_parts_is_dropped_first(tmp_path: Path) -> None:
+    draw = random.Random(1)
+    for number in range(4):
+        begin = T0 + number * 600 * S
+        messages = [odom(begin + n * S // 40, draw.uniform(-9, 9), 0.0) for n in range(1200)]
+        # In the oldest bag, which is stored last, there is more of them than of odometry.
+        said = [f"{draw.getrandbits(2000):x}" for _ in range(20 if number == 0 else 1)]
+        messages += [text(begin + n * S + 7, word) for n, word in enumerate(said)]
+        messages.sort(key=lambda message: message.log_time)
+        path = write_mcap(tmp_path / f"rec_{number}" / "rec_0.mcap", messages)
+        os.utime(path, ns=(T0, T0))
+    # No share: 200 bytes a second are for either of them.
+    assert World.of(tmp_path, limits=StoreLimits(max_share=0.0)).fill() == 4
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        rows = base.execute(
+            "SELECT name, part.first_ns / 600000000000, bytes, dropped <> '' FROM part"
+            " JOIN topic ON topic.id = topic ORDER BY 1, 2"
+        ).fetchall()
+    assert [dropped for name, *_, dropped in rows if name == "/chatter"] == [0, 0, 0, 0]
+    assert [dropped for name, *_, dropped in rows if name == "/odom"] == [1, 0, 0, 0]
+    odometry, said_then = (
+        next(row[2] for row in rows if row[0] == name) for name in ("/odom", "/chatter")
+    )
+    assert odometry < said_then
+
+
 @pytest.mark.usefixtures("small_groups")
 def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None:
     write_bag(tmp_path, 0, rows=2000, hz=100)
     world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
     assert world.fill() == 1
-    assert count(world, "part_column", "codec = 'dropped'") > 0
+    assert count(world, "zone", "codec = 'dropped'") > 0
     assert times(world, "/odom") == times(world.unstored(), "/odom")
 
 
@@ -367,3 +413,13 @@ def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path:
     key = one.filling._key(bag)
     assert not one.store.put_long(key, bag, deleted_meanwhile(), hashed=False, budget=10**6)
     assert (count(one, "part"), count(one, "bag")) == (0, 0)
+
+
+def test_numbers_that_are_rounded_to_one_come_back(tmp_path: Path) -> None:
+    messages = [odom(T0 + n * S, 1.0 + n * 1e-6, 0.0) for n in range(9)]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    os.utime(path, ns=(T0, T0))
+    world = World.of(tmp_path)
+    assert world.fill() == 1
+    assert count(world, "zone", "codec GLOB '* flat 0'") == 1
+    assert check_all(world) == 9

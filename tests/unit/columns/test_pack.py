@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import random
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -215,8 +216,31 @@ def test_words_of_a_zone_are_casefolded_and_distinct() -> None:
     assert zone.words == "cup\nstrasse"
 
 
-def test_a_zone_of_too_many_words_keeps_none() -> None:
-    assert pack(Texts.of([f"word {number}" for number in range(1000)])).zone.words is None
+def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
+    texts = [f'{{"label": "Größe {number}", "score": 0.{number}}}' for number in range(1000)]
+    zone = pack(Texts.of(texts)).zone
+    assert zone.words == "LETTERS\ngrösse\nlabel\nscore"
+    assert zone.may_be_json
+    found = ["label", "abel", "größe 7".casefold(), '"score": 0.5', "12345"]
+    assert [zone.may_have(text) for text in found] == [True] * 5
+    assert [zone.may_have(text) for text in ("labels", "cup", "letters", "score cup")] == [
+        False
+    ] * 4
+
+
+def test_a_zone_of_too_many_different_words_keeps_none() -> None:
+    draw = random.Random(5)
+    words = ["".join(draw.choices("abcdefgh", k=9)) for _ in range(1000)]
+    assert pack(Texts.of(words)).zone.words is None
+
+
+@given(st.lists(st.text(max_size=30), max_size=30), st.text(max_size=5))
+def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], text: str) -> None:
+    asked = text.casefold()
+    for padding in ([], [f"{number} " * 900 for number in range(3)]):
+        zone = pack(Texts.of([*values, *padding])).zone
+        if any(asked in value.casefold() for value in values):
+            assert zone.may_have(asked)
 
 
 def test_two_threads_unpack_at_once() -> None:
@@ -242,7 +266,7 @@ def test_damaged_bytes_are_refused() -> None:
 
 def test_packed_bytes_of_this_format_do_not_change() -> None:
     """Stores that robots have are read by the bytes' format."""
-    assert (FORMAT, hashlib.sha256(golden()).hexdigest()[:16]) == (2, "5dc94e7bfc97dc55"), (
+    assert (FORMAT, hashlib.sha256(golden()).hexdigest()[:16]) == (3, "5dc94e7bfc97dc55"), (
         "packed columns are other bytes than before: raise FORMAT in columns/pack.py, so that "
         "stores are filled anew, and pin the new number and hash here"
     )

@@ -13,16 +13,19 @@ import numpy as np
 import pytest
 
 from ros2_memory.columns.pack import FORMAT, decompressed
-from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.table import Table
+from ros2_memory.columns.units import GoneError
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import battery, detections, odom, text, write_mcap
-from tests.support.column_worlds import World, check_all, store_file
+from tests.support.column_worlds import World, check_all, store_file, times
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.pack import Packed
     from ros2_memory.columns.table import Column
 
 S = 10**9
@@ -48,12 +51,14 @@ def stored_rows(file: Path) -> str:
     digest = hashlib.sha256()
     with closing(sqlite3.connect(file)) as base:
         tables = {
-            "bag": "id, path, first_ns, last_ns, messages, hashed, definitions",
+            "bag": "id, path, first_ns, last_ns, messages, hashed, definitions, summary, counts",
+            "summary": "*",
             "topic": "*",
             "definition": "*",
             "split": "*",
             "part": "*",
             "part_column": "*",
+            "zone": "*",
         }
         for table, columns in tables.items():
             for row in base.execute(f"SELECT {columns} FROM {table} ORDER BY 1, 2"):  # noqa: S608
@@ -74,7 +79,7 @@ def test_rows_of_this_format_do_not_change_their_meaning(tmp_path: Path) -> None
     split = stored_rows(store_file(tmp_path))
     world.fill()
     hashes = split, stored_rows(store_file(tmp_path))
-    assert (FORMAT, *hashes) == (2, "b78802f4c7df8199", "35367f1187aba73b"), (
+    assert (FORMAT, *hashes) == (3, "913c186e7f155adf", "0b75af8df761f0b6"), (
         "the store has other rows of the same bags than before: raise FORMAT in columns/pack.py, "
         "so that stores are filled anew, and pin the new number and hashes here"
     )
@@ -255,3 +260,33 @@ def test_a_file_that_another_program_has_locked_costs_no_answer(tmp_path: Path) 
         other.execute("BEGIN IMMEDIATE")
         assert check_all(World.of(tmp_path)) == 4 * 24
         assert check_all(world) == 4 * 24
+
+
+def test_what_could_not_be_read_once_is_read_the_next_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    read = world.store.packed
+
+    def fail(topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
+        world.store.failures += 1
+        return {}
+
+    monkeypatch.setattr(world.store, "packed", fail)
+    with pytest.raises(GoneError):
+        times(world, "/odom")
+    monkeypatch.setattr(world.store, "packed", read)
+    assert times(world, "/odom") == times(world.unstored(), "/odom")
+
+
+def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(tmp_path: Path) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    scanner, [head, *_] = Scanner(world.store, tmp_path), world.store.parts("/odom")
+    assert scanner.packed(head, "no such column", []) is None
+    assert world.store.delete(world.store.paths())
+    with pytest.raises(GoneError):
+        scanner.packed(head, "#publish_time", [])

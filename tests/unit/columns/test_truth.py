@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals, NearPosition
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.table import Texts
-from ros2_memory.columns.truth import ColumnCondition, truth
+from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -77,7 +77,7 @@ def test_truth_of_drawn_messages_is_that_of_each_message(drawn: Drawn, random: R
     values = values_of(drawn)
     for _ in range(4):
         condition = condition_on(values, random)
-        compared(truth(condition, drawn.table, EXTRACTOR), condition, values)
+        compared(ColumnCondition(condition, EXTRACTOR).truth(drawn.table), condition, values)
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -86,7 +86,10 @@ def test_truth_is_sure_where_columns_hold_the_whole_value(drawn: Drawn, random: 
     values = values_of(drawn)
     for _ in range(4):
         condition = condition_on(values, random)
-        assert compared(truth(condition, drawn.table, EXTRACTOR), condition, values) == 0
+        assert (
+            compared(ColumnCondition(condition, EXTRACTOR).truth(drawn.table), condition, values)
+            == 0
+        )
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -98,7 +101,7 @@ def test_truth_of_rounded_columns_is_unsure_rather_than_wrong(
     table = stored(drawn.table, step)
     for _ in range(4):
         condition = condition_on(values, random)
-        compared(truth(condition, table, EXTRACTOR), condition, values)
+        compared(ColumnCondition(condition, EXTRACTOR).truth(table), condition, values)
 
 
 @cache
@@ -163,7 +166,7 @@ def test_truth_of_shared_bags_is_that_of_each_message(folder: str) -> None:
     for table, values in shared_samples(folder):
         for _ in range(200 if LONG else 4):
             condition = condition_on(values, random)
-            found = truth(condition, table, EXTRACTOR)
+            found = ColumnCondition(condition, EXTRACTOR).truth(table)
             unsure += compared(found, condition, values)
             rows += len(values)
     # Long arrays alone (scans, covariances) are not in the columns.
@@ -186,7 +189,7 @@ def detections(*scored: tuple[str, float]) -> object:
 
 
 def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
-    found = truth(condition, drawn_of(type_name, messages).table, EXTRACTOR)
+    found = ColumnCondition(condition, EXTRACTOR).truth(drawn_of(type_name, messages).table)
     assert not found.unsure.any()
     return [bool(each) for each in found.met]
 
@@ -293,7 +296,7 @@ def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
         result.hypothesis.class_id, result.hypothesis.score = "", 0.1
     condition = Condition(Beyond(-1e300, above=True), "detections.results.pose", 0.5)
     table = drawn_of(kind, [whole]).table
-    assert truth(condition, table, EXTRACTOR).unsure.all()
+    assert ColumnCondition(condition, EXTRACTOR).truth(table).unsure.all()
 
 
 @pytest.mark.parametrize(
@@ -310,7 +313,7 @@ def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
 )
 def test_a_column_that_its_zone_rules_out_is_not_unpacked(condition: Condition) -> None:
     table = stored(drawn_of(VISION, [detections(("cup", 0.9)), detections()]).table, 0.0)
-    found = truth(condition, table, EXTRACTOR)
+    found = ColumnCondition(condition, EXTRACTOR).truth(table)
     assert found.is_none
     assert not table.unpacked
     assert not found.met.any()
@@ -320,7 +323,9 @@ def test_a_column_that_its_zone_rules_out_is_not_unpacked(condition: Condition) 
 
 def test_only_the_columns_that_may_match_are_unpacked() -> None:
     table = stored(drawn_of(VISION, [detections(("cup", 0.9))]).table, 0.0)
-    assert truth(Condition(Contains("cup")), table, EXTRACTOR).met.tolist() == [True]
+    assert ColumnCondition(Condition(Contains("cup")), EXTRACTOR).truth(table).met.tolist() == [
+        True
+    ]
     assert table.unpacked == {"detections.label"}
 
 
@@ -328,7 +333,7 @@ def test_a_limit_within_the_error_of_a_number_is_unsure() -> None:
     kind = "std_msgs/msg/Float64"
     drawn = drawn_of(kind, [make(kind, data=number) for number in (0.96, 1.04, 2.0)])
     table = stored(drawn.table, 0.1, zones=False)
-    found = truth(Condition(Beyond(1.01, above=True), "value"), table, EXTRACTOR)
+    found = ColumnCondition(Condition(Beyond(1.01, above=True), "value"), EXTRACTOR).truth(table)
     assert found.met.tolist() == [False, False, True]
     assert found.unsure.tolist() == [True, True, False]
 
@@ -338,11 +343,15 @@ def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:
     scan = message(kind, Random(3), is_odd=False)
     scan.ranges = np.linspace(1, 2, 100, dtype=np.float32)  # type: ignore[attr-defined]
     table = drawn_of(kind, [scan]).table
-    near = truth(Condition(Beyond(1.5, above=False), "ranges"), table, EXTRACTOR)
+    near = ColumnCondition(Condition(Beyond(1.5, above=False), "ranges"), EXTRACTOR).truth(table)
     assert near.met.all()
-    assert truth(Condition(Equals(3), "ranges"), table, EXTRACTOR).is_none
-    assert truth(Condition(Equals(1.5), "ranges"), table, EXTRACTOR).unsure.all()
-    assert truth(Condition(Beyond(1.5, above=False), "ranges.7"), table, EXTRACTOR).unsure.all()
+    assert ColumnCondition(Condition(Equals(3), "ranges"), EXTRACTOR).truth(table).is_none
+    assert ColumnCondition(Condition(Equals(1.5), "ranges"), EXTRACTOR).truth(table).unsure.all()
+    assert (
+        ColumnCondition(Condition(Beyond(1.5, above=False), "ranges.7"), EXTRACTOR)
+        .truth(table)
+        .unsure.all()
+    )
 
 
 def test_one_tester_answers_for_tables_of_several_types() -> None:
@@ -356,4 +365,4 @@ def test_a_table_without_a_definition_is_unsure() -> None:
     table = drawn_of(STRING, [make(STRING, data="cup")]).table
     assert isinstance(table.columns["data"], Texts)
     object.__setattr__(table, "definition", None)
-    assert truth(Condition(Contains("cup")), table, EXTRACTOR).unsure.all()
+    assert ColumnCondition(Condition(Contains("cup")), EXTRACTOR).truth(table).unsure.all()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.columns.fill import Filling, StoreLimits
-from ros2_memory.columns.scan import Scanner
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
 
-from ros2_memory.catalogue.codec import decode_schema, encode_schema
+from ros2_memory.core.bag_summary import SummarySchema
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import data_time_range, topic_range
@@ -101,4 +101,4 @@ def test_the_catalogue_keeps_it(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
     shape = McapReader().summarize(tmp_path / "a.mcap").schema
     assert shape.set_back
-    assert decode_schema(encode_schema(shape)) == shape
+    assert SummarySchema.from_json(shape.to_json()) == shape

@@ -149,3 +149,17 @@ def test_what_was_driven_inside_is_the_same_whatever_the_catalogue_knows(
             assert asked(memory, bag_dir, "trajectory_summary", **arguments) == asked(
                 known, bag_dir, "trajectory_summary", **arguments
             )
+
+
+def test_a_jump_out_of_a_place_and_back_adds_nothing_to_what_few_poses_drove_inside(
+    tmp_path: Path,
+) -> None:
+    # 0.2 m/s along x, and one pose that is 80 m away.
+    places = [(0.2 * n if n != 4 else 80.0) for n in range(9)]
+    messages = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(places)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    where = {"x": [-1, 2], "y": [-1, 1]}
+    span = {"start": BEGIN / S, "end": BEGIN / S + 8}
+    reply = asked(memory_of(tmp_path), tmp_path, "trajectory_summary", where=where, **span)
+    assert reply["distance_m"] == pytest.approx(1.2, abs=0.05)
+    assert reply["max_speed"] == pytest.approx(0.2, abs=0.05)

@@ -1,0 +1,288 @@
+"""What is stored of a bag directory: parts, with zones and columns that are remembered.
+
+Of a part that nothing needs not even the times are unpacked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.columns.blob import unpack_tables
+from ros2_memory.columns.coverage import Covering
+from ros2_memory.columns.pack import Packed, decompressed, unpack
+from ros2_memory.columns.parts import LOG_TIME, part_table
+from ros2_memory.columns.table import Zone, column_bytes
+from ros2_memory.columns.units import GoneError, PartUnit
+from ros2_memory.columns.zones import PartZones, Zones
+from ros2_memory.storage.cache import ByteLru
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.analysis.motion.standstills import Stands
+    from ros2_memory.analysis.motion.trajectory import PathSlice
+    from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.columns.coverage import Coverage
+    from ros2_memory.columns.store import ColumnStore, PartHead
+    from ros2_memory.columns.stored import Topic
+    from ros2_memory.columns.table import Column, Table
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.index.timeline import Timeline
+    from ros2_memory.storage.base import IntArray
+
+_HEAD_BYTES: Final = 400
+"""About how much memory what is known of a part takes."""
+_COLUMN_BYTES: Final = 300
+"""About how much memory what is known of a column takes."""
+_ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
+"""Stands for a column that a part does not have."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Heads:
+    """The parts of a topic, in order of their first log times.
+
+    Attributes:
+        coverage: of the timeline that they were compared with.
+        heads: the parts.
+        firsts: their first log times.
+        lasts: their last ones.
+        live: of how many of its bags the rows of each count.
+    """
+
+    coverage: Coverage
+    heads: Sequence[PartHead]
+    firsts: IntArray
+    lasts: IntArray
+    live: IntArray
+
+    @classmethod
+    def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
+        """Returns the parts as of a coverage."""
+        live = np.zeros(len(heads), np.int64)
+        if heads:
+            sizes = np.cumsum([0, *(head.bags.size for head in heads)])
+            positions = coverage.positions(np.concatenate([head.bags for head in heads]))
+            live = np.add.reduceat(positions >= 0, sizes[:-1]).astype(np.int64)
+        return cls(
+            coverage,
+            heads,
+            np.array([head.first for head in heads], np.int64),
+            np.array([head.last for head in heads], np.int64),
+            live,
+        )
+
+    def within(self, window: TimeWindow) -> list[PartHead]:
+        """Returns the parts that may have rows in a window."""
+        here = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
+        return [self.heads[nth] for nth in np.flatnonzero(here).tolist()]
+
+
+class Scanner:
+    """What is stored of one bag directory, and what was read of it last. Thread-safe.
+
+    Args:
+        store: the store; None where nothing is stored.
+        bag_dir: the bag directory.
+
+    Attributes:
+        events: by part, what happened in it; of parts of which all rows count.
+        paths: by slice of the clock and such parts, the path of the poses in it.
+        stands: likewise, where the robot may have stood.
+    """
+
+    def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
+        self.store = store
+        self._covering = None if store is None else Covering(store, bag_dir)
+        self._columns: ByteLru[Column] = ByteLru(48 << 20)
+        self._known: ByteLru[Packed] = ByteLru(16 << 20)
+        self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
+        self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
+        self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
+        self.paths: ByteLru[PathSlice] = ByteLru(24 << 20)
+        self.stands: ByteLru[Stands] = ByteLru(24 << 20)
+
+    def coverage(self, timeline: Timeline) -> Coverage | None:
+        """Returns which bags of a timeline are stored; None without a store."""
+        return None if self._covering is None else self._covering.of(timeline)
+
+    def parts(self, topic: str, window: TimeWindow, coverage: Coverage) -> list[PartHead]:
+        """Returns the parts of a topic that may have rows in a window."""
+        if self.store is None:
+            return []
+        state = coverage.state
+        known = self._heads.get(topic)
+        if known is None or known.coverage is not coverage:
+            failures = self.store.failures
+            heads: list[PartHead] = []
+            if known is not None and known.coverage.state.deletion == state.deletion:
+                heads = [*known.heads]
+            if known is None or known.coverage.state != state:
+                heads += self.store.parts(topic, max((head.number for head in heads), default=0))
+                heads.sort(key=lambda head: (head.first, head.number))
+            known = _Heads.of(heads, coverage)
+            if self.store.failures == failures:
+                self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
+        return known.within(window)
+
+    def matching(
+        self, heads: Sequence[PartHead], may_match: Callable[[PartZones], bool | Mask]
+    ) -> Mask:
+        """Returns which of some parts may have rows that are wanted, by their zones."""
+        found = np.ones(len(heads), np.bool_)
+        topics = np.array([head.topic for head in heads], np.int64)
+        numbers = np.array([head.number for head in heads], np.int64)
+        for number in np.unique(topics).tolist():
+            topic = None if self.store is None else self.store.topic(number)
+            if topic is not None:
+                own = topics == number
+                zones = partial(self._zones, number, numbers[own])
+                found[own] = may_match(PartZones(topic, zones))
+        return found
+
+    def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:
+        """Returns the least and greatest value of a column by part; infinite if not stored."""
+        found: dict[int, tuple[float, float]] = {}
+        for topic in {head.topic for head in heads}:
+            parts = [head.number for head in heads if head.topic == topic]
+            zones = self._zones(topic, np.array(parts, np.int64), path)
+            bounds = zip(zones.low.tolist(), zones.high.tolist(), strict=True)
+            found.update(zip(parts, bounds, strict=True))
+        return found
+
+    def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
+        """Returns the zones of a column in some parts of a topic."""
+        assert self.store is not None  # noqa: S101 - there are no parts without one
+        key = (self.store.offset, topic, path)
+        known, newest = self._all_zones.get(key) or (Zones.of([], []), 0)
+        asked = int(parts.max(initial=0))
+        if asked > newest:
+            failures = self.store.failures
+            known = known.joined(self.store.zones(topic, path, newest))
+            if self.store.failures == failures:
+                # Not each part has each column, so what was asked for counts, too.
+                newest = max([asked, *known.parts[-1:].tolist()])
+                self._all_zones.put(key, (known, newest), known.memory_bytes)
+        return known.among(parts)
+
+    def part(
+        self, head: PartHead, coverage: Coverage, together: Sequence[PartHead] = ()
+    ) -> PartUnit | None:
+        """Returns a part; None where no row of it counts.
+
+        What is known of its columns is read at once for the parts `together` with it.
+
+        Raises:
+            GoneError: it was deleted meanwhile.
+        """
+        assert self.store is not None  # noqa: S101 - there are no parts without one
+        offset = self.store.offset
+        topic = self.store.topic(head.topic)
+        if topic is None:
+            raise GoneError
+        columns = _PartColumns(self, topic, head, together)
+
+        def load(path: str) -> Column:
+            return self._column(head.number, path, columns[path])
+
+        table = part_table(topic, columns, load, messages=head.messages, dropped=head.dropped)
+        counting = coverage.among(head.bags)
+        if not counting.size:
+            return None
+
+        def integers(path: str) -> IntArray | None:
+            return None if path not in columns else np.asarray(load(path), np.int64)
+
+        def bag_of(number: int) -> BagFile:
+            bag = coverage.bag(number + offset)
+            if bag is None:
+                raise GoneError
+            return bag
+
+        return PartUnit(head, table, integers, counting - offset, bag_of)
+
+    def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:
+        """Returns what is known of a column of a part; None where it has no such one.
+
+        It is read at once for those parts of the same topic that are `together` with it.
+
+        Raises:
+            GoneError: the part was deleted meanwhile, or the store cannot be read.
+        """
+        assert self.store is not None  # noqa: S101 - as above
+        known = self._known.get((head.number, path))
+        if known is None:
+            numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
+            failures = self.store.failures
+            found = self.store.packed(head.topic, path, numbers)
+            others = [number for number in numbers if number not in found]
+            # A part that is gone has no columns either: only of one that is there it says anything.
+            there = self.store.packed(head.topic, LOG_TIME, others) if others else {}
+            if self.store.failures != failures:
+                raise GoneError
+            found.update(dict.fromkeys(there, _ABSENT))
+            for number, packed in found.items():
+                self._known.put((number, path), packed, _COLUMN_BYTES)
+            known = found.get(head.number)
+            if known is None:
+                raise GoneError
+        return None if known is _ABSENT else known
+
+    def split(self, number: int, topic: str) -> list[Table] | None:
+        """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
+        assert self.store is not None  # noqa: S101 - there are no splits without one
+        failures = self.store.failures
+        data = self.store.split_data(number)
+        topics = self.store.topics()
+        if data is None or self.store.failures != failures:
+            return None
+        tables = unpack_tables(data, topics)
+        return [table for number, table in tables if topics[number].channel.topic == topic]
+
+    def _column(self, part: int, path: str, packed: Packed) -> Column:
+        column = self._columns.get((part, path))
+        if column is not None:
+            return column
+        assert self.store is not None  # noqa: S101 - as above
+        data = b""
+        # The one value of a constant is its least, unless it is a text.
+        is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
+        if packed.count and not is_constant:
+            stored = self.store.part_data(part, path)
+            if stored is None:
+                raise GoneError
+            data = decompressed(stored) if stored else b""
+        column = unpack(packed.codec, packed.count, packed.zone.least, data)
+        self._columns.put((part, path), column, column_bytes(column))
+        return column
+
+
+class _PartColumns(Mapping[str, "Packed"]):
+    """What is known of the columns of a part, looked up when it is first asked for."""
+
+    def __init__(
+        self, scanner: Scanner, topic: Topic, head: PartHead, together: Sequence[PartHead]
+    ) -> None:
+        self._scanner = scanner
+        self._topic = topic
+        self._head = head
+        self._together = together
+
+    def __getitem__(self, path: str) -> Packed:
+        packed = self._scanner.packed(self._head, path, self._together)
+        if packed is None:
+            raise KeyError(path)
+        return packed
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._topic.layout.slots)
+
+    def __len__(self) -> int:
+        return len(self._topic.layout.slots)

@@ -1,0 +1,165 @@
+"""The zones of a column over many parts, as arrays: one comparison rules out a week of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.columns.table import as_float, may_be_in
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.stored import Topic
+    from ros2_memory.columns.table import Zone
+    from ros2_memory.storage.base import Channel, Definition, IntArray
+
+    Floats = NDArray[np.float64]
+    Mask = NDArray[np.bool_]
+
+_EXACT_BELOW: Final = 2.0**53
+_ANY: Final = -1
+"""The code of a zone whose words are not known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Zones:
+    """The zones of one column in several parts: what `Zone` is of one.
+
+    Attributes:
+        parts: the numbers of the parts, ascending.
+        low: no value of the part is less; infinity where it has none.
+        high: no value is greater; minus infinity where it has none.
+        codes: which of `words` are those of the part; -1: any may be there.
+        words: the different ones, as `Zone.words`.
+    """
+
+    parts: IntArray
+    low: Floats
+    high: Floats
+    codes: IntArray
+    words: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, parts: Sequence[int], zones: Sequence[Zone]) -> Zones:
+        """Returns the zones of some parts, whose numbers ascend."""
+        known: dict[str, int] = {}
+        codes = [
+            _ANY if zone.words is None else known.setdefault(zone.words, len(known))
+            for zone in zones
+        ]
+        return cls(
+            np.array(parts, np.int64),
+            _bounds([zone.low for zone in zones], -math.inf),
+            _bounds([zone.high for zone in zones], math.inf),
+            np.array(codes, np.int64),
+            tuple(known),
+        )
+
+    def among(self, parts: IntArray) -> Zones:
+        """Returns the zones of some parts, in their order; of one that is not known, any value."""
+        if not self.parts.size:
+            nothing = np.full(parts.size, math.inf)
+            return Zones(parts, -nothing, nothing, np.full(parts.size, _ANY))
+        at = np.minimum(np.searchsorted(self.parts, parts), self.parts.size - 1)
+        known = self.parts[at] == parts
+        return Zones(
+            parts,
+            np.where(known, self.low[at], -math.inf),
+            np.where(known, self.high[at], math.inf),
+            np.where(known, self.codes[at], _ANY),
+            self.words,
+        )
+
+    def joined(self, newer: Zones) -> Zones:
+        """Returns these and those of newer parts."""
+        known = {words: code for code, words in enumerate(self.words)}
+        new = [known.setdefault(words, len(known)) for words in newer.words]
+        recoded = np.array([*new, _ANY], np.int64)  # the last stands for -1, too
+        return Zones(
+            np.concatenate((self.parts, newer.parts)),
+            np.concatenate((self.low, newer.low)),
+            np.concatenate((self.high, newer.high)),
+            np.concatenate((self.codes, recoded[newer.codes])),
+            tuple(known),
+        )
+
+    def divided(self, by: int) -> Zones:
+        """Returns the zones of the values divided by a positive number."""
+        return replace(self, low=self.low / by, high=self.high / by)
+
+    def spans(self, number: float) -> Mask:
+        """Returns in which parts a number may be a value."""
+        at = as_float(number)
+        return (self.low <= at) & (at <= self.high)
+
+    def reaches(self, limit: float, *, above: bool) -> Mask:
+        """Returns in which parts some value may lie above a limit, or below it."""
+        at = as_float(limit)
+        return self.high > at if above else self.low < at
+
+    def is_near(self, place: float, distance: float) -> Mask:
+        """Returns in which parts some value may be within a distance of a place."""
+        return (self.low - place <= distance) & (place - self.high <= distance)
+
+    def may_have(self, text: str) -> Mask:
+        """Returns in which parts a casefolded text may be part of a value."""
+        return self._where([may_be_in(words, text) for words in self.words])
+
+    @property
+    def may_be_json(self) -> Mask:
+        """In which parts a text may be a JSON array or object."""
+        return self._where([any(may_be_in(words, mark) for mark in "[{") for words in self.words])
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 32 * self.parts.size + sum(60 + len(words) for words in self.words)
+
+    def _where(self, flags: Sequence[bool]) -> Mask:
+        return np.array([*flags, True], np.bool_)[self.codes]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartZones:
+    """What is known of some parts of one topic without reading any.
+
+    Attributes:
+        topic: what they are of.
+        zones: returns the zones of a column, by its path.
+    """
+
+    topic: Topic
+    zones: Callable[[str], Zones]
+
+    @property
+    def channel(self) -> Channel:
+        """The topic's channel."""
+        return self.topic.channel
+
+    @property
+    def definition(self) -> Definition | None:
+        """The fields of its type; None where they are not known."""
+        return self.topic.definition
+
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Which fields have no column, as of a table."""
+        return self.topic.layout.left_out
+
+    def zone(self, path: str) -> Zones:
+        """Returns the zones of a column; of elements its path is `<sequence>.<column>`."""
+        return self.zones(path.rstrip("."))
+
+
+def _bounds(values: Sequence[float], away: float) -> Floats:
+    """Returns bounds as floats: where these are rounded, the next one farther out."""
+    bounds = np.array([float(value) for value in values], np.float64)
+    is_rounded = (np.abs(bounds) >= _EXACT_BELOW) & np.isfinite(bounds)
+    with np.errstate(over="ignore"):  # beyond the greatest float lies infinity
+        return np.where(is_rounded, np.nextafter(bounds, away), bounds)

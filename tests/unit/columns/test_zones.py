@@ -1,0 +1,100 @@
+"""The zones of many parts say the same of each as the zone of that part alone."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import numpy as np
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from ros2_memory.columns.store import ColumnStore
+from ros2_memory.columns.table import Zone
+from ros2_memory.columns.zones import Zones
+from tests.support.bags import odom, write_mcap
+from tests.support.column_worlds import World, store_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * 10**9
+NUMBERS = st.one_of(
+    st.integers(-(2**63), 2**64 - 1),
+    st.sampled_from([2**53, 2**53 + 1, -(2**53) - 1, 0, 1]),
+    st.floats(allow_nan=False),
+    st.booleans(),
+)
+LIMITS = st.one_of(NUMBERS, st.just(10**400), st.just(-(10**400)))
+WORDS = st.one_of(st.none(), st.text("ab[{\n", max_size=6))
+
+
+@st.composite
+def zones(draw: st.DrawFn) -> Zone:
+    if draw(st.booleans()):
+        return Zone(words=draw(WORDS))
+    if draw(st.integers(0, 5)) == 0:
+        return Zone()
+    low, high = sorted((draw(NUMBERS), draw(NUMBERS)))
+    return Zone(low, high)
+
+
+def is_exact(*numbers: float) -> bool:
+    return all(not math.isfinite(number) or abs(number) < 2**53 for number in numbers)
+
+
+@given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
+@example([Zone(0, sys.float_info.max)], 1, "")
+def test_zones_rule_out_what_the_zone_of_each_part_does(
+    given_zones: list[Zone], limit: float, text: str
+) -> None:
+    together = Zones.of(range(1, len(given_zones) + 1), given_zones)
+    for nth, zone in enumerate(given_zones):
+        pairs = [
+            (zone.spans(limit), together.spans(limit)[nth]),
+            (zone.reaches(limit, above=True), together.reaches(limit, above=True)[nth]),
+            (zone.reaches(limit, above=False), together.reaches(limit, above=False)[nth]),
+        ]
+        for alone, among_others in pairs:
+            assert among_others or not alone
+            if is_exact(zone.low, zone.high) and abs(limit) < 2**53:
+                assert among_others == alone
+        assert together.may_have(text)[nth] == zone.may_have(text)
+        assert together.may_be_json[nth] == zone.may_be_json
+
+
+@given(st.lists(zones(), min_size=1, max_size=8), st.data())
+def test_zones_of_newer_parts_are_added_and_some_are_taken(
+    given_zones: list[Zone], data: st.DataObject
+) -> None:
+    numbers = [3 * nth + 1 for nth in range(len(given_zones))]
+    cut = data.draw(st.integers(0, len(numbers)))
+    older = Zones.of(numbers[:cut], given_zones[:cut])
+    whole = older.joined(Zones.of(numbers[cut:], given_zones[cut:]))
+    asked = np.array(data.draw(st.permutations([*numbers, 2, 10**6])), np.int64)
+    some = whole.among(asked)
+    expected = Zones.of(numbers, given_zones)
+    for nth, number in enumerate(asked.tolist()):
+        if number in numbers:
+            at = numbers.index(number)
+            assert some.low[nth] == expected.low[at]
+            assert some.high[nth] == expected.high[at]
+            assert some.may_have("a")[nth] == given_zones[at].may_have("a")
+        else:
+            assert (some.low[nth], some.high[nth]) == (-math.inf, math.inf)
+            assert some.may_have("anything")[nth]
+
+
+def test_known_files_are_the_bags_as_they_were_indexed(tmp_path: Path) -> None:
+    for number in range(3):
+        messages = [odom(T0 + (10 * number + n) * 10**9, float(n), 0.0) for n in range(5)]
+        path = write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+        os.utime(path, ns=(T0, T0))
+    world = World.of(tmp_path)
+    world.fill()
+    store = ColumnStore([store_file(tmp_path)], lambda _: None)
+    indexed = {bag.file: bag for bag in world.memory.index.snapshot().bags}
+    assert store.known_files(tmp_path) == indexed
+    assert len(indexed) == 3
