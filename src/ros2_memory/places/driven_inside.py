@@ -7,17 +7,16 @@ metres.
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.motion.polyline import DrawnPath
 from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
-    TOLERANCE_M,
     Waypoint,
-    vertices_of,
+    drawn,
+    joined_lines,
 )
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
@@ -32,9 +31,8 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.results import DrivenInside
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from ros2_memory.analysis.motion.polyline import Vertex
     from ros2_memory.analysis.motion.trajectory import Line
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
@@ -140,38 +138,17 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
 
     `at_most` 0 asks for none, 1 for the last.
     """
-    path = DrawnPath(TOLERANCE_M)
-    for span in spans:
-        path.part()
-        path.extend(_vertices(line, span), 0.0)
-    drawn = path.drawn(max(at_most, _FEWEST_WAYPOINTS))
-    found = tuple(
-        Waypoint(time, position, turn, jump=not place)
-        for piece in drawn.pieces
-        for place, (time, position, turn) in enumerate(piece)
-    )
+    if not spans:
+        return ()
+    inside = joined_lines([_part(line, span) for span in spans])
+    found, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
     return found if at_most >= _FEWEST_WAYPOINTS else found[len(found) - at_most :]
 
 
-def _vertices(line: Line, span: Inside) -> Iterator[Vertex]:
+def _part(line: Line, span: Inside) -> Line:
+    """Returns the line in a time: its first vertex is where that begins, as after a jump."""
     inner = np.flatnonzero((line.times > span.start) & (line.times < span.stop))
-    yield _vertex_at(line, span.start)
-    yield from vertices_of(line.rows(inner))
-    if span.stop > span.start:
-        yield _vertex_at(line, span.stop)
-
-
-def _vertex_at(line: Line, time: Ns) -> Vertex:
-    """Returns where the robot was between two vertices; at the nearer one across a jump."""
-    last = len(line) - 1
-    after = min(int(np.searchsorted(line.times, time, side="right")), last)
-    before = max(after - 1, 0)
-    lasted = int(line.times[after] - line.times[before])
-    share = (time - int(line.times[before])) / lasted if lasted else 0.0
-    share = min(max(share, 0.0), 1.0)
-    if line.jumps[after]:
-        share = float(round(share))
-    turn = math.remainder(line.headings[after] - line.headings[before], math.tau)
-    heading = float(line.headings[before]) + turn * share
-    x, y, z = (line.places[before] + (line.places[after] - line.places[before]) * share).tolist()
-    return time, (x, y, z), None if math.isnan(heading) else heading
+    ends = [span.start, span.stop] if span.stop > span.start else [span.start]
+    first, last = line.at(np.array(ends[:1])), line.at(np.array(ends[1:], np.int64))
+    begins = dataclasses.replace(first, jumps=np.array([True]))
+    return joined_lines([begins, line.rows(inner), last])

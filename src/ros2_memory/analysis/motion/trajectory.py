@@ -3,14 +3,15 @@
 What is measured of poses depends on how many of them are measured together (see `path_length`). So
 a history is measured in slices of `SLICE_NS` of the clock, however it is cut into bags: a
 `PathSlice` is what is kept of one, and `Way.of` joins those of a window. The drawn path is
-simplified twice (see `polyline`); the deviations add up to at most the tolerance, unless a limit on
-the count of vertices widens it.
+simplified twice. The deviations add up and do no more, since a vertex that the second drops is
+beside the same kept segment as its neighbours: so to at most the tolerance, unless a limit on the
+count of vertices widens it. Where the robot jumped, nothing is drawn.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -18,9 +19,8 @@ import numpy as np
 
 from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, are_places, measured_path
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
-from ros2_memory.analysis.motion.polyline import DrawnPath
 from ros2_memory.analysis.poses import headings, joined_poses
-from ros2_memory.core.geometry import refined
+from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.motion.polyline import Vertex
     from ros2_memory.analysis.poses import Floats, Poses, Vectors
     from ros2_memory.core.model import Vector3
     from ros2_memory.storage.base import IntArray
@@ -42,8 +41,6 @@ MAX_WAYPOINTS: Final = 50
 
 _MOST_VERTICES: Final = 400
 """Vertices of the path that is kept of a slice, but for the ends of jumps."""
-_FINER: Final = 6
-"""The metres driven up to a time are known to about ten times the tolerance over this."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
@@ -144,10 +141,40 @@ class Line:
         """Returns where the robot was at some log times (ns), as rows; there must be a vertex."""
         return np.stack([self._at(times, axis) for axis in self.places.T], axis=1)
 
+    def at(self, times: IntArray) -> Line:
+        """Returns where the robot was at some log times (ns); beside a jump at the nearer vertex.
+
+        There must be a vertex.
+        """
+        after = np.searchsorted(self.times, times, side="right").clip(max=len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        lasted = np.maximum(self.times[after] - self.times[before], 1)
+        share = ((times - self.times[before]) / lasted).clip(0.0, 1.0)
+        share = np.where(self.jumps[after], np.rint(share), share)
+        turn = np.remainder(self.headings[after] - self.headings[before] + np.pi, 2 * np.pi) - np.pi
+        return Line(
+            times,
+            self.metres_at(times),
+            self.places[before] + (self.places[after] - self.places[before]) * share[:, None],
+            self.headings[before] + turn * share,
+            np.zeros(len(times), np.bool_),
+        )
+
     def _at(self, times: IntArray, values: Floats) -> Floats:
         since = self.times[0]
         found: Floats = np.interp(times - since, self.times - since, values)
         return found
+
+
+def joined_lines(lines: Sequence[Line]) -> Line:
+    """Returns the vertices of some lines, one line after the other."""
+    return Line(
+        np.concatenate([line.times for line in lines]),
+        np.concatenate([line.metres for line in lines]),
+        np.concatenate([line.places for line in lines]),
+        np.concatenate([line.headings for line in lines]),
+        np.concatenate([line.jumps for line in lines]),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +230,12 @@ def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_
         totals, step_mps = measured.totals, measured.step_mps
         kept = np.arange(len(known))
         if len(known) > _FEW:
-            kept, error_m = _drawn(known, measured.parted, tolerance_m / 4)
+            parted = np.array(measured.parted, np.intp)
+            ends = np.unique(np.concatenate(([0, len(known) - 1], parted - 1, parted)))
+            seconds = (known.times - known.times[0]) / NS_PER_S
+            kept, error_m = simplified(
+                known.positions, seconds, ends, tolerance_m / 4, _MOST_VERTICES
+            )
         line = Line(
             known.times[kept],
             np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
@@ -229,25 +261,6 @@ def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_
 NO_LINE: Final = Line(
     np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty(0), np.empty(0, np.bool_)
 )
-
-
-def _drawn(poses: Poses, parted: Sequence[int], tolerance_m: float) -> tuple[IntArray, float]:
-    """Returns which poses draw the path, and how far (m) any other is from it.
-
-    By the first poses of some seconds, and by those that lie off the lines between these.
-    """
-    ends = np.unique([0, len(poses) - 1, *parted, *(nth - 1 for nth in parted)])
-    begins = np.flatnonzero(np.diff(poses.times // NS_PER_S)) + 1
-    some = np.union1d(ends, begins)
-    seconds = (poses.times - poses.times[0]) / NS_PER_S
-    coarse, _ = refined(
-        poses.positions[some],
-        seconds[some],
-        np.searchsorted(some, ends),
-        tolerance_m / _FINER,
-        _MOST_VERTICES,
-    )
-    return refined(poses.positions, seconds, some[coarse], tolerance_m, _MOST_VERTICES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -283,24 +296,18 @@ class Way:
         """Joins slices in order, of which there is one at least."""
         slices = [*_together(slices, fastest_mps)]
         motion = Motion(fastest_mps)
-        metres: list[Floats] = []
-        jumps: list[NDArray[np.bool_]] = []
-        for each in slices:
-            jumped = motion.join(each.totals)
+        lines: list[Line] = []
+        for some in slices:
+            jumped = motion.join(some.totals)
             # What joining adds to the slice's own length is driven up to its first vertex.
-            added = motion.totals.distance_m - each.totals.distance_m
-            metres.append(each.line.metres + added)
-            jumps.append(each.line.jumps.copy())
-            jumps[-1][:1] |= jumped
-        twists = [each.twist for each in slices if each.twist is not None]
-        line = Line(
-            np.concatenate([each.line.times for each in slices]),
-            # Where two places turn out to be one, joining takes some metres back.
-            np.maximum.accumulate(np.minimum(np.concatenate(metres), motion.totals.distance_m)),
-            np.concatenate([each.line.places for each in slices]),
-            np.concatenate([each.line.headings for each in slices]),
-            np.concatenate(jumps),
-        )
+            metres = some.line.metres + (motion.totals.distance_m - some.totals.distance_m)
+            jumps = some.line.jumps.copy()
+            jumps[:1] |= jumped
+            lines.append(replace(some.line, metres=metres, jumps=jumps))
+        line = joined_lines(lines)
+        # Where two places turn out to be one, joining takes some metres back.
+        metres = np.maximum.accumulate(np.minimum(line.metres, motion.totals.distance_m))
+        twists = [some.twist for some in slices if some.twist is not None]
         return cls(
             slices[0].first,
             slices[-1].last,
@@ -308,7 +315,7 @@ class Way:
             sum(each.invalid for each in slices),
             motion.totals,
             tuple(dict.fromkeys(frame for each in slices for frame in each.frames)),
-            line,
+            replace(line, metres=metres),
             max(each.error_m for each in slices),
             max(twists, default=None),
             max(each.step_mps for each in slices),
@@ -328,7 +335,10 @@ class Way:
         stated = self.twist if self.twist or not distance_m else None
         step_mps = self.step_mps if self.poses <= SPEED_STEPS else 0.0
         measured = self.totals.speed_mps or step_mps
-        waypoints, error_m = self._drawn(max_waypoints, tolerance_m) if max_waypoints else ((), 0.0)
+        waypoints: tuple[Waypoint, ...] = ()
+        error_m = 0.0
+        if max_waypoints and len(self.line):
+            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m, tolerance_m)
         return Trajectory(
             self.totals,
             avg_speed,
@@ -340,26 +350,36 @@ class Way:
             self.invalid,
         )
 
-    def _drawn(self, max_waypoints: int, tolerance_m: float) -> tuple[tuple[Waypoint, ...], float]:
-        path = DrawnPath(tolerance_m)
-        for vertex, jump in zip(vertices_of(self.line), self.line.jumps.tolist(), strict=True):
-            if jump:
-                path.part()
-            path.extend([vertex], self.error_m)
-        drawn = path.drawn(max(max_waypoints, 2))
-        waypoints = tuple(
-            Waypoint(time, position, turn, jump=place == 0 and number > 0)
-            for number, piece in enumerate(drawn.pieces)
-            for place, (time, position, turn) in enumerate(piece)
-        )
-        return waypoints, drawn.error_m
 
+def drawn(
+    line: Line, at_most: int, error_m: float = 0.0, tolerance_m: float = TOLERANCE_M
+) -> tuple[tuple[Waypoint, ...], float]:
+    """Draws a line with so many waypoints at most, 2 or more; then the longest jumps alone part it.
 
-def vertices_of(line: Line) -> Iterator[Vertex]:
-    """Yields the vertices of a line with their headings (rad)."""
-    columns = line.times.tolist(), line.places.tolist(), line.headings.tolist()
-    for time, (x, y, z), heading in zip(*columns, strict=True):
-        yield time, (x, y, z), None if math.isnan(heading) else heading
+    Args:
+        line: of one vertex at least.
+        at_most: see above.
+        error_m: how far poses may be off the line.
+        tolerance_m: how far they may be off what is drawn, where so many waypoints are enough.
+
+    Returns:
+        The waypoints, and how far (m) poses may be off these.
+    """
+    jumps = np.flatnonzero(line.jumps[1:]) + 1
+    far_m = np.linalg.norm(line.places[jumps] - line.places[jumps - 1], axis=1)
+    parted = np.sort(jumps[np.argsort(-far_m, kind="stable")[: at_most // 2 - 1]])
+    ends = np.unique(np.concatenate(([0, len(line) - 1], parted - 1, parted)))
+    seconds = (line.times - line.times[0]) / NS_PER_S
+    left_m = max(tolerance_m - error_m, tolerance_m / 4)
+    kept, off_m = simplified(line.places, seconds, ends, left_m, at_most)
+    chosen = line.rows(kept)
+    parts = (chosen.jumps & np.isin(kept, [0, *parted])).tolist()
+    columns = chosen.times.tolist(), chosen.places.tolist(), chosen.headings.tolist(), parts
+    waypoints = tuple(
+        Waypoint(time, (x, y, z), None if math.isnan(heading) else heading, jump=jump)
+        for time, (x, y, z), heading, jump in zip(*columns, strict=True)
+    )
+    return waypoints, error_m + off_m
 
 
 def _together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.odometry import TimedPosition, link
 from ros2_memory.analysis.motion.trajectory import Trajectory
-from ros2_memory.core.geometry import simplify_to
+from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
@@ -537,11 +537,11 @@ def test_of_very_many_turns_as_many_as_may_be_are_drawn() -> None:
 def test_no_way_back_is_dropped_that_is_longer_than_twice_the_stated_limit(
     xs: list[float], at_most: int
 ) -> None:
-    times = [float(nth) for nth in range(len(xs))]
-    path = [(x, 0.0, 0.0) for x in xs]
-    kept, error_m = simplify_to(path, 0.05, at_most, times)
+    path = np.array([(x, 0.0, 0.0) for x in xs])
+    clock, ends = np.arange(len(xs), dtype=np.float64), np.array([0, len(xs) - 1])
+    kept, error_m = simplified(path, clock, ends, 0.05, at_most)
     assert len(kept) <= at_most
-    for begin, end in pairwise(kept):
+    for begin, end in pairwise(kept.tolist()):
         rising = 1.0 if xs[end] >= xs[begin] else -1.0
         reach = -math.inf
         for x in xs[begin : end + 1]:
