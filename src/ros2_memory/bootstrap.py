@@ -426,7 +426,7 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
-    scanner = Scanner(columns, bag_dir)
+    scanner = Scanner(columns, bag_dir, _hash_of(digest_config(settings, schemas).text(schemas)))
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, recall, scanner)
 

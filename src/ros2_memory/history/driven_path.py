@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, SLICE_NS, Way, path_slice
+from ros2_memory.columns.motion import PATHS
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -117,7 +118,7 @@ def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
     """
     fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
-    found, since = _slices_in(view, topic, window, fastest, failures)
+    found, since = _slices_in(view, topic, window, failures)
     if failures and not found:
         raise with_notes(view, window, undecodable(failures[0])) from failures[0]
     if failures:
@@ -131,12 +132,10 @@ def _slices_in(
     view: View,
     topic: str,
     window: TimeWindow,
-    fastest_mps: float,
     failures: list[UndecodableError],
 ) -> tuple[list[PathSlice], Ns | None]:
     """Returns the path in slices, in order, and since when, where the time was over before."""
     reading = view.call.partial_after(READING_S)
-    known = None if view.memory.columns is None else view.memory.columns.paths
     found: list[PathSlice] = []
     since = MAX_NS
 
@@ -144,13 +143,10 @@ def _slices_in(
         if reading.expired() and found:
             raise QueryTimeoutError("the rest is left out")
 
-    def make(some: PoseSlice) -> PathSlice:
-        return path_slice(some.poses, fastest_mps)
-
     try:
-        for some in slices_back(blocks_back(view, topic, window, failures, reached), SLICE_NS):
-            made = some.remembered(known, make, fastest_mps)
-            since = some.start
+        blocks = blocks_back(view, topic, window, failures, reached)
+        for start, made in slices_of_path(view, blocks):
+            since = start
             if made.poses or made.invalid:
                 found.append(made)
     except GoneError:
@@ -160,6 +156,22 @@ def _slices_in(
             raise
         return found[::-1], since
     return found[::-1], None
+
+
+def slices_of_path(view: View, blocks: Iterable[PoseRows]) -> Iterator[tuple[Ns, PathSlice]]:
+    """Yields the path of some poses in slices, the newest first, with the time where each begins.
+
+    Raises:
+        InvalidArgumentsError: a message carries no position.
+    """
+    fastest = view.memory.limits.max_plausible_speed_mps
+    known = None if view.memory.columns is None else view.memory.columns.fragments(PATHS)
+
+    def make(some: PoseSlice) -> PathSlice:
+        return path_slice(some.poses, fastest)
+
+    for some in slices_back(blocks, SLICE_NS):
+        yield some.start, some.remembered(known, make, str(fastest))
 
 
 def blocks_back(

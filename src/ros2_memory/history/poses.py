@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses, joined_poses
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.stored import StoredTable
@@ -22,6 +23,7 @@ from ros2_memory.history.scan import decoded_rows, messages_of, scan
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 
+    from ros2_memory.columns.fragments import Fragments, Sized
     from ros2_memory.core.model import BagFile, Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
@@ -31,25 +33,7 @@ _MOST_SLICES: Final = 64
 """Of more between its ends, a block may have most slices without a pose."""
 
 
-class Sized(Protocol):
-    """What is remembered."""
-
-    @property
-    def memory_bytes(self) -> int:
-        """About how much memory it takes."""
-
-
-T = TypeVar("T", bound=Sized)
-
-
-class Known(Protocol[T]):
-    """A bounded cache of them."""
-
-    def get(self, key: Hashable) -> T | None:
-        """Returns what is remembered under a key; None where it is not."""
-
-    def put(self, key: Hashable, value: T, size: int) -> None:
-        """Remembers a value, which takes about so many bytes."""
+T = TypeVar("T", bound="Sized")
 
 
 class PoseRows:
@@ -105,19 +89,22 @@ def pose_rows(
     failures: list[UndecodableError],
     *,
     newest_first: bool = False,
+    stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 
     Positions are rounded to 0.1 mm, as the store has them. Why messages cannot be decoded is added
-    to `failures` as poses are read. `reached` is as for `scan`.
+    to `failures` as poses are read. `stored` and `reached` are as for `scan`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     reader = _Reader(view, failures)
     together: list[Rows] = []
-    for rows in scan(view, topic, window, newest_first=newest_first, reached=reached):
+    for rows in scan(
+        view, topic, window, newest_first=newest_first, stored=stored, reached=reached
+    ):
         is_apart = together and (
             rows.last < min(each.first for each in together)
             if newest_first
@@ -151,23 +138,25 @@ class PoseSlice:
         return joined_poses([block.poses.between(start, stop) for block in self._blocks])
 
     def remembered(
-        self, known: Known[T] | None, make: Callable[[PoseSlice], T], settings: Hashable = None
+        self, known: Fragments[T] | None, make: Callable[[PoseSlice], T], settings: str = ""
     ) -> T:
         """Returns what is made of it, and remembers that where it follows from whole parts alone.
 
         Raises:
             InvalidArgumentsError: messages carry no position.
         """
-        parts = [block.parts for block in self._blocks]
-        if known is None or None in parts:
-            return make(self)
-        key = (self.start, settings, *parts)
-        found = known.get(key)
+        parts: list[int] = []
+        for block in self._blocks:
+            if known is None or block.parts is None:
+                return make(self)
+            parts += block.parts
+        key = FragmentKey(self.start, settings, tuple(parts))
+        found = None if known is None else known.get(key)
         if found is None:
             before = [block.trouble() for block in self._blocks]
             found = make(self)
-            if before == [block.trouble() for block in self._blocks]:
-                known.put(key, found, found.memory_bytes)
+            if known is not None and before == [block.trouble() for block in self._blocks]:
+                known.put(key, found)
         return found
 
 

@@ -36,6 +36,7 @@ def scan(
     may_match: Callable[[PartZones], bool | Mask] | None = None,
     may_be_empty: bool = False,
     within: Sequence[tuple[Ns, Ns]] | None = None,
+    stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `columns.scan.Scan.rows`.
@@ -44,7 +45,8 @@ def scan(
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. `may_match`, `may_be_empty` and `within` are as in
+    may hold copies, where the caller knows them. With `stored` bags that are not stored have no
+    rows. `may_match`, `may_be_empty` and `within` are as in
     `Asked`.
 
     Raises:
@@ -53,7 +55,7 @@ def scan(
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed, columns=columns)
+        return () if stored else view.bags.tables(bag, topic, hashed=hashed, columns=columns)
 
     def check(at: Ns) -> None:
         reached(at)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -19,6 +20,7 @@ from ros2_memory.analysis.motion.standstills import (
     standstills_of,
 )
 from ros2_memory.analysis.motion.trajectory import SLICE_NS
+from ros2_memory.columns.motion import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -28,19 +30,28 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.driven_path import blocks_back, driven_path, resolve_path_topic
-from ros2_memory.history.poses import slices_back
+from ros2_memory.history.driven_path import (
+    blocks_back,
+    driven_path,
+    resolve_path_topic,
+    slices_of_path,
+)
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.poses import pose_rows, slices_back
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 from ros2_memory.insights.silences import unrecorded_length
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Stands, Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
+    from ros2_memory.history.poses import PoseRows
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
@@ -147,11 +158,29 @@ def _standstills_in(
 
 def _stands_in(view: View, topic: str, window: TimeWindow) -> list[Stands]:
     """Returns what shows where the robot stood in slices of a window, the newest first."""
+    return _stands(view, blocks_back(view, topic, window, []))
+
+
+def _stands(view: View, blocks: Iterable[PoseRows]) -> list[Stands]:
     scanner = view.memory.columns
     return [
         some.remembered(
-            None if scanner is None else scanner.stands,
+            None if scanner is None else scanner.fragments(STANDS),
             lambda part: stands_of(part.poses, part.start, part.stop),
         )
-        for some in slices_back(blocks_back(view, topic, window, []), SLICE_NS, BESIDE_NS)
+        for some in slices_back(blocks, SLICE_NS, BESIDE_NS)
     ]
+
+
+def make_fragments(view: View, window: TimeWindow) -> None:
+    """Makes what the columns of a window say of the robot's path, and of where it stood.
+
+    What is not in parts yet is left out.
+    """
+    with suppress(InvalidArgumentsError, NoDataError):
+        topic = resolve_pose_topic(view)
+        rows = pose_rows(view, topic, window.widened(SLICE_NS), [], newest_first=True, stored=True)
+        blocks = [block for block in rows if block.parts is not None]
+        for _ in slices_of_path(view, blocks):
+            pass
+        _stands(view, blocks)

@@ -30,6 +30,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
+from ros2_memory.insights.drive import make_fragments
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import MapDigests
 from ros2_memory.queries import list_recorded_topics
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.map_digest import Statics
     from ros2_memory.columns.fill import Filling
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.history.context import Memory
     from ros2_memory.index.timeline import Timeline
 
@@ -190,8 +191,22 @@ class Backfill:
         """Makes parts of what is stored and over, and keeps the store within what it may take."""
         snapshot = self._memory.index.snapshot()
         if self.filling is not None and snapshot.problem is None:
-            self.filling.merge(snapshot.timeline)
+            merged = self.filling.merge(snapshot.timeline)
             self.filling.trim()
+            self._make_fragments(merged)
+
+    def _make_fragments(self, windows: Sequence[TimeWindow]) -> None:
+        """Makes and stores what follows from the parts of some times."""
+        scanner = self._memory.columns
+        if scanner is None or not windows:
+            return
+        view = View(self._memory, Call())
+        for window in windows:
+            try:
+                make_fragments(view, window)
+            except EpisodicError as error:
+                log.warning("fragments_not_made", reason=str(error))
+            scanner.write_fragments()
 
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""
