@@ -426,7 +426,7 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
-    scanner = Scanner(columns, bag_dir)
+    scanner = Scanner(columns, bag_dir, _hash_of(digest_config(settings, schemas).text(schemas)))
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, recall, scanner)
 
@@ -518,7 +518,6 @@ def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) 
         settings.reader.max_chunk_mb,
         _definitions_of(settings),
         settings.data.max_array_length,
-        settings.data.max_plausible_speed_mps,
         settings.data.pose_topic,
         settings.data.map_frame,
         settings.data.tf_topics,
@@ -565,7 +564,6 @@ def build_digester(memory: Memory) -> Digester:
     return Digester(
         memory.reader,
         memory.extractor,
-        limits.max_plausible_speed_mps,
         map_settings(limits),
         partial(DetectorSights, memory.reader, memory.extractor),
     )

@@ -105,11 +105,9 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     """The memory with a catalogue and a store of the first `part` of the closed bags."""
     catalogue = Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test"))
     recall = DigestCache(catalogue, bag_dir)
-    limit = memory.limits.max_plausible_speed_mps
     digester = Digester(
         memory.reader,
         memory.extractor,
-        limit,
         map_settings(memory.limits),
         partial(DetectorSights, memory.reader, memory.extractor),
     )

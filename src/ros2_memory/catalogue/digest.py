@@ -50,7 +50,6 @@ class Digester:
     Args:
         reader: gives the messages that count.
         extractor: gives the values that conditions are tested on.
-        max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         map_settings: which topics place the robot.
         sights: returns what collects the sights of a bag; None where they are not wanted.
     """
@@ -59,7 +58,6 @@ class Digester:
         self,
         reader: BagReader,
         extractor: SchemaExtractor,
-        max_plausible_speed_mps: float,
         map_settings: MapSettings = _DEFAULT_MAP,
         sights: Callable[[], SightsSource] | None = None,
     ) -> None:
@@ -68,7 +66,6 @@ class Digester:
         self._sights = sights
         self._extractor = extractor
         self._templates = Templates(reader, extractor)
-        self._max_plausible_speed_mps = max_plausible_speed_mps
 
     def digest(self, path: Path, statics: Statics = NO_STATICS) -> Digest:
         """Reads a bag and returns its digest, given the static transforms in force.
@@ -92,7 +89,6 @@ class Digester:
                 self._reader,
                 self._extractor,
                 self._templates,
-                self._max_plausible_speed_mps,
                 latched=is_latched,
                 in_map=in_map,
             )

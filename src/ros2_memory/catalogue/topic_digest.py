@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample
-from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.standstills import StandstillCollector
-from ros2_memory.analysis.motion.trajectory import PoseCollector
+from ros2_memory.analysis.bulk_decode import BulkDecoder
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
     from ros2_memory.catalogue.map_digest import MapCollector
     from ros2_memory.core.model import Pose, StampedTransform
@@ -54,8 +48,6 @@ class TopicDigest:
 
     Attributes:
         topic: its name.
-        poses: the digest of its poses; None where some message carries none.
-        standstills: among its poses; None where `poses` is None or has no valid one.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
         relatched: whether one of its messages may repeat a message of another recording.
@@ -63,8 +55,6 @@ class TopicDigest:
     """
 
     topic: str
-    poses: PoseDigest | None
-    standstills: StandstillDigest | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
     undecodable: tuple[tuple[str, str], ...] = ()
@@ -80,7 +70,6 @@ class _Sample(NamedTuple):
     """
 
     pose: Pose | None
-    speed_mps: float | None
     detections: tuple[Detection, ...] | None = None
     pairs: frozenset[tuple[str, str]] | None = frozenset()
 
@@ -93,7 +82,6 @@ class TopicCollector:
         reader: decodes the messages.
         extractor: gives the values that conditions are tested on.
         templates: of the same reader and extractor.
-        max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         latched: whether its messages are stored whole where they are few.
         in_map: takes the robot's poses, moving transforms and sights of all topics of the bag.
     """
@@ -104,7 +92,6 @@ class TopicCollector:
         reader: BagReader,
         extractor: SchemaExtractor,
         templates: Templates,
-        max_plausible_speed_mps: float,
         *,
         latched: bool,
         in_map: MapCollector | None = None,
@@ -119,8 +106,6 @@ class TopicCollector:
         self._templates = templates
         self._latched = latched
         self._relatched = False
-        self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
-        self._standstills = StandstillCollector()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
@@ -148,8 +133,6 @@ class TopicCollector:
         few = self._kept is not None and (self._latched or bool(self._pairs))
         return TopicDigest(
             topic=self._topic,
-            poses=None if self._poses is None else self._poses.digest(),
-            standstills=None if self._poses is None else self._standstills.digest(),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
             undecodable=tuple(undecodable.items()),
@@ -189,19 +172,10 @@ class TopicCollector:
         self._add_sights(batch, samples)
         for record, sample in zip(batch, samples, strict=True):
             if isinstance(sample, UndecodableError):
-                self._pairs = self._poses = None
+                self._pairs = None
                 continue
-            time = record.log_time
-            pose = sample.pose
-            if pose is None:
-                self._poses = None
-                continue
-            if map_poses is not None:
-                map_poses.add_pose(time, pose)
-            if self._poses is not None:
-                self._poses.add(time, pose, sample.speed_mps)
-                if is_place(pose.position):
-                    self._standstills.add(time, pose.position, pose.orientation)
+            if map_poses is not None and sample.pose is not None:
+                map_poses.add_pose(record.log_time, sample.pose)
 
     def _add_sights(
         self, batch: Sequence[Record], samples: Sequence[_Sample | UndecodableError]
@@ -230,11 +204,10 @@ class TopicCollector:
         pairs = None
         if self._pairs is not None or self._map_transforms:
             pairs = self._add_transforms(self._transforms(message, record))
-        motion = motion_sample(self._extractor, message, type_name)
         seen = None
         if self._wants_sights(type_name):
             seen = detections_of(self._extractor.exact(message, type_name))
-        return _Sample(*motion, seen, pairs)
+        return _Sample(self._extractor.pose(message, type_name), seen, pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
         """Takes the valid transforms of a message, and returns their frames."""
@@ -259,6 +232,4 @@ class TopicCollector:
     ) -> Iterable[_Sample]:
         if self._map is not None and self._map_transforms:
             self._map.add_rows(template, records, rows)
-        if template.position is None and template.velocity is None:
-            return repeat(_Sample(None, None), len(rows))
-        return map(_Sample, template.poses(rows), template.speeds(rows))
+        return map(_Sample, template.poses(rows))

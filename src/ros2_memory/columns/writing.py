@@ -319,6 +319,11 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
             {"topic": topic, "parts": parts},
         )
     numbers = [(part,) for part, _ in gone]
+    connection.executemany(
+        "DELETE FROM fragment WHERE id IN (SELECT fragment FROM fragment_part WHERE part = ?)",
+        numbers,
+    )
+    connection.execute("DELETE FROM fragment_part WHERE fragment NOT IN (SELECT id FROM fragment)")
     connection.executemany("DELETE FROM part_column WHERE part = ?", numbers)
     connection.executemany("DELETE FROM part WHERE id = ?", numbers)
     connection.execute("INSERT INTO deletion DEFAULT VALUES")

@@ -66,7 +66,7 @@ def backfill_of(bag_dir: Path, catalogue: str, reader: BagDirReader | None = Non
     path = bag_dir / FOLDER / catalogue / FILE
     memory = replace(memory, recall=DigestCache(Catalogue([path], DigestConfig("test")), bag_dir))
     sights = partial(DetectorSights, memory.reader, memory.extractor)
-    digester = Digester(memory.reader, memory.extractor, 10.0, map_settings(memory.limits), sights)
+    digester = Digester(memory.reader, memory.extractor, map_settings(memory.limits), sights)
     return Backfill(memory, digester, bag_dir)
 
 
