@@ -39,7 +39,7 @@ from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -407,7 +407,7 @@ def build_memory(
         sources=() if settings.data.recording else (bag_dir / FOLDER / FILE,),
         waits_for=bag_dir,
     )
-    columns = build_columns(settings, reader)
+    columns = build_columns(settings, reader, shared.extractor.types_that_place())
 
     def known_files() -> dict[str, BagFile]:
         stored = {} if columns is None else columns.known_files(bag_dir)
@@ -426,7 +426,7 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
     )
     recall = DigestCache(catalogue, bag_dir)
-    scanner = Scanner(columns, bag_dir)
+    scanner = Scanner(columns, bag_dir, _hash_of(digest_config(settings, schemas).text(schemas)))
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, recall, scanner)
 
@@ -455,10 +455,13 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     return (*beside, cache / PACKAGE / name / file) if cache.is_absolute() else beside
 
 
-def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
+def build_columns(
+    settings: Settings, reader: BagReader, first: Collection[str] = ()
+) -> ColumnStore | None:
     """Returns the store of columns; None where the configuration wants none.
 
-    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes.
+    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes. `first`
+    is as in `ColumnStore`.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
@@ -470,6 +473,7 @@ def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
         partial(column_paths, settings),
         reader.definition,
         definitions=_hash_of(_definitions_of(settings)),
+        first=first,
         # What a recorder's server stored serves who only looks, too.
         sources=(bag_dir / OWN_FOLDER / FILE,),
         waits_for=bag_dir,
@@ -514,7 +518,6 @@ def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) 
         settings.reader.max_chunk_mb,
         _definitions_of(settings),
         settings.data.max_array_length,
-        settings.data.max_plausible_speed_mps,
         settings.data.pose_topic,
         settings.data.map_frame,
         settings.data.tf_topics,
@@ -555,8 +558,7 @@ def build_digester(memory: Memory) -> Digester:
     """Returns what digests the bags of a memory."""
     from ros2_memory.catalogue.digest import Digester
 
-    limits = memory.limits
-    return Digester(memory.reader, memory.extractor, limits.max_plausible_speed_mps)
+    return Digester(memory.reader, memory.extractor)
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:

@@ -289,7 +289,7 @@ async def test_bags_that_cannot_be_digested_have_the_helper_started_no_second_ti
 ) -> None:
     write_bags(tmp_path, BACKLOG + 1)
     memory, _ = served(tmp_path)
-    filler = Counted(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
+    filler = Counted(memory, Refusing(memory.reader, memory.extractor), tmp_path)
     started = tmp_path / "started"
     helper = ["sh", "-c", f"echo once >> {started}"]
     async with anyio.create_task_group() as tasks:
@@ -313,7 +313,7 @@ def test_a_bag_that_could_not_be_digested_is_tried_again_later(tmp_path: Path) -
     memory, _ = served(tmp_path)
     clock = SettableClock(NOW.now())
     memory = replace(memory, clock=clock)
-    refusing = Backfill(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
+    refusing = Backfill(memory, Refusing(memory.reader, memory.extractor), tmp_path)
     fill_up(refusing)
     assert refusing.progress() == Progress(2, 0, 2)
     clock.at += RETRY_NS
@@ -346,12 +346,12 @@ def test_entries_that_another_program_makes_anew_are_not_taken_for_the_lost_ones
     assert told(memory) == right
     assert memory.recall is not None
     with closing(sqlite3.connect(path)) as base:
-        base.execute("UPDATE held SET poses = x'00' WHERE poses IS NOT NULL")
+        base.execute("UPDATE edges SET pairs = '[' || pairs")
         base.commit()
-    # It is noticed by the next question about the way driven, which has other bounds.
+    # It is noticed by the next question about frames.
     [run] = memory.index.snapshot().timeline.segments
     notes = memory.recall.digests_for(run, memory.recall.catalogue.newest())
-    notes.catalogue.poses("/odom", [*notes.numbers.values()])
+    notes.catalogue.edges("/odom", [*notes.numbers.values()])
     _, other = served(tmp_path)
     fill_up(other)
     assert told(memory) == right

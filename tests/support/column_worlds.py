@@ -24,6 +24,7 @@ from tests.support.leaves import Comparison
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
@@ -54,11 +55,12 @@ class World:
         file: Path | None = None,
         clock: Clock | None = None,
         definitions: str = "",
+        first: Collection[str] = (),
     ) -> World:
         reader = BagDirReader(Rosbag2Reader(), bag_dir)
         memory = memory_of(bag_dir, clock=clock, reader=reader)
         paths = [file or store_file(bag_dir)]
-        store = ColumnStore(paths, reader.definition, definitions=definitions)
+        store = ColumnStore(paths, reader.definition, definitions=definitions, first=first)
         memory = replace(memory, columns=Scanner(store, bag_dir))
         assert memory.columns is not None
         filling = Filling(memory.columns, reader, bag_dir, memory.clock, limits or StoreLimits())

@@ -45,19 +45,16 @@ class Digester:
     Args:
         reader: gives the messages that count.
         extractor: gives the values that conditions are tested on.
-        max_plausible_speed_mps: the speed above which a step of the robot is a jump.
     """
 
     def __init__(
         self,
         reader: BagReader,
         extractor: SchemaExtractor,
-        max_plausible_speed_mps: float,
     ) -> None:
         self._reader = reader
         self._extractor = extractor
         self._templates = Templates(reader, extractor)
-        self._max_plausible_speed_mps = max_plausible_speed_mps
 
     def digest(self, path: Path) -> Digest:
         """Reads a bag and returns its digest.
@@ -76,7 +73,6 @@ class Digester:
                 self._reader,
                 self._extractor,
                 self._templates,
-                self._max_plausible_speed_mps,
                 latched=is_latched,
             )
             for topic, is_latched in latched.items()

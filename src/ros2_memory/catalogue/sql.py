@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.catalogue.codec import (
     encode_counts,
-    encode_poses,
-    encode_standstills,
 )
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed
 from ros2_memory.columns.database import ROW_ID_BITS, Tables
@@ -31,7 +29,6 @@ TABLES: Final = Tables(
     names=(
         "bags",
         "held",
-        "tales",
         "kept",
         "payloads",
         "channels",
@@ -48,8 +45,7 @@ CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
 CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
-  kept INTEGER, relatched INTEGER, undecodable TEXT, poses BLOB);
-CREATE TABLE tales (id INTEGER PRIMARY KEY, rests BLOB NOT NULL);
+  kept INTEGER, relatched INTEGER, undecodable TEXT);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
@@ -64,8 +60,7 @@ CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, ans
 CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
 """,
 )
-"""In `held` and `tales` the high bits of an id (see `ROW_ID_BITS`) are the topic's: its rows lie
-together."""
+"""In `held` the high bits of an id (see `ROW_ID_BITS`) are the topic's: its rows lie together."""
 
 NO_TOPIC: Final = 0
 """The topic of models that belong to no topic."""
@@ -74,16 +69,12 @@ _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 OF_CONFIGS: Final = f"config {_AMONG}"
 
 # Columns for `topic_rows`. Those of one word are packed, and the word is the kind of their model.
-POSES: Final = "poses"
-STANDSTILLS: Final = "rests"
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
 PACKED_IN: Final = {
-    POSES: "held",
-    STANDSTILLS: "tales",
     COUNTS: "bags",
 }
 """The table in whose column of that name what is packed of a kind lies; answers lie elsewhere."""
@@ -113,11 +104,10 @@ def topic_rows(
     connection: sqlite3.Connection, columns: str, topic: str, row_ids: Sequence[int]
 ) -> list[sqlite3.Row]:
     """Returns the row id and these columns of what entries hold of a topic."""
-    table = "tales" if columns == STANDSTILLS else "held"
     number = topic_number(connection, topic)
     base = number << ROW_ID_BITS
     return connection.execute(
-        f"SELECT id - ?, {columns} FROM {table} WHERE id IN (SELECT value + ? FROM json_each(?))",
+        f"SELECT id - ?, {columns} FROM held WHERE id IN (SELECT value + ? FROM json_each(?))",
         (base, base, json.dumps(row_ids)),
     ).fetchall()
 
@@ -183,11 +173,10 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
     listed = json.dumps(row_ids)
     # Topic by topic: the primary keys begin with the topic.
     for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
-        for table in ("held", "tales"):
-            connection.execute(
-                f"DELETE FROM {table} WHERE id IN (SELECT value + ? FROM json_each(?))",
-                (topic << ROW_ID_BITS, listed),
-            )
+        connection.execute(
+            "DELETE FROM held WHERE id IN (SELECT value + ? FROM json_each(?))",
+            (topic << ROW_ID_BITS, listed),
+        )
         connection.execute(f"DELETE FROM kept WHERE topic = ? AND bag {_AMONG}", (topic, listed))
     connection.execute(f"DELETE FROM bags WHERE id {_AMONG}", (listed,))
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
@@ -207,10 +196,7 @@ def renew_entry(connection: sqlite3.Connection, row_id: int, sidecar: int) -> No
     new = cursor.lastrowid
     for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
         base = topic << ROW_ID_BITS
-        for table in ("held", "tales"):
-            connection.execute(
-                f"UPDATE {table} SET id = ? + ? WHERE id = ? + ?", (base, new, base, row_id)
-            )
+        connection.execute("UPDATE held SET id = ? + ? WHERE id = ? + ?", (base, new, base, row_id))
         connection.execute(
             "UPDATE kept SET bag = ? WHERE topic = ? AND bag = ?", (new, topic, row_id)
         )
@@ -233,17 +219,16 @@ def insert_entry(
     for topic in digest.topics:
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
-        _insert_standstills(connection, (number, bag), topic)
         for nth, record in enumerate(topic.kept or ()):
             _insert_record(connection, (bag, number, nth), record)
 
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:
     number, bag = key
-    edges, poses = topic.edges, topic.poses
+    edges = topic.edges
     pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 8)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 7)})",
         (
             number << ROW_ID_BITS | bag,
             pairs,
@@ -252,21 +237,7 @@ def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: T
             topic.kept is not None,
             topic.relatched,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
-            poses and packed_by_model(connection, number, POSES, encode_poses(poses)),
         ),
-    )
-
-
-def _insert_standstills(
-    connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest
-) -> None:
-    number, bag = key
-    if topic.standstills is None:
-        return
-    plain = encode_standstills(topic.standstills)
-    connection.execute(
-        "INSERT INTO tales VALUES (?, ?)",
-        (number << ROW_ID_BITS | bag, packed_by_model(connection, number, STANDSTILLS, plain)),
     )
 
 

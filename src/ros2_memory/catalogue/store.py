@@ -12,13 +12,10 @@ from __future__ import annotations
 import json
 import os
 import time
-from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.catalogue.codec import (
     decode_counts,
-    decode_poses,
-    decode_standstills,
 )
 from ros2_memory.catalogue.digest_config import may_be_one
 from ros2_memory.catalogue.packing import unpacked
@@ -27,9 +24,7 @@ from ros2_memory.catalogue.sql import (
     EDGES,
     NO_TOPIC,
     OF_CONFIGS,
-    POSES,
     RELATCHED,
-    STANDSTILLS,
     TABLES,
     UNDECODABLE,
     any_is_gone,
@@ -42,7 +37,6 @@ from ros2_memory.catalogue.sql import (
     packed_by_model,
     payloads_of,
     renew_entry,
-    topic_number,
     topic_rows,
 )
 from ros2_memory.catalogue.topic_digest import EdgeDigest
@@ -59,8 +53,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.digest_config import DigestConfig
@@ -69,8 +61,6 @@ if TYPE_CHECKING:
 FOLDER: Final = ".episodic"
 FILE: Final = "catalogue.sqlite"
 
-MOST_JOINED: Final = 200
-"""Bytes for each entry that what many entries add up to may take."""
 _BATCH: Final = 4096
 """Rows that are held at a time while known files are made of them."""
 
@@ -194,14 +184,6 @@ class Catalogue(Database):
         del topic, numbers
         return {}
 
-    def poses(self, topic: str, numbers: Sequence[int]) -> dict[int, PoseDigest]:
-        """Returns the digests of the topic's poses; not where some message carries no pose."""
-        return self._packed_of_topic(topic, numbers, POSES, decode_poses)
-
-    def standstills(self, topic: str, numbers: Sequence[int]) -> dict[int, StandstillDigest]:
-        """Returns the standstills among the topic's poses; not where some message has no pose."""
-        return self._packed_of_topic(topic, numbers, STANDSTILLS, decode_standstills)
-
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic, which a lake holds: `NO_EVENTS`, or None.
 
@@ -244,27 +226,6 @@ class Catalogue(Database):
             offset = self.offset
             rows = topic_rows(connection, columns, topic, self.row_ids(numbers))
             return {offset + row[0]: decode(row) for row in rows if row[1] is not None}
-
-        return self.read(ask, {})
-
-    def _packed_of_topic(
-        self,
-        topic: str,
-        numbers: Sequence[int],
-        kind: str,
-        decode: Callable[[bytes], T],
-    ) -> dict[int, T]:
-        """Decodes what is packed of one topic, by entry, where there is some."""
-
-        def ask(connection: sqlite3.Connection) -> dict[int, T]:
-            offset = self.offset
-            model = model_of(connection, topic_number(connection, topic), kind)
-            rows = topic_rows(connection, kind, topic, self.row_ids(numbers))
-            return {
-                offset + number: decode(unpacked(stored, model))
-                for number, stored in rows
-                if stored is not None
-            }
 
         return self.read(ask, {})
 
@@ -364,50 +325,6 @@ class Catalogue(Database):
             )
 
         self.write(write)
-
-    def joined(self, name: str, entries: Sequence[Sequence[int]]) -> bytes | None:
-        """Returns what `store_joined` stored; empty if it was too large."""
-
-        def ask(connection: sqlite3.Connection) -> bytes | None:
-            key = self._key_of_joined(name, entries)
-            row = connection.execute(
-                "SELECT answer FROM remembered WHERE question = ?", (key,)
-            ).fetchone()
-            return None if row is None else unpacked(row[0], model_of(connection, NO_TOPIC, name))
-
-        return self.read(ask, None)
-
-    def store_joined(self, name: str, entries: Sequence[Sequence[int]], joined: bytes) -> bool:
-        """Stores a digest joined from many entries, until the oldest of the first is deleted.
-
-        Only that it is too much where it takes more than `MOST_JOINED` bytes for each of those.
-        Returns whether the database could be written.
-        """
-
-        def write(connection: sqlite3.Connection) -> None:
-            row_ids = self.row_ids(entries[0])
-            key = self._key_of_joined(name, entries)
-            used = [number for each in entries for number in self.row_ids(each)]
-            if row_ids and key is not None and not any_is_gone(connection, used):
-                stored = packed_by_model(connection, NO_TOPIC, name, joined)
-                if len(stored) > MOST_JOINED * len(row_ids):
-                    stored = b""
-                connection.execute(
-                    "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
-                    (key, min(row_ids), stored),
-                )
-
-        return self.write(write)
-
-    def _key_of_joined(self, name: str, entries: Sequence[Sequence[int]]) -> str | None:
-        """Returns the key of a digest joined from entries; None if one of them was deleted.
-
-        Entries come in lists, of which each has a meaning.
-        """
-        row_ids = [self.row_ids(each) for each in entries]
-        if [*map(len, row_ids)] != [*map(len, entries)]:
-            return None
-        return json.dumps([name, sha256(json.dumps(row_ids).encode()).hexdigest()])
 
     def put(self, key: BagKey, digest: Digest) -> bool:
         """Adds an entry in place of any other of that path; returns whether it was written."""

@@ -6,19 +6,14 @@ from dataclasses import dataclass
 from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample
-from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.standstills import StandstillCollector
-from ros2_memory.analysis.motion.trajectory import PoseCollector
+from ros2_memory.analysis.bulk_decode import BulkDecoder
 from ros2_memory.core.errors import UndecodableError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate, Templates
-    from ros2_memory.core.model import Pose, StampedTransform
+    from ros2_memory.core.model import StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record
@@ -51,8 +46,6 @@ class TopicDigest:
 
     Attributes:
         topic: its name.
-        poses: the digest of its poses; None where some message carries none.
-        standstills: among its poses; None where `poses` is None or has no valid one.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
         relatched: whether one of its messages may repeat a message of another recording.
@@ -60,8 +53,6 @@ class TopicDigest:
     """
 
     topic: str
-    poses: PoseDigest | None
-    standstills: StandstillDigest | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
     undecodable: tuple[tuple[str, str], ...] = ()
@@ -69,14 +60,12 @@ class TopicDigest:
 
 
 class _Sample(NamedTuple):
-    """What one message contributes to the digest besides its numbers and edges.
+    """What one message contributes to the digest.
 
     `pairs` are the frames of its valid transforms where it was decoded alone, None if not
     requested.
     """
 
-    pose: Pose | None
-    speed_mps: float | None
     pairs: frozenset[tuple[str, str]] | None = frozenset()
 
 
@@ -88,7 +77,6 @@ class TopicCollector:
         reader: decodes the messages.
         extractor: gives the values that conditions are tested on.
         templates: of the same reader and extractor.
-        max_plausible_speed_mps: the speed above which a step of the robot is a jump.
         latched: whether its messages are stored whole where they are few.
     """
 
@@ -98,7 +86,6 @@ class TopicCollector:
         reader: BagReader,
         extractor: SchemaExtractor,
         templates: Templates,
-        max_plausible_speed_mps: float,
         *,
         latched: bool,
     ) -> None:
@@ -108,8 +95,6 @@ class TopicCollector:
         self._templates = templates
         self._latched = latched
         self._relatched = False
-        self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
-        self._standstills = StandstillCollector()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
@@ -137,8 +122,6 @@ class TopicCollector:
         few = self._kept is not None and (self._latched or bool(self._pairs))
         return TopicDigest(
             topic=self._topic,
-            poses=None if self._poses is None else self._poses.digest(),
-            standstills=None if self._poses is None else self._standstills.digest(),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
             undecodable=tuple(undecodable.items()),
@@ -169,34 +152,20 @@ class TopicCollector:
         return self._extractor.transforms(message, record.log_time, static=False)
 
     def _decode_batch(self) -> None:
-        """Decodes the waiting messages, and takes their poses in order."""
+        """Decodes the waiting messages."""
         batch, self._batch, self._batch_bytes = self._batch, [], 0
         if batch:
             self._ends = (batch[0] if self._ends is None else self._ends[0], batch[-1])
-        samples = self._decoder.decode(batch)
-        for record, sample in zip(batch, samples, strict=True):
-            if isinstance(sample, UndecodableError):
-                self._pairs = self._poses = None
-                continue
-            time = record.log_time
-            pose = sample.pose
-            if pose is None:
-                self._poses = None
-                continue
-            if self._poses is not None:
-                self._poses.add(time, pose, sample.speed_mps)
-                if is_place(pose.position):
-                    self._standstills.add(time, pose.position, pose.orientation)
+        if any(isinstance(sample, UndecodableError) for sample in self._decoder.decode(batch)):
+            self._pairs = None
 
     def _decode(self, record: Record) -> _Sample:
         """Decodes one message; its edges count at once, since their order does not."""
-        type_name = record.channel.type
         message = self._reader.decode(record)
         pairs = None
         if self._pairs is not None:
             pairs = self._add_transforms(self._transforms(message, record))
-        motion = motion_sample(self._extractor, message, type_name)
-        return _Sample(*motion, pairs)
+        return _Sample(pairs)
 
     def _add_transforms(self, transforms: Sequence[StampedTransform]) -> frozenset[tuple[str, str]]:
         """Takes the valid transforms of a message, and returns their frames."""
@@ -213,8 +182,6 @@ class TopicCollector:
         return template if template is not None and template.pairs == sample.pairs else None
 
     def _apply(
-        self, template: PayloadTemplate, _: _Sample, __: Sequence[Record], rows: Bytes
+        self, _: PayloadTemplate, __: _Sample, ___: Sequence[Record], rows: Bytes
     ) -> Iterable[_Sample]:
-        if template.position is None and template.velocity is None:
-            return repeat(_Sample(None, None), len(rows))
-        return map(_Sample, template.poses(rows), template.speeds(rows))
+        return repeat(_Sample(), len(rows))

@@ -67,10 +67,14 @@ def joined_identities(parts: Sequence[Identities]) -> Identities:
 
 
 def copies_among(messages: Identities) -> NDArray[np.bool_]:
-    """Returns which of the messages repeat an earlier one of another recording."""
+    """Returns which of the messages repeat an earlier one of another recording.
+
+    Of several of one log time that of the recording with the lowest number counts.
+    """
     copies = np.zeros(messages.log_times.size, np.bool_)
     suspects = _shared_by_recordings(messages)
-    order = suspects[np.argsort(messages.log_times[suspects], kind="stable")]
+    some = messages.rows(suspects)
+    order = suspects[np.lexsort((some.recordings, some.log_times))]
     counts: dict[tuple[int, int], dict[int, int]] = {}
     recent: deque[tuple[Ns, tuple[int, int]]] = deque()
     some = messages.rows(order)

@@ -17,6 +17,7 @@ from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
@@ -88,6 +89,7 @@ class Filling:
         self._limits = limits
         self._refused: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
+        self._merged: list[tuple[Ns, Ns]] = []
 
     def waiting(self, timeline: Timeline) -> list[BagFile]:
         """Returns the bags to be stored, the newest first.
@@ -122,12 +124,15 @@ class Filling:
             log.debug("bag_stored", path=str(bag.path), duration_ms=round(spent, 3))
         return stored
 
-    def merge(self, timeline: Timeline) -> int:
-        """Makes parts of bags whose ten minutes are over and all stored; returns of how many."""
+    def merge(self, timeline: Timeline) -> list[TimeWindow]:
+        """Makes parts of bags whose ten minutes are over and all stored.
+
+        Returns:
+            The times in which there are parts since the last call, the newest first.
+        """
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
-            return 0
-        done = 0
+            return []
         waiting = {self._slot(bag) for bag in self.waiting(timeline)}
         slots: dict[tuple[str, Ns, bool], list[tuple[int, BagFile]]] = defaultdict(list)
         hashed = self.store.hashed()
@@ -139,8 +144,9 @@ class Filling:
             if self._is_over(begin, timeline):
                 budget = self._budget([bag for _, bag in bags])
                 if self.store.merge([number for number, _ in bags], budget):
-                    done += len(bags)
-        return done
+                    self._merged.append((begin, begin + PART_NS))
+        merged, self._merged = united(self._merged), []
+        return [TimeWindow(*span) for span in reversed(merged)]
 
     def prune(self, timeline: Timeline) -> None:
         """Deletes the bags whose files are gone; nothing where no bag is left.
@@ -186,8 +192,10 @@ class Filling:
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
         every = (self._whole(bag, tables) for tables in chain(begin, groups))
+        budget = self._budget([bag])
+        self._merged.append((bag.start, bag.end + 1))
         return self.store.put_long(
-            key, bag, every, hashed=hashed, budget=self._budget([bag]), is_current=is_current
+            key, bag, every, hashed=hashed, budget=budget, is_current=is_current
         )
 
     def _budget(self, bags: Sequence[BagFile]) -> int:

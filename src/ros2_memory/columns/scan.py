@@ -26,7 +26,6 @@ from ros2_memory.storage.base import RELATCHED_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.scanner import Scanner
@@ -370,10 +369,12 @@ class Scan:
 
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
-        numbers: dict[Path, int] = {}
+        # By their names: of messages of one time that counts which lies in the first recording.
+        recordings = sorted({unit.recording for unit in units}, key=str)
+        numbers = {recording: number for number, recording in enumerate(recordings)}
         parts: list[Identities] = []
         for unit, some in zip(units, rows, strict=True):
-            recording = numbers.setdefault(unit.recording, len(numbers))
+            recording = numbers[unit.recording]
             # Below 0, and another for each recording: what has no hash is no copy.
             published, hashes = unit.identities() or self._hashed_again(unit, -1 - recording)
             parts.append(

@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 import numpy as np
 
 from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.coverage import Covering
+from ros2_memory.columns.fragments import Fragments
 from ros2_memory.columns.pack import Packed, decompressed, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
 from ros2_memory.columns.table import Zone, column_bytes
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.robot_track import TrackPart
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
+    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
@@ -37,10 +39,14 @@ if TYPE_CHECKING:
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
 
+T = TypeVar("T", bound="Sized")
+
 _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
+_FRAGMENT_BYTES: Final = 24 << 20
+"""How much the fragments of a kind may take in memory, and as much again as they are stored."""
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
 
@@ -91,6 +97,7 @@ class Scanner:
     Args:
         store: the store; None where nothing is stored.
         bag_dir: the bag directory.
+        settings: what fragments depend on besides the bags, as a text.
 
     Attributes:
         events: by part, what happened in it; of parts of which all rows count.
@@ -102,7 +109,7 @@ class Scanner:
         things: by settings, what was estimated of all bags of a timeline.
     """
 
-    def __init__(self, store: ColumnStore | None, bag_dir: Path) -> None:
+    def __init__(self, store: ColumnStore | None, bag_dir: Path, settings: str = "") -> None:
         self.store = store
         self._covering = None if store is None else Covering(store, bag_dir)
         self._columns: ByteLru[Column] = ByteLru(48 << 20)
@@ -116,6 +123,19 @@ class Scanner:
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
         self.sights: ByteLru[bytes] = ByteLru(16 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
+        self._settings = settings
+        self._fragments: dict[str, object] = {}
+
+    def fragments(self, kind: Kind[T]) -> Fragments[T]:
+        """Returns the fragments of a kind."""
+        made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
+        # By name: each kind has one type.
+        return cast("Fragments[T]", self._fragments.setdefault(kind.name, made))
+
+    def write_fragments(self) -> None:
+        """Stores the fragments that were made since."""
+        for fragments in [*self._fragments.values()]:
+            cast("Fragments[Sized]", fragments).write()
 
     def coverage(self, timeline: Timeline) -> Coverage | None:
         """Returns which bags of a timeline are stored; None without a store."""

@@ -6,6 +6,7 @@ row (`split`). Then those of one recording become parts, one for each topic (`pa
 column (`part_column`). What is known of a column without unpacking it lies apart from the parts
 (`zone`), next to that of the same column in the other parts: a search reads it at once. A part has
 rows of several bags, and names them: rows of a bag that is not in `bag` any more do not count.
+What follows from parts, as the path of the poses in them, is stored with them (`fragment`).
 
 A bag is known by its path below the bag directory, its size and mtime, and the mtime of the sidecar
 that says which of its messages count. Its number is never used twice.
@@ -24,6 +25,7 @@ import numpy as np
 
 from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
 from ros2_memory.columns.parts import packed_part
@@ -32,6 +34,7 @@ from ros2_memory.columns.writing import (
     PART_NS,
     Layouts,
     LongBag,
+    Share,
     delete_bags,
     insert_bag,
     insert_parts,
@@ -47,7 +50,7 @@ from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
@@ -69,6 +72,8 @@ TABLES: Final = Tables(
         "part",
         "part_column",
         "zone",
+        "fragment",
+        "fragment_part",
         "deletion",
     ),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
@@ -95,6 +100,11 @@ CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB N
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
   codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
   nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
+CREATE TABLE fragment (id INTEGER PRIMARY KEY AUTOINCREMENT, kind TEXT NOT NULL,
+  settings TEXT NOT NULL, start_ns INTEGER NOT NULL, parts TEXT NOT NULL, data BLOB NOT NULL,
+  UNIQUE (kind, settings, start_ns, parts));
+CREATE TABLE fragment_part (part INTEGER NOT NULL, fragment INTEGER NOT NULL,
+  PRIMARY KEY (part, fragment)) WITHOUT ROWID;
 CREATE TABLE deletion (id INTEGER PRIMARY KEY AUTOINCREMENT);
 """,
 )
@@ -190,6 +200,8 @@ class ColumnStore(Database):
         definition_of: returns the definition of a channel, as `BagReader.definition`.
         definitions: tells the configured message definitions apart. Bags with messages that these
             could not decode are stored only for them.
+        first: types of messages whose columns are stored before those of other large topics: what
+            places the robot, without which hardly any question is answered fast.
     """
 
     def __init__(
@@ -198,12 +210,14 @@ class ColumnStore(Database):
         definition_of: DefinitionOf,
         *,
         definitions: str = "",
+        first: Collection[str] = (),
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
     ) -> None:
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
         self._definition_of = definition_of
         self._definitions = definitions
+        self._first = first
         self._topics: tuple[int, dict[int, Topic]] = (0, {})
         self._layouts = Layouts()
 
@@ -437,7 +451,57 @@ class ColumnStore(Database):
 
         return self.read(ask, None)
 
+    def fragments(
+        self, kind: str, settings: str, span: tuple[Ns, Ns], after: int = 0
+    ) -> list[tuple[int, FragmentKey, bytes]]:
+        """Returns the fragments of slices that begin in a span, with their numbers.
+
+        Args:
+            kind: of them.
+            settings: what they depend on.
+            span: half-open, log times (ns).
+            after: a number; those that were stored later are returned.
+        """
+
+        def ask(connection: sqlite3.Connection) -> list[tuple[int, FragmentKey, bytes]]:
+            rows = connection.execute(
+                "SELECT id, start_ns, parts, data FROM fragment WHERE kind = ? AND settings = ?"
+                " AND start_ns >= ? AND start_ns < ? AND id > ?",
+                (kind, settings, *span, after),
+            )
+            return [
+                (number, FragmentKey(start, settings, self._numbers(parts)), data)
+                for number, start, parts, data in rows
+            ]
+
+        return self.read(ask, [])
+
+    def _numbers(self, parts: str) -> tuple[int, ...]:
+        return tuple(self.offset + part for part in json.loads(parts))
+
     # Writing
+
+    def put_fragments(self, kind: str, made: Sequence[tuple[FragmentKey, bytes]]) -> bool:
+        """Stores fragments; not those of a part that is not stored any more, nor any again."""
+
+        def write(connection: sqlite3.Connection) -> None:
+            for key, data in made:
+                if not all(map(self.is_current, key.parts)):
+                    continue
+                parts = json.dumps([part - self.offset for part in key.parts])
+                cursor = connection.execute(
+                    "INSERT OR IGNORE INTO fragment (kind, settings, start_ns, parts, data)"
+                    " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
+                    " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))",
+                    (kind, key.settings, key.start, parts, data),
+                )
+                if cursor.rowcount > 0:
+                    connection.execute(
+                        "INSERT INTO fragment_part SELECT value, ? FROM json_each(?)",
+                        (cursor.lastrowid, parts),
+                    )
+
+        return self.write(write)
 
     def put(
         self,
@@ -497,7 +561,7 @@ class ColumnStore(Database):
             budget: how many bytes the parts may take, as for `merge`.
             is_current: as for `put`, asked with each group.
         """
-        long = LongBag(key, bag, self._definitions, is_current, budget)
+        long = LongBag(key, bag, self._definitions, is_current, Share(budget, self._first))
         if not (self.write(partial(long.begin, hashed=hashed)) and long.goes_on):
             return False
         is_whole = False
@@ -539,7 +603,7 @@ class ColumnStore(Database):
                 topic: [packed_part(topics[topic].layout, tables)]
                 for topic, tables in found.items()
             }
-            insert_parts(connection, within(connection, packed, budget))
+            insert_parts(connection, within(connection, packed, Share(budget, self._first)))
             connection.execute(
                 "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
                 (json.dumps(numbers),),

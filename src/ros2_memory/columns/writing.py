@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from ros2_memory.columns.parts import PackedPart
     from ros2_memory.columns.store import BagKey
@@ -26,7 +26,16 @@ if TYPE_CHECKING:
 PART_NS: Final[Ns] = 600 * NS_PER_S
 """Bags of one recording that begin in the same ten minutes become one part for each topic."""
 _MOST_INTEGER: Final = 2**63 - 1
+_WEIGHT_OF_FIRST: Final = 0.25
+"""What a byte of the topics that come first counts: before large ones, not before all the small."""
 _MOST_LAYOUTS: Final = 4_096
+
+
+class Share(NamedTuple):
+    """What parts may take: so many bytes, and topics of which types come first."""
+
+    size: int
+    first: Collection[str] = ()
 
 
 class LongBag:
@@ -40,7 +49,7 @@ class LongBag:
         bag: the bag.
         definitions: as `ColumnStore` has them.
         is_current: whether the bag may be stored.
-        budget: how many bytes its parts may take.
+        share: what its parts may take.
     """
 
     def __init__(
@@ -49,14 +58,14 @@ class LongBag:
         bag: BagFile,
         definitions: str,
         is_current: Callable[[], bool],
-        budget: int,
+        share: Share,
     ) -> None:
         self.goes_on = False
         self._key = key
         self._bag = bag
         self._definitions = definitions
         self._is_current = is_current
-        self._share = budget / max(_messages_of(bag), 1)
+        self._share = share
         self._lacks_definitions = False
         self._number = 0
         self._layouts = Layouts()
@@ -80,8 +89,9 @@ class LongBag:
             for rows in _in_parts(table) if len(table) else ():
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
-        budget = round(self._share * sum(len(table) for table in tables))
-        insert_parts(connection, within(connection, packed, budget))
+        part = sum(len(table) for table in tables) / max(_messages_of(self._bag), 1)
+        share = self._share._replace(size=round(self._share.size * part))
+        insert_parts(connection, within(connection, packed, share))
 
     def end(self, connection: sqlite3.Connection) -> None:
         """Gives the bag its key: now it is stored."""
@@ -105,16 +115,30 @@ class LongBag:
 
 
 def within(
-    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], budget: int
+    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], share: Share
 ) -> dict[int, list[PackedPart]]:
-    """Returns the parts of topics; of the largest that are beyond the budget (bytes) no data.
+    """Returns the parts of topics; of the largest that are beyond the share no data.
 
     Those that are the largest in all parts, so that not each topic has some parts without data.
+    Topics of the types that come first lose theirs after others that are as large.
     """
+    rows = connection.execute(
+        "SELECT topic.id FROM topic JOIN definition ON definition.id = topic.definition"
+        " WHERE type IN (SELECT value FROM json_each(?))",
+        (json.dumps([*share.first]),),
+    )
+    weights = {topic: _WEIGHT_OF_FIRST for (topic,) in rows}
     sizes = {topic: sum(part.size for part in parts[topic]) for topic in parts}
-    usual = dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
+    usual: dict[int, float] = dict(
+        connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic")
+    )
+    budget = share.size
     found: dict[int, list[PackedPart]] = {}
-    for topic in sorted(parts, key=lambda topic: sizes[topic] + usual.get(topic, 0)):
+
+    def rank(topic: int) -> float:
+        return weights.get(topic, 1.0) * (sizes[topic] + usual.get(topic, 0))
+
+    for topic in sorted(parts, key=rank):
         budget -= sizes[topic]
         kept = budget >= 0
         found[topic] = [part if kept else part.without_data() for part in parts[topic]]
@@ -295,6 +319,11 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
             {"topic": topic, "parts": parts},
         )
     numbers = [(part,) for part, _ in gone]
+    connection.executemany(
+        "DELETE FROM fragment WHERE id IN (SELECT fragment FROM fragment_part WHERE part = ?)",
+        numbers,
+    )
+    connection.execute("DELETE FROM fragment_part WHERE fragment NOT IN (SELECT id FROM fragment)")
     connection.executemany("DELETE FROM part_column WHERE part = ?", numbers)
     connection.executemany("DELETE FROM part WHERE id = ?", numbers)
     connection.execute("INSERT INTO deletion DEFAULT VALUES")

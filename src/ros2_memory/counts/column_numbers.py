@@ -16,13 +16,13 @@ import numpy as np
 
 from ros2_memory.columns.numbers import extent, numbers
 from ros2_memory.columns.stored import StoredTable
-from ros2_memory.columns.units import BagUnit, GoneError, Rows
+from ros2_memory.columns.units import GoneError, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import decoded_rows, messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -196,7 +196,7 @@ class PieceNumbers:
         held = [some for some in found if some is not None]
         if len(held) < len(found):
             if isinstance(rows.table, StoredTable):
-                for decoded in _decoded(self._view, rows):
+                for decoded in decoded_rows(self._view, rows):
                     self._add(decoded, since)
             else:
                 self._add_read(rows, since)
@@ -303,22 +303,11 @@ class PieceNumbers:
                 break
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
-            for decoded in _decoded(self._view, rows):
+            for decoded in decoded_rows(self._view, rows):
                 known = numbers(decoded.table, path, extractor)
                 if known is not None:
                     best = min(best, _first_furthest(decoded, _of_rows(known, decoded), sign))
         return None if best[1] == MAX_NS else Extreme(best[0], best[0], best[1], best[1])
-
-
-def _decoded(view: View, rows: Rows) -> Iterator[Rows]:
-    """Yields some rows as their bags have them."""
-    for bag, positions in rows.bag_rows():
-        wanted = rows.times[positions]
-        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
-            index = np.flatnonzero(np.isin(table.log_times, wanted))
-            if table.channel.type == rows.table.channel.type and index.size:
-                unit = BagUnit(bag, table, nth)
-                yield Rows.of(unit, index)
 
 
 def _candidates(rows: Rows, known: FieldNumbers | None, sign: int, extreme: Extreme) -> IntArray:

@@ -1,43 +1,29 @@
-"""The bags of one topic in groups, and what the catalogue stores of a group.
+"""The bags of one topic in groups.
 
 A group is what must be ordered and cleared of duplicates together. Most groups are one bag; where
 recordings overlap, or splits are out of order, they are more.
-
-A digest of a bag is the same whether the catalogue has it or it is made here from the bag, so an
-answer that is joined from digests does not depend on what the catalogue knows.
 """
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_left
-from dataclasses import dataclass
 from itertools import groupby
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar, cast
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeVar
 
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.merged_stream import MergedStream
-    from ros2_memory.history.view import View
-    from ros2_memory.index.timeline import Timeline
 
 T = TypeVar("T")
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
-
-
-_RELATCHED: Final[WeakKeyDictionary[Timeline, dict[object, object]]] = WeakKeyDictionary()
-_ONE_BY_ONE: Final = 8
-"""Groups of several bags whose digests are looked up one by one; then all are read."""
 
 
 class MessagePosition(NamedTuple):
@@ -216,126 +202,3 @@ def _belongs(first: Ns, recording: Path, latest: Mapping[Path, Ns]) -> bool:
 def _reaches(group: Sequence[BagSpan], oldest: Ns, recording: Path) -> bool:
     """Whether a bag of another recording ends at a time or after it."""
     return any(each.last >= oldest and each.bag.recording != recording for each in group)
-
-
-@dataclass(frozen=True, slots=True)
-class DigestKind(Generic[T]):
-    """A kind of digest of a topic in a bag.
-
-    Attributes:
-        name: part of the key under which the catalogue stores one; never changes its meaning.
-        look_up: those that the catalogue has of a topic, for some entries of one segment of bags.
-        encode: a digest as bytes.
-        decode: reads a digest from bytes; ValueError if they are invalid.
-    """
-
-    name: str
-    look_up: Callable[[SegmentDigests, str, Sequence[int]], Mapping[int, T]]
-    encode: Callable[[T], bytes]
-    decode: Callable[[bytes], T]
-
-
-class StoredDigests(Generic[T]):
-    """The digests of one `topic` in a window that the catalogue has."""
-
-    def __init__(self, view: View, topic: str, kind: DigestKind[T], window: TimeWindow) -> None:
-        self._view = view
-        self.topic = topic
-        self._kind = kind
-        self._window = window
-        self._question = f"{kind.name} {topic}"
-        self._segment: SegmentDigests | None = None
-        self._known: Mapping[int, T] = {}
-        self._asked = 0
-        self._answers: Mapping[tuple[int, ...], str] | None = None
-        self._relatched = _RELATCHED.setdefault(view.snapshot.timeline, {})
-
-    def of(self, group: Group) -> tuple[T, Span] | None:
-        """Returns a group's digest and the times of its first and last message, if stored."""
-        if group.may_be_relatched:
-            return cast("dict[object, tuple[T, Span]]", self._relatched).get(self._key(group))
-        if len(group.bags) > 1:
-            return self._of_several(group)
-        [span] = group.bags
-        number = None if self._segment is None else self._segment.numbers.get(span.bag.file)
-        if number is None:
-            number = self._enter_segment(span)
-        if number not in self._known:
-            return None
-        return self._known[number], (span.first, span.last)
-
-    def _of_several(self, group: Group) -> tuple[T, Span] | None:
-        """Returns what is stored of several bags: where they are many, all is read at once."""
-        self._asked += 1
-        if self._asked <= _ONE_BY_ONE:
-            return self._view.bags.cached_answer(self._question, group.bags, self._decode)
-        if self._answers is None:
-            self._answers = self._view.bags.cached_answers(self._question)
-        numbers = self._view.bags.entry_numbers(group.bags)
-        answer = None if numbers is None else self._answers.get(tuple(numbers))
-        try:
-            return None if answer is None else self._decode(answer)
-        # A damaged file can hold anything.
-        except (ValueError, TypeError, LookupError):
-            return None
-
-    def _enter_segment(self, span: BagSpan) -> int:
-        """Looks up the digests of all bags in the segment of this one; returns its number.
-
-        One query for each segment of bags: one for each bag would be thousands.
-        """
-        entry = self._view.bags.entry(span.bag)
-        if entry is None:
-            return -1
-        self._view.bags.check_deadline()
-        self._segment, number = entry
-        numbers = self._segment.numbers
-        segment = self._view.snapshot.timeline.segment_of(span.bag)
-        inside = [each.bag.file for each in segment.extents(self.topic, self._window)]
-        among = [numbers[file] for file in dict.fromkeys(inside) if file in numbers]
-        self._known = self._kind.look_up(self._segment, self.topic, among)
-        return number
-
-    def store(self, group: Group, digest: T, span: Span) -> None:
-        """Stores the digest of bags that hold duplicates of each other, for the next question.
-
-        The catalogue's own entries are of single bags. Where bags outside of the group matter, it
-        lasts until a bag comes or goes.
-        """
-        if group.may_be_relatched:
-            if self._view.bags.notes.complete:
-                self._relatched[self._key(group)] = (digest, span)
-        elif len(group.bags) > 1:
-            answer = json.dumps([self._kind.encode(digest).hex(), *span])
-            self._view.bags.cache_answer(self._question, group.bags, answer)
-
-    def _key(self, group: Group) -> tuple[str, tuple[str, ...]]:
-        return self._question, tuple(each.bag.file for each in group.bags)
-
-    def _decode(self, answer: str) -> tuple[T, Span]:
-        digest, first, last = json.loads(answer)
-        return self._kind.decode(bytes.fromhex(digest)), (int(first), int(last))
-
-
-def store_shared(
-    view: View,
-    topic: str,
-    kind: DigestKind[T],
-    collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]],
-    window: TimeWindow,
-) -> int:
-    """Stores the digests of all groups of several bags in a window that have none.
-
-    So the first question about them need not read bags. Returns how many it stored.
-    """
-    stored = StoredDigests(view, topic, kind, window)
-    done = 0
-    for group in groups_of(view.stream, topic, window):
-        if len(group.bags) < 2 or not group.is_whole or group.may_be_relatched:
-            continue
-        if stored.of(group) is None:
-            made, span = collect(group.messages())
-            if made is not None and span is not None:
-                stored.store(group, made, span)
-                done += 1
-    return done

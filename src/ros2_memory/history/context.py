@@ -200,7 +200,6 @@ class Call:
 
     Attributes:
         used_active: whether the answer is partly from a bag that is still being written.
-        stores_joined: whether what is joined of many bags is stored for other processes.
         robots: those of a fleet that it may ask about; None for all.
         rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
             count all the same. None for all.
@@ -209,7 +208,6 @@ class Call:
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
     used_active: bool = False
-    stores_joined: bool = False
     robots: frozenset[str] | None = None
     rows_in: TimeWindow | None = None
 

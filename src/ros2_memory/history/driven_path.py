@@ -1,4 +1,4 @@
-"""The driven path in a window: whole bags by digests of their poses, the others pose by pose."""
+"""The driven path in a window, by the poses of a topic, or by transforms."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.frames import static_at, static_changes
 from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.trajectory import (
-    MAX_WAYPOINTS,
-    PoseCollector,
-    TrajectoryBuilder,
-    joined_poses,
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, SLICE_NS, Way, path_slice
+from ros2_memory.columns.motion import PATHS
+from ros2_memory.columns.units import GoneError
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+    UndecodableError,
 )
-from ros2_memory.catalogue.codec import decode_poses, encode_poses
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
-from ros2_memory.history.bag_fold import Fold
-from ros2_memory.history.bag_groups import DigestKind, store_shared
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.history.context import READING_S
+from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
     resolve_pose_topic,
@@ -32,6 +32,7 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
+from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, slices_back
 from ros2_memory.history.transforms import (
     edges,
     graph_of,
@@ -44,29 +45,23 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from ros2_memory.analysis.bulk_decode import MotionDecoder
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.analysis.transform_tree import FrameGraph
     from ros2_memory.core.model import Vector3
-    from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
 
 _MOST_AT_ONCE: Final = 1024
-"""Messages that are decoded together: 0.74 in place of 7.6 µs for the position of each."""
+"""Messages that are decoded together."""
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
-_MOST_BYTES_AT_ONCE: Final = 1 << 20
 _BODIES: Final = ("base_footprint", "base_link")
 _NO_POSES: Final = "no topic has the robot's poses"
 _MOST_BAGS_OF_BODY: Final = 128
 """Bags of which transforms are read for a path, as no digest has them."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
-
-
-AddPose: TypeAlias = "Callable[[Ns, Pose, float | None], None]"
-"""Takes the next pose (log time, pose), and the speed (m/s) that its message states, if any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +74,11 @@ class DrivenPath:
     last: Ns
 
 
-POSES: Final = DigestKind(
-    "poses",
-    look_up=lambda digests, topic, among: digests.catalogue.poses(topic, among),
-    encode=encode_poses,
-    decode=decode_poses,
-)
+class FoundWay(NamedTuple):
+    """The path of a window; from `since` (log time, ns) on, where older bags were not read."""
+
+    way: Way | None
+    since: Ns | None = None
 
 
 def driven_path(
@@ -92,66 +86,110 @@ def driven_path(
 ) -> DrivenPath | None:
     """Returns the path in a window by the poses of one topic; None where there is no message.
 
-    It is drawn with `max_waypoints` (2 or more) at most. Messages that cannot be decoded are left
-    out, with a note.
+    It is drawn with `max_waypoints` (2 or more) at most, or not at all for 0. Notes say what cannot
+    be decoded, and how far back it is known where the time was over before all was read.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
         NoDataError: no message can be decoded.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    way, since = way_in(view, topic, window)
+    note_known_since(view, since)
+    if way is None:
+        return None
+    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last)
+
+
+def note_known_since(view: View, since: Ns | None) -> None:
+    """Notes since when a path is known, where older bags were not read."""
+    if since is not None:
+        view.notes.complete = False
+        view.notes.add(
+            f"the path is known back to {unix_text(since)}: out of time before older bags were read"
+        )
+
+
+def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
+    """Returns the path in a window by the poses of one topic; raises as `driven_path`.
+
+    Messages that cannot be decoded are left out, with a note.
     """
     fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
-    builder = TrajectoryBuilder(fastest, max_waypoints)
-    if topic in view.memory.limits.tf_topics:
-        poses = poses_of_body(view, window)
-        for time, pose in poses:
-            builder.add(time, pose, None)
-        ends = (poses[0][0], poses[-1][0]) if poses else None
-        return None if ends is None else DrivenPath(builder.result(), builder.frames, *ends)
-    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
-
-    def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest, Span | None]:
-        collector = PoseCollector(fastest)
-        span = add_poses(view, collector.add, decoder, messages, failures)
-        return collector.digest(), span
-
-    span = Fold(
-        POSES,
-        add=lambda messages: add_poses(view, builder.add, decoder, messages, failures),
-        collect=collect,
-        join=lambda digest, _span: builder.join(digest),
-        reduce=lambda found: joined_poses(found, fastest),
-        encode=encode_poses,
-        decode=decode_poses,
-        failures=failures,
-        name=f"{fastest:g}",
-    ).over(view, topic, window)
+    found, since = _slices_in(view, topic, window, failures)
+    if failures and not found:
+        raise with_notes(view, window, undecodable(failures[0])) from failures[0]
     if failures:
-        error = failures[0]
-        if span is None:
-            raise with_notes(view, window, undecodable(error)) from error
         view.notes.complete = False
-        count = len(failures)
-        view.notes.add(f"poses left out, since they cannot be decoded: {count} ({error.reason})")
-    return None if span is None else DrivenPath(builder.result(), builder.frames, *span)
+        why = f"{len(failures)} ({failures[0].reason})"
+        view.notes.add(f"poses left out, since they cannot be decoded: {why}")
+    return FoundWay(Way.of(found, fastest) if found else None, since)
 
 
-def store_shared_paths(view: View, topic: str, window: TimeWindow) -> int:
-    """Stores the poses of recordings that touch each other; returns of how many groups of bags.
+def _slices_in(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    failures: list[UndecodableError],
+) -> tuple[list[PathSlice], Ns | None]:
+    """Returns the path in slices, in order, and since when, where the time was over before."""
+    reading = view.call.partial_after(READING_S)
+    found: list[PathSlice] = []
+    since = MAX_NS
+
+    def reached(_: Ns) -> None:
+        if reading.expired() and found:
+            raise QueryTimeoutError("the rest is left out")
+
+    try:
+        blocks = blocks_back(view, topic, window, failures, reached)
+        for start, made in slices_of_path(view, blocks):
+            since = start
+            if made.poses or made.invalid:
+                found.append(made)
+    except GoneError:
+        raise
+    except QueryTimeoutError:
+        if not found:
+            raise
+        return found[::-1], since
+    return found[::-1], None
+
+
+def slices_of_path(view: View, blocks: Iterable[PoseRows]) -> Iterator[tuple[Ns, PathSlice]]:
+    """Yields the path of some poses in slices, the newest first, with the time where each begins.
 
     Raises:
-        InvalidArgumentsError: a message of the topic carries no position.
+        InvalidArgumentsError: a message carries no position.
     """
     fastest = view.memory.limits.max_plausible_speed_mps
-    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
+    known = None if view.memory.columns is None else view.memory.columns.fragments(PATHS)
 
-    def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest | None, Span | None]:
-        failures: list[UndecodableError] = []
-        collector = PoseCollector(fastest)
-        span = add_poses(view, collector.add, decoder, messages, failures)
-        return (None if failures else collector.digest()), span
+    def make(some: PoseSlice) -> PathSlice:
+        return path_slice(some.poses, fastest)
 
-    return store_shared(view, topic, POSES, collect, window)
+    for some in slices_back(blocks, SLICE_NS):
+        yield some.start, some.remembered(known, make, str(fastest))
+
+
+def blocks_back(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    failures: list[UndecodableError],
+    reached: Callable[[Ns], None] = lambda _: None,
+) -> Iterator[PoseRows]:
+    """Yields the poses of the robot's path in a window, the newest first; see `pose_rows`.
+
+    Of a topic of transforms they are those of the robot's body.
+    """
+    if topic in view.memory.limits.tf_topics:
+        poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
+        if len(poses):
+            yield PoseRows((int(poses.times[0]), int(poses.times[-1])), lambda: poses)
+        return
+    yield from pose_rows(view, topic, window, failures, newest_first=True, reached=reached)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:
@@ -186,50 +224,6 @@ def length_notes(path: Trajectory) -> Iterator[str]:
             f"odometry restarted {counted(len(totals.resets), 'time')}: "
             "the jumps back to its origin are left out of distance and speed"
         )
-
-
-def add_poses(
-    view: View,
-    add: AddPose,
-    decoder: MotionDecoder,
-    messages: Iterable[StoredMessage],
-    failures: list[UndecodableError],
-) -> tuple[Ns, Ns] | None:
-    """Adds the poses of messages, and returns the times of the first and last; None without any.
-
-    Those that cannot be decoded are added to `failures`.
-
-    Raises:
-        InvalidArgumentsError: a message carries no position.
-    """
-    first: Ns | None = None
-    last: Ns | None = None
-    for some in _batches(messages):
-        for found, sample in zip(some, decoder.decode([each.record for each in some]), strict=True):
-            if isinstance(sample, UndecodableError):
-                failures.append(sample)
-                continue
-            if sample.pose is None:
-                raise InvalidArgumentsError(describe_lack(view, "position", found))
-            add(found.time, sample.pose, sample.speed_mps)
-            first = found.time if first is None else first
-            last = found.time
-        view.bags.check_deadline()
-    return None if first is None or last is None else (first, last)
-
-
-def _batches(messages: Iterable[StoredMessage]) -> Iterator[list[StoredMessage]]:
-    """Yields the messages in lists, bounded in number and in bytes."""
-    some: list[StoredMessage] = []
-    size = 0
-    for found in messages:
-        some.append(found)
-        size += len(found.record.payload)
-        if len(some) == _MOST_AT_ONCE or size > _MOST_BYTES_AT_ONCE:
-            yield some
-            some, size = [], 0
-    if some:
-        yield some
 
 
 def positions_of(

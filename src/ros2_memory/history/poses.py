@@ -3,49 +3,75 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
-from typing import TYPE_CHECKING
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses, joined_poses
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
+from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Texts
+from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import decoded_rows, messages_of, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import Pose, TimeWindow
+    from ros2_memory.columns.fragments import Fragments, Sized
+    from ros2_memory.core.model import BagFile, Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
 
 
+_MOST_SLICES: Final = 64
+"""Of more between its ends, a block may have most slices without a pose."""
+
+
+T = TypeVar("T", bound="Sized")
+
+
 class PoseRows:
-    """Rows with poses, which no other ones of the scan overlap in time.
+    """Poses that no other ones overlap in time.
+
+    Args:
+        span: log times (ns) that none of them is earlier or later than.
+        load: returns the poses.
+        parts: the numbers of the parts of which all rows are here; None if there are others, too.
+        trouble: differs from before where something could not be read since.
 
     Attributes:
-        first: a log time (ns) that none of them is earlier than.
+        first: a log time (ns) that none of the poses is earlier than.
         last: one that none is later than.
+        parts: see above.
+        trouble: see above.
     """
 
-    def __init__(self, reader: PoseReader, rows: Sequence[Rows]) -> None:
-        self.first = min(each.first for each in rows)
-        self.last = max(each.last for each in rows)
-        self._reader = reader
-        self._rows = rows
+    def __init__(
+        self,
+        span: tuple[Ns, Ns],
+        load: Callable[[], Poses],
+        parts: tuple[int, ...] | None = None,
+        trouble: Callable[[], Hashable] = lambda: None,
+    ) -> None:
+        self.first, self.last = span
+        self.parts = parts
+        self.trouble = trouble
+        self._load = load
 
-    @cached_property
-    def parts(self) -> tuple[int, ...] | None:
-        """The numbers of the parts of which all rows are here; None if there are others, too."""
-        known = [each.part for each in self._rows]
-        numbers = tuple(part for part in known if part is not None)
-        return numbers if len(numbers) == len(known) else None
+    def slices(self, length: Ns) -> Iterable[int]:
+        """Returns which slices of the clock may have poses, counted from the epoch."""
+        first, last = self.first // length, self.last // length
+        if last - first < _MOST_SLICES:
+            return range(first, last + 1)
+        numbers: list[int] = np.unique(self.poses.times // length).tolist()
+        return numbers
 
     @cached_property
     def poses(self) -> Poses:
@@ -54,8 +80,7 @@ class PoseRows:
         Raises:
             InvalidArgumentsError: messages carry no position.
         """
-        rows = sorted(self._rows, key=lambda each: (each.first, each.last, str(each.recording)))
-        return joined_poses([self._reader.poses(each) for each in rows])
+        return self._load()
 
 
 def pose_rows(
@@ -65,20 +90,24 @@ def pose_rows(
     failures: list[UndecodableError],
     *,
     newest_first: bool = False,
+    stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
     among: Callable[[Path], bool] = lambda _: True,
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 
     Positions are rounded to 0.1 mm, as the store has them. Why messages cannot be decoded is added
-    to `failures` as poses are read. `reached` is as for `scan`; `among`: which recordings count.
+    to `failures` as poses are read. `stored` and `reached` are as for `scan`; `among`: which
+    recordings count.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     reader = PoseReader(view, failures)
     together: list[Rows] = []
-    for rows in scan(view, topic, window, newest_first=newest_first, reached=reached):
+    for rows in scan(
+        view, topic, window, newest_first=newest_first, stored=stored, reached=reached
+    ):
         if not among(rows.recording):
             continue
         is_apart = together and (
@@ -87,11 +116,83 @@ def pose_rows(
             else rows.first > max(each.last for each in together)
         )
         if is_apart:
-            yield PoseRows(reader, together)
+            yield reader.block(together)
             together = []
         together.append(rows)
     if together:
-        yield PoseRows(reader, together)
+        yield reader.block(together)
+
+
+class PoseSlice:
+    """The poses in a slice of the clock, and those beside it.
+
+    Attributes:
+        start: log time (ns) where it begins.
+        stop: where it ends.
+    """
+
+    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
+        self.start, self.stop = start, stop
+        self._beside = beside
+        self._blocks = blocks
+
+    @property
+    def poses(self) -> Poses:
+        """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
+        start, stop = self.start - self._beside, self.stop + self._beside
+        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
+
+    def remembered(
+        self, known: Fragments[T] | None, make: Callable[[PoseSlice], T], settings: str = ""
+    ) -> T:
+        """Returns what is made of it, and remembers that where it follows from whole parts alone.
+
+        Raises:
+            InvalidArgumentsError: messages carry no position.
+        """
+        parts: list[int] = []
+        for block in self._blocks:
+            if known is None or block.parts is None:
+                return make(self)
+            parts += block.parts
+        key = FragmentKey(self.start, settings, tuple(parts))
+        found = None if known is None else known.get(key)
+        if found is None:
+            before = [block.trouble() for block in self._blocks]
+            found = make(self)
+            if known is not None and before == [block.trouble() for block in self._blocks]:
+                known.put(key, found)
+        return found
+
+
+def slices_back(blocks: Iterable[PoseRows], length: Ns, beside: Ns = 0) -> Iterator[PoseSlice]:
+    """Yields the slices of the clock in which there may be poses, the newest first.
+
+    Args:
+        blocks: from `pose_rows`, the newest first.
+        length: of a slice (ns); they are counted from the epoch.
+        beside: poses so far before and after a slice (ns) are with it, too.
+    """
+    held: list[PoseRows] = []
+    waiting: set[int] = set()
+
+    def done(oldest: Ns) -> Iterator[PoseSlice]:
+        """Yields the slices that reach no poses older than the oldest that is held."""
+        for number in sorted(waiting, reverse=True):
+            start, stop = number * length, (number + 1) * length
+            if start - beside < oldest:
+                return
+            waiting.discard(number)
+            near = [each for each in held if each.last >= start - beside]
+            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
+
+    for block in blocks:
+        newest = max(waiting, default=block.last // length)
+        held = [each for each in held if each.first < (newest + 1) * length + beside]
+        held.append(block)
+        waiting.update(block.slices(length))
+        yield from done(block.first)
+    yield from done(MIN_NS)
 
 
 def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
@@ -110,6 +211,19 @@ def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
     )
 
 
+def poses_of_bag(view: View, bag: BagFile, topic: str) -> Poses | None:
+    """Returns the poses of a topic in a bag; None without any, and where some message has none."""
+    failures: list[UndecodableError] = []
+    reader = PoseReader(view, failures)
+    tables = view.bags.tables(bag, topic, hashed=False)
+    units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
+    try:
+        poses = joined_poses([reader.poses(Rows(unit, lambda: None)) for unit in units])
+    except InvalidArgumentsError:
+        return None
+    return poses if len(poses) and not failures else None
+
+
 class PoseReader:
     """Reads the poses of rows by their columns, else by their messages.
 
@@ -122,6 +236,21 @@ class PoseReader:
         self._view = view
         self._failures = failures
         self._columns = PoseColumns(view.memory.extractor)
+
+    def block(self, rows: Sequence[Rows]) -> PoseRows:
+        """Returns the poses of rows that overlap in time."""
+        span = min(each.first for each in rows), max(each.last for each in rows)
+        known = [each.part for each in rows]
+        numbers = tuple(part for part in known if part is not None)
+        parts = numbers if len(numbers) == len(known) else None
+        ordered = sorted(rows, key=lambda each: (each.first, each.last, str(each.recording)))
+        return PoseRows(span, partial(self._joined, ordered), parts, self._trouble)
+
+    def _trouble(self) -> Hashable:
+        return len(self._failures), self._view.notes.added
+
+    def _joined(self, rows: Sequence[Rows]) -> Poses:
+        return joined_poses([self.poses(each) for each in rows])
 
     def poses(self, rows: Rows) -> Poses:
         """Returns the poses of rows, in order of log time.
@@ -136,6 +265,9 @@ class PoseReader:
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
+        if found is None and isinstance(rows.table, StoredTable):
+            # Of a topic beyond its share no columns are stored.
+            return joined_poses([self.poses(each) for each in decoded_rows(self._view, rows)])
         return poses_of(self._decoded(rows)) if found is None else found
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:

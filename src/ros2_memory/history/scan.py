@@ -9,13 +9,13 @@ import numpy as np
 
 from ros2_memory.columns.scan import Asked, Scan
 from ros2_memory.columns.scanner import Scanner
+from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
@@ -37,6 +37,7 @@ def scan(
     may_match: Callable[[PartZones], bool | Mask] | None = None,
     may_be_empty: bool = False,
     within: Sequence[tuple[Ns, Ns]] | None = None,
+    stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[Rows]:
     """Yields the rows of a topic in a window; see `columns.scan.Scan.rows`.
@@ -45,7 +46,8 @@ def scan(
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. `may_match`, `may_be_empty` and `within` are as in
+    may hold copies, where the caller knows them. With `stored` bags that are not stored have no
+    rows. `may_match`, `may_be_empty` and `within` are as in
     `Asked`.
 
     Raises:
@@ -54,7 +56,7 @@ def scan(
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed, columns=columns)
+        return () if stored else view.bags.tables(bag, topic, hashed=hashed, columns=columns)
 
     def check(at: Ns) -> None:
         reached(at)
@@ -98,6 +100,17 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
         check=lambda _: view.bags.check_deadline(),
     )
     return Scan(scanner, asked).copies()
+
+
+def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
+    """Yields some rows as their bags have them."""
+    for bag, positions in rows.bag_rows():
+        wanted = rows.times[positions]
+        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
+            index = np.flatnonzero(np.isin(table.log_times, wanted))
+            if table.channel.type == rows.table.channel.type and index.size:
+                unit = BagUnit(bag, table, nth)
+                yield Rows.of(unit, index)
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:

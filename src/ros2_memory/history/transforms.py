@@ -251,7 +251,12 @@ def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransfo
     """Yields the static transforms of a topic that differ from those before in their recording."""
     sessions = sessions_of(view)
     latest: dict[Path, tuple[Ns, dict[str, StaticRun]]] = {}
-    for rows in scan(view, topic, TimeWindow.everything(), copies=True):
+    spans = sessions.recordings_of(among, (topic,)).values()
+    if not spans:
+        return
+    # A session is mostly some hours of a week.
+    window = TimeWindow(min(first for first, _ in spans), max(last for _, last in spans) + 1)
+    for rows in scan(view, topic, window, copies=True):
         if sessions.holds_carried(rows.recording):
             for found in messages_of(view, rows):
                 if sessions.has(among, found):

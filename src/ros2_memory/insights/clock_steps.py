@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.clock_steps import (
     BESIDE_NS,
     SHORTEST_STEP_NS,
@@ -28,13 +27,12 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
     QueryTimeoutError,
-    UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.driven_path import add_poses
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
+from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import scan
 from ros2_memory.index.clock_faults import FaultyClock
 
@@ -43,7 +41,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import BagFile, Pose
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
@@ -243,16 +241,11 @@ def _busiest(bag: BagFile) -> list[str]:
 
 
 def _poses(view: View, topic: str, window: TimeWindow) -> list[TimedPosition]:
-    poses: list[TimedPosition] = []
-    failures: list[UndecodableError] = []
-
-    def add(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
-        if is_place(pose.position):
-            poses.append(TimedPosition(time, pose.position))
-
-    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
+    found: list[TimedPosition] = []
     try:
-        add_poses(view, add, decoder, view.stream.messages([topic], window), failures)
+        for block in pose_rows(view, topic, window, []):
+            rows = zip(block.poses.times.tolist(), block.poses.positions.tolist(), strict=True)
+            found += [TimedPosition(time, (x, y, z)) for time, (x, y, z) in rows]
     except InvalidArgumentsError:
         return []
-    return poses
+    return [pose for pose in found if is_place(pose.position)]

@@ -3,66 +3,57 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.bulk_decode import motion_decoder
 from ros2_memory.analysis.clock_steps import Elapsed
-from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.speed_drops import SLOT_NS
 from ros2_memory.analysis.motion.standstills import (
+    BESIDE_NS,
     CONTEXT_NS,
     CREEP_MPS,
+    NO_BLOCKS,
     SHORTEST_NS,
-    StandstillBuilder,
-    StandstillCollector,
-    StandstillDigest,
-    StandstillRun,
+    joined_blocks,
+    stands_of,
+    standstills_of,
 )
-from ros2_memory.catalogue.codec import (
-    decode_standstill_run,
-    decode_standstills,
-    encode_standstill_run,
-    encode_standstills,
-)
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.analysis.motion.trajectory import SLICE_NS
+from ros2_memory.columns.motion import STANDS
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.bag_fold import Fold
-from ros2_memory.history.bag_groups import DigestKind, store_shared
 from ros2_memory.history.driven_path import (
-    add_poses,
+    blocks_back,
     driven_path,
-    poses_of_body,
     resolve_path_topic,
+    slices_of_path,
 )
+from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.poses import pose_rows, slices_back
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 from ros2_memory.insights.silences import unrecorded_length
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
-    from ros2_memory.analysis.bulk_decode import MotionDecoder
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-    from ros2_memory.analysis.motion.standstills import Standstill
+    from ros2_memory.analysis.motion.standstills import Stands, Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import Pose
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.driven_path import DrivenPath
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.poses import PoseRows
     from ros2_memory.history.view import View
 
-
-_NO_WAYPOINTS: Final = 2
-"""The fewest that a path is drawn with: drawing takes long, and these are not shown."""
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
 """A standstill that begins so soon after a loss of speed is what that led to."""
 
@@ -114,7 +105,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     try:
         topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
-        path = driven_path(view, topic, window, _NO_WAYPOINTS)
+        path = driven_path(view, topic, window, 0)
         standstills, drops = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
@@ -125,72 +116,6 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         path = replace(path, trajectory=across_steps(path, elapsed))
     unrecorded = 0 if path is None else unrecorded_length(view, topic, path, elapsed)
     return Drive(path, standstills, drops, elapsed, unrecorded)
-
-
-_STANDSTILLS: Final = DigestKind(
-    "standstills",
-    look_up=lambda digests, topic, among: digests.catalogue.standstills(topic, among),
-    encode=encode_standstills,
-    decode=decode_standstills,
-)
-
-
-def store_shared_standstills(view: View, topic: str, window: TimeWindow) -> int:
-    """Stores the standstills of recordings that touch each other; returns of how many groups.
-
-    Raises:
-        InvalidArgumentsError: a message of the topic carries no position.
-    """
-    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
-
-    def collect(
-        messages: Iterable[StoredMessage],
-    ) -> tuple[StandstillDigest | None, Span | None]:
-        failures: list[UndecodableError] = []
-        collector = StandstillCollector()
-        span = _add_places(view, collector, decoder, messages, failures)
-        return (None if failures else collector.digest()), span
-
-    return store_shared(view, topic, _STANDSTILLS, collect, window)
-
-
-def _add_places(
-    view: View,
-    to: StandstillBuilder | StandstillCollector,
-    decoder: MotionDecoder,
-    messages: Iterable[StoredMessage],
-    failures: list[UndecodableError],
-) -> Span | None:
-    def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
-        if is_place(pose.position):
-            to.add(time, pose.position, pose.orientation)
-
-    return add_poses(view, add_place, decoder, messages, failures)
-
-
-def _in_one(
-    found: Sequence[tuple[StandstillDigest, Span]],
-) -> Sequence[tuple[StandstillRun, Span]]:
-    run = StandstillRun.of([digest for digest, _ in found])
-    return [(run, (found[0][1][0], found[-1][1][1]))]
-
-
-def _encoded(joined: StandstillDigest | StandstillRun) -> bytes:
-    if isinstance(joined, StandstillDigest):
-        joined = StandstillRun((joined,))
-    return encode_standstill_run(joined)
-
-
-def _whole_bags(view: View, topic: str, window: TimeWindow) -> TimeWindow:
-    """Returns a window, or where positions inside of bags are thinned, that of all its bags.
-
-    They have digests of every position.
-    """
-    extents = [] if view.memory.stated is None else [*view.snapshot.timeline.extents(topic, window)]
-    if not extents:
-        return window
-    first, last = min(each.first for each in extents), max(each.last for each in extents)
-    return TimeWindow(min(first, window.start), max(last + 1, window.stop))
 
 
 def _standstills_in(
@@ -209,46 +134,53 @@ def _standstills_in(
         InvalidArgumentsError: a message of the topic carries no position.
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    builder = StandstillBuilder()
-    decoder = motion_decoder(view.memory.reader, view.memory.extractor)
-    failures: list[UndecodableError] = []
-
-    def collect(
-        messages: Iterable[StoredMessage],
-    ) -> tuple[StandstillDigest | None, Span | None]:
-        collector = StandstillCollector()
-        span = _add_places(view, collector, decoder, messages, failures)
-        return collector.digest(), span
-
-    fold = Fold(
-        _STANDSTILLS,
-        add=lambda messages: _add_places(view, builder, decoder, messages, failures),
-        collect=collect,
-        join=lambda digest, _span: builder.join(digest),
-        reduce=_in_one,
-        encode=_encoded,
-        decode=decode_standstill_run,
-        failures=failures,
-    )
-    if topic in view.memory.limits.tf_topics:
-        for time, pose in poses_of_body(view, window.widened(CONTEXT_NS)):
-            builder.add(time, pose.position, pose.orientation)
-    else:
-        fold.over(view, topic, _whole_bags(view, topic, window.widened(CONTEXT_NS)))
-    found = builder.standstills()
+    stands = _stands_in(view, topic, window.widened(CONTEXT_NS))[::-1]
+    found = standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)]))
+    last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
     standstills = tuple(
         (
             each._replace(start=max(each.start, start), end=min(each.end, end)),
-            each.end > end or each.end == builder.last,
+            each.end > end or each.end == last,
         )
         for each in found
         if each.start < end and each.end > start
     )
     drops = tuple(
         each
-        for each in builder.drops
+        for stand in stands
+        for each in stand.drops
         if start <= each.time <= end
         and bisect_left(begins, each.time - SLOT_NS) == bisect_left(begins, each.time + _BRAKING_NS)
     )
     return standstills, drops
+
+
+def _stands_in(view: View, topic: str, window: TimeWindow) -> list[Stands]:
+    """Returns what shows where the robot stood in slices of a window, the newest first."""
+    return _stands(view, blocks_back(view, topic, window, []))
+
+
+def _stands(view: View, blocks: Iterable[PoseRows]) -> list[Stands]:
+    scanner = view.memory.columns
+    return [
+        some.remembered(
+            None if scanner is None else scanner.fragments(STANDS),
+            lambda part: stands_of(part.poses, part.start, part.stop),
+        )
+        for some in slices_back(blocks, SLICE_NS, BESIDE_NS)
+    ]
+
+
+def make_fragments(view: View, window: TimeWindow) -> None:
+    """Makes what the columns of a window say of the robot's path, and of where it stood.
+
+    What is not in parts yet is left out.
+    """
+    with suppress(InvalidArgumentsError, NoDataError):
+        topic = resolve_pose_topic(view)
+        rows = pose_rows(view, topic, window.widened(SLICE_NS), [], newest_first=True, stored=True)
+        blocks = [block for block in rows if block.parts is not None]
+        for _ in slices_of_path(view, blocks):
+            pass
+        _stands(view, blocks)

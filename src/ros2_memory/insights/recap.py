@@ -26,7 +26,7 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
 )
-from ros2_memory.history.driven_path import length_notes
+from ros2_memory.history.driven_path import length_notes, way_in
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
@@ -42,7 +42,7 @@ from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
-from ros2_memory.places.driven_inside import driven_way
+from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.scope import times_in_region
 from ros2_memory.places.where import parse_where
@@ -285,10 +285,10 @@ def _with_way_there(
     view: View, answer: Recap, drive: Drive, window: TimeWindow, there: _There
 ) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    way = None
+    driven = None
     if drive.path is not None:
-        way = driven_way(view, resolve_pose_topic(view), window)
-    driven = None if way is None else way.totals(there.spans)
+        way, _ = way_in(view, resolve_pose_topic(view), window)
+        driven = totals_inside(way.line, there.spans) if way is not None and way.poses else None
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,

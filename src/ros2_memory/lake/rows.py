@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import static_at
+from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut
-from ros2_memory.analysis.motion.standstills import StandstillBuilder
-from ros2_memory.analysis.motion.trajectory import TrajectoryBuilder
+from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
+from ros2_memory.analysis.motion.trajectory import Way, path_slice
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.analysis.state_changes import has_levels
 from ros2_memory.analysis.topic_events import (
@@ -26,13 +27,13 @@ from ros2_memory.analysis.topic_events import (
     has_events,
     state_of,
 )
-from ros2_memory.catalogue.codec import encode_poses, encode_standstills
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.history.context import Call
+from ros2_memory.history.poses import poses_of_bag
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
@@ -162,6 +163,7 @@ class _BagRows:
             raise ValueError(f"{content.bag.file} has no digest")
         self._number = number
         self._pose_topic = memory.limits.pose_topic
+        self._poses = poses_of_bag(View(memory, Call()), content.bag, self._pose_topic)
         self._types: dict[str, list[str]] = {}
         for each in self._bag.summary.topics:
             self._types.setdefault(each.topic, []).append(each.type)
@@ -211,13 +213,11 @@ class _BagRows:
         }
 
     def _add_bag(self, in_map: tuple[str, RobotTrack] | None, stood_s: float | None) -> None:
-        bag, content, number = self._bag, self._content, self._number
-        digest = self._catalogue.poses(self._pose_topic, [number]).get(number)
+        bag, content = self._bag, self._content
         driven = None
-        if digest is not None:
-            builder = TrajectoryBuilder(self._memory.limits.max_plausible_speed_mps)
-            builder.join(digest)
-            driven = builder.result()
+        if self._poses is not None:
+            fastest = self._memory.limits.max_plausible_speed_mps
+            driven = Way.of([path_slice(self._poses, fastest)], fastest).trajectory(0)
         self._rows["bags"].append(
             (
                 bag.recording.name,
@@ -265,7 +265,7 @@ class _BagRows:
             ]
 
     def _add_digests(self, events: Mapping[str, TopicEvents | None]) -> None:
-        number, catalogue, add = self._number, self._catalogue, self._add_digest
+        add = self._add_digest
         for each in self._bag.summary.topics:
             self._rows["digests"].append(
                 (
@@ -281,12 +281,6 @@ class _BagRows:
                 )
             )
         for topic in self._types:
-            poses = catalogue.poses(topic, [number]).get(number)
-            if poses is not None:
-                add(topic, "poses", encode_poses(poses))
-            stood = catalogue.standstills(topic, [number]).get(number)
-            if stood is not None:
-                add(topic, "standstills", encode_standstills(stood))
             found = events.get(topic, NO_EVENTS)
             if found is not NO_EVENTS:
                 add(topic, "events", encode_topic_events(found))
@@ -349,17 +343,15 @@ class _BagRows:
                 add(topic, "flip", flip.time, None, toggled(topic, flip), value=float(flip.value))
             for error in found.errors:
                 add(topic, "error", error.first, error.last, error.text, count=error.reports)
-        pose_topic, number = self._pose_topic, self._number
-        digest = self._catalogue.standstills(pose_topic, [number]).get(number)
-        if digest is None:
+        pose_topic = self._pose_topic
+        if self._poses is None or not are_places(self._poses.positions).any():
             return None
-        builder = StandstillBuilder()
-        builder.join(digest)
-        standstills = builder.standstills()
+        stands = stands_of(self._poses, MIN_NS, MAX_NS)
+        standstills = standstills_of(stands.blocks)
         for start, end, box in standstills:
             x, y, _ = box.centre
             add(pose_topic, "stop", start, end, "stood", x=x, y=y)
-        for time, before_mps, after_mps in builder.drops:
+        for time, before_mps, after_mps in stands.drops:
             text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
             add(pose_topic, "drop", time, None, text, value=before_mps - after_mps)
         return unix_from_ns(sum(each.end - each.start for each in standstills))

@@ -6,6 +6,7 @@ not change any more are remembered, so a week is asked again in a tenth of a sec
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -110,7 +111,7 @@ class RobotTracks:
         self._is_own = self._body is None and own == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
-        self._statics: dict[Session, tuple[StampedTransform, ...]] = {}
+        self._statics: dict[Session, Sequence[StampedTransform]] = {}
 
     def over(self, window: TimeWindow) -> JoinedTrack:
         """Returns the track in a window, and a little beyond.
@@ -152,15 +153,14 @@ class RobotTracks:
         moving = None if self._is_own else _Moving(view, window.widened(TF_CACHE_NS))
         for topic in self._topics:
             for rows in scan(view, topic, window, newest_first=True):
-                sources = [] if moving is None else moving.around(rows.first, rows.last)
-                groups = [] if moving is None else self._sessions(rows)
-                key = self._key(rows, sources, groups)
+                groups = self._groups(rows, moving)
+                key = self._key(rows, groups)
                 part = None if key is None or scanner is None else scanner.tracks.get(key)
                 if part is None:
                     if reading.expired():
                         raise QueryTimeoutError("to place poses takes too long")
                     noted = view.notes.added, len(self._failures)
-                    placed = self._placed(rows, sources, groups, thins=True)
+                    placed = self._placed(rows, groups, thins=True)
                     part = track_part(
                         placed.times, placed.x, placed.y, placed.heading, placed.left_out
                     )
@@ -169,41 +169,52 @@ class RobotTracks:
                         scanner.tracks.put(key, part, part.size)
                 yield rows, part
 
-    def _key(
-        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group]
-    ) -> Hashable | None:
+    def _key(self, rows: Rows, groups: Sequence[_Group]) -> Hashable | None:
         """Returns what the track by some rows follows from; None where that may still change."""
-        used = [source.rows.part for source in sources]
-        if rows.part is None or None in used:
+        parts = [[source.rows.part for source in group.sources] for group in groups]
+        if rows.part is None or any(None in some for some in parts):
             return None
+        placed_by = tuple(
+            (group.span.start, group.static, tuple(some))
+            for group, some in zip(groups, parts, strict=True)
+        )
         clock = self._view.memory.limits.tf_clock
-        statics = tuple((group.since, self._static(group.session)) for group in groups)
-        return rows.part, self._frame_id, self._body, clock, tuple(used), statics
+        return rows.part, self._frame_id, self._body, clock, placed_by
 
-    def _static(self, session: Session) -> tuple[StampedTransform, ...]:
+    def _groups(self, rows: Rows, moving: _Moving | None) -> list[_Group]:
+        """Returns by what the poses of some rows are placed, each since when; none: by nothing."""
+        if moving is None:
+            return []
+        sources = moving.around(rows.first, rows.last)
+        lenders = self._lenders(rows)
+        ends = [since for since, _ in lenders[1:]] + [MAX_NS]
+        groups = []
+        for (since, session), end in zip(lenders, ends, strict=True):
+            span = TimeWindow(max(since, rows.first), min(end, rows.last + 1))
+            used = [source for source in sources if source.is_of(self._view, session)]
+            groups.append(_Group(span, session, self._static(session, span), used))
+        return groups
+
+    def _static(self, session: Session, span: TimeWindow) -> tuple[StampedTransform, ...]:
+        """Returns the static transforms that hold in a span."""
         if session not in self._statics:
-            self._statics[session] = tuple(static_transforms(self._view, session))
-        return self._statics[session]
+            self._statics[session] = static_transforms(self._view, session)
+        recorded = self._statics[session]
+        static = static_at(recorded, span.start)
+        return (*static, *(one for one in recorded if span.contains(one.log_time)))
 
-    def _sessions(self, rows: Rows) -> list[_Group]:
+    def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
         sessions, recording = sessions_of(self._view), rows.recording
         own = sessions.of(recording)
         if sessions.has_all_kinds(own):
-            return [_Group(MIN_NS, own)]
+            return [(MIN_NS, own)]
         first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
         if first == last:
-            return [_Group(MIN_NS, first)]
-        stretches = np.unique(rows.times // STRETCH_NS).tolist()
-        every = [
-            _Group(at, self._lending(recording, at))
-            for at in (stretch * STRETCH_NS for stretch in stretches)
-        ]
-        return [
-            group
-            for nth, group in enumerate(every)
-            if not nth or group.session != every[nth - 1].session
-        ]
+            return [(MIN_NS, first)]
+        stretches = (np.unique(rows.times // STRETCH_NS) * STRETCH_NS).tolist()
+        every = [(at, self._lending(recording, at)) for at in stretches]
+        return [one for nth, one in enumerate(every) if not nth or one[1] != every[nth - 1][1]]
 
     def poses(self, window: TimeWindow) -> Placed:
         """Returns all poses in a short window, in order.
@@ -214,10 +225,8 @@ class RobotTracks:
         moving = None if self._is_own else _Moving(self._view, window.widened(TF_CACHE_NS))
         found = [NOWHERE]
         for topic in self._topics:
-            for rows in scan(self._view, topic, window, newest_first=True):
-                sources = [] if moving is None else moving.around(rows.first, rows.last)
-                groups = [] if moving is None else self._sessions(rows)
-                found.append(self._placed(rows, sources, groups, thins=False))
+            every = scan(self._view, topic, window, newest_first=True)
+            found += [self._placed(rows, self._groups(rows, moving), thins=False) for rows in every]
         return _joined(found)
 
     def _lending(self, recording: Path, at: Ns) -> Session:
@@ -227,9 +236,7 @@ class RobotTracks:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
-    def _placed(
-        self, rows: Rows, sources: Sequence[_Source], groups: Sequence[_Group], *, thins: bool
-    ) -> Placed:
+    def _placed(self, rows: Rows, groups: Sequence[_Group], *, thins: bool) -> Placed:
         """Returns the poses of some rows; with `thins` those that a track needs."""
         if self._body is None:
             poses = self._reader.poses(rows)
@@ -237,34 +244,34 @@ class RobotTracks:
         if not groups:
             return _placed(poses, None, self._frame_id)
         found: list[Placed] = []
-        ends = [group.since for group in groups[1:]] + [MAX_NS]
-        for group, end in zip(groups, ends, strict=True):
-            span = TimeWindow(max(group.since, rows.first), min(end, rows.last + 1))
-            frames = self._frames(sources, span, group.session)
+        for group in groups:
+            frames = self._frames(group)
             if self._body is None:
-                found.append(_placed(poses.between(group.since, end), frames, self._frame_id))
+                some = poses.between(group.span.start, group.span.stop)
+                found.append(_placed(some, frames, self._frame_id))
             else:
                 edges = edges_of_rows(self._view, rows, group.session)
-                found.append(_placed_body(edges, self._body, frames, span, thins=thins))
+                found.append(_placed_body(edges, self._body, frames, group.span, thins=thins))
         return _joined(found)
 
-    def _frames(self, sources: Sequence[_Source], span: TimeWindow, among: Session) -> Frames:
-        around = span.widened(TF_CACHE_NS)
-        moving = [_within(source.edges(self._view, among), around) for source in sources]
-        recorded = self._static(among)
-        static = static_at(recorded, span.start)
-        static += [one for one in recorded if span.contains(one.log_time)]
+    def _frames(self, group: _Group) -> Frames:
+        around = group.span.widened(TF_CACHE_NS)
+        moving = [
+            _within(source.edges(self._view, group.session), around) for source in group.sources
+        ]
         clock = self._view.memory.limits.tf_clock
         return Frames(
-            static, joined_edges(moving), self._frame_id, None if clock == "auto" else clock
+            group.static, joined_edges(moving), self._frame_id, None if clock == "auto" else clock
         )
 
 
 class _Group(NamedTuple):
-    """The session whose transforms place poses from a log time on."""
+    """By what poses of a span of log time are placed: the transforms of one session."""
 
-    since: Ns
+    span: TimeWindow
     session: Session
+    static: tuple[StampedTransform, ...]
+    sources: Sequence[_Source]
 
 
 class Placed(NamedTuple):
@@ -354,6 +361,12 @@ class _Source:
         self.rows = rows
         self._edges: dict[Session, Edges] = {}
 
+    def is_of(self, view: View, among: Session) -> bool:
+        """Returns whether it may have transforms of a session."""
+        sessions = sessions_of(view)
+        is_mixed = sessions.holds_carried(self.rows.recording)
+        return is_mixed or sessions.folder(self.rows.recording) in among
+
     def edges(self, view: View, among: Session) -> Edges:
         """Returns the transforms of a session in it."""
         if among not in self._edges:
@@ -405,27 +418,39 @@ def _within(edges: Edges, window: TimeWindow) -> Edges:
     return found
 
 
+class _Pieces(NamedTuple):
+    """When a recording places a robot: from each of the starts to a stop (ns, inclusive)."""
+
+    starts: Times
+    stops: Times
+    first: Ns
+    last: Ns
+
+
 def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
     """Returns the parts of the track in order of time, and of others what lies beside it.
 
     Where several recordings place a robot at a time, that which began first is in the track.
     """
-    parts = [(recording, part) for recording, part in found[::-1] if len(part.times)]
+    parts = [(str(recording), part) for recording, part in found[::-1] if len(part.times)]
     parts.sort(key=lambda one: int(one[1].times[0]))
-    recordings = [*dict.fromkeys(recording for recording, _ in parts)]
-    if len(recordings) < 2:
+    by_recording: dict[str, list[TrackPart]] = defaultdict(list)
+    for recording, part in parts:
+        by_recording[recording].append(part)
+    if len(by_recording) < 2:
         return [[part for _, part in parts]]
     others: list[list[TrackPart]] = []
     kept: list[TrackPart] = []
-    pieces: list[tuple[Times, Times]] = []
-    for recording in recordings:
-        own = [part for each, part in parts if each == recording]
+    placed: list[_Pieces] = []
+    for own in by_recording.values():
         beside: list[TrackPart] = []
         for part in own:
+            first, last = int(part.times[0]), int(part.times[-1])
             fresh = np.ones(len(part.times), np.bool_)
-            for starts, stops in pieces:
-                nth = np.searchsorted(starts, part.times, side="right") - 1
-                fresh &= (nth < 0) | (part.times > stops[nth])
+            for pieces in placed:
+                if pieces.first <= last and pieces.last >= first:
+                    nth = np.searchsorted(pieces.starts, part.times, side="right") - 1
+                    fresh &= (nth < 0) | (part.times > pieces.stops[nth])
             kept.append(part if fresh.all() else part.some(np.flatnonzero(fresh)))
             if not fresh.all():
                 beside.append(part.some(np.flatnonzero(~fresh)))
@@ -434,7 +459,8 @@ def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
         times = np.concatenate([part.times for part in own])
         times.sort()
         new = np.diff(times) > SILENCE_NS
-        pieces.append((times[np.append([True], new)], times[np.append(new, [True])]))
+        starts, stops = times[np.append([True], new)], times[np.append(new, [True])]
+        placed.append(_Pieces(starts, stops, int(starts[0]), int(stops[-1])))
     return [kept, *others]
 
 

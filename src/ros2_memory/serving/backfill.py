@@ -11,7 +11,7 @@ import os
 import subprocess
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -20,21 +20,17 @@ import anyio.to_thread
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
-from ros2_memory.catalogue.store import MOST_JOINED
+from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.columns.store import BagKey
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ms_from_ns, ns_from_unix
-from ros2_memory.history.bag_fold import JOINED_VERSION, counted_once
+from ros2_memory.core.model import BagState
+from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.history.context import Call
-from ros2_memory.history.driven_path import store_shared_paths
-from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
-from ros2_memory.insights.drive import drive_in, store_shared_standstills
+from ros2_memory.insights.drive import make_fragments
 from ros2_memory.queries import list_recorded_topics
 
 if TYPE_CHECKING:
@@ -45,7 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.columns.fill import Filling
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.history.context import Memory
 
 T = TypeVar("T")
@@ -64,11 +60,7 @@ _LATELY: Final = 4
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be digested is tried again: the disk may have failed."""
 
-_BESIDE_NS: Final[Ns] = 3600 * NS_PER_S
-"""Bags that are older than a new one by more than this do not touch it."""
 _MAX_REFUSED: Final = 10_000
-_PASSED_AT_ONCE: Final = 16_384
-"""Stored messages that stay in memory while all are passed through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +104,6 @@ class Backfill:
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
-        self._shared_from: Ns = MIN_NS
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags to be digested, the newest first."""
@@ -148,8 +139,22 @@ class Backfill:
         """Makes parts of what is stored and over, and keeps the store within what it may take."""
         snapshot = self._memory.index.snapshot()
         if self.filling is not None and snapshot.problem is None:
-            self.filling.merge(snapshot.timeline)
+            merged = self.filling.merge(snapshot.timeline)
             self.filling.trim()
+            self._make_fragments(merged)
+
+    def _make_fragments(self, windows: Sequence[TimeWindow]) -> None:
+        """Makes and stores what follows from the parts of some times."""
+        scanner = self._memory.columns
+        if scanner is None or not windows:
+            return
+        view = View(self._memory, Call())
+        for window in windows:
+            try:
+                make_fragments(view, window)
+            except EpisodicError as error:
+                log.warning("fragments_not_made", reason=str(error))
+            scanner.write_fragments()
 
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""
@@ -169,7 +174,6 @@ class Backfill:
             return False
         if not self.catalogue.put(self._key(bag), digest):
             return False
-        self._shared_from = min(self._shared_from, bag.start)
         log.debug(
             "bag_digested",
             path=str(bag.path),
@@ -215,34 +219,13 @@ class Backfill:
                 self.filling.store.look_after(thorough=thorough)
 
     def precompute(self) -> None:
-        """Computes what overlapping recordings hold together, before a client asks.
+        """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
 
-        And what the bags of a segment add up to, so that no process joins a week for its first
-        answer. What was computed once is not looked at again, but for the hour before the bags
-        that were digested since.
+        Before a client asks.
         """
         with suppress(EpisodicError):
             rows = list_recorded_topics(self._memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
-        since, self._shared_from = self._shared_from, MAX_NS
-        if since == MAX_NS:
-            return
-        view = View(self._memory, Call())
-        windows = (
-            _not_joined(view)
-            if since == MIN_NS
-            else [TimeWindow(max(since - _BESIDE_NS, MIN_NS), MAX_NS)]
-        )
-        if TimeWindow.everything() in windows:
-            # What this looks at of a week is not what clients ask about, nor what stays in memory.
-            passing = DigestCache(self.catalogue, self._bag_dir, most_messages=_PASSED_AT_ONCE)
-            view = View(replace(self._memory, recall=passing), Call())
-        for window in windows:
-            with suppress(EpisodicError):
-                poses = resolve_pose_topic(view)
-                store_shared_paths(view, poses, window)
-                store_shared_standstills(view, poses, window)
-        store_joined(self._memory)
 
     def prune(self) -> None:
         """Removes the entries of deleted files, and those of older configurations.
@@ -292,58 +275,6 @@ class Backfill:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
-
-
-def store_joined(memory: Memory) -> None:
-    """Stores what the bags of each segment add up to.
-
-    Nothing is looked at where all of it was stored, be it by another process.
-    """
-    view = View(memory, Call(stores_joined=True))
-    mark, numbers = _settled(view)
-    if memory.recall is None or not numbers:
-        return
-    catalogue = memory.recall.catalogue
-    if catalogue.joined(mark, [numbers]) is not None:
-        return
-    # Not only what is new: `forget` empties the catalogue of all that was joined.
-    window = TimeWindow.everything()
-    with suppress(EpisodicError):
-        drive_in(view, window)
-    topics = view.snapshot.timeline.topics()
-    for topic in filter(lambda each: view.stream.may_be_relatched([each]), topics):
-        with suppress(EpisodicError):
-            counted_once(view, topic)
-    catalogue.store_joined(mark, [numbers], b"-")
-
-
-def _settled(view: View) -> tuple[str, list[int]]:
-    """Returns the numbers of all digests in segments that stay as they are.
-
-    And the name of the mark that their bags' digests were joined, and those of overlapping
-    recordings stored.
-    """
-    timeline, limits = view.snapshot.timeline, view.memory.limits
-    known = [view.bags.digests_of(each) for each in timeline.segments if timeline.is_settled(each)]
-    numbers = [number for each in known if each is not None for number in each.numbers.values()]
-    depends_on = f"{limits.max_plausible_speed_mps:g} {view.pose_topic}"
-    return f"joined {JOINED_VERSION} and counted to {MOST_JOINED} {depends_on}", numbers
-
-
-def _not_joined(view: View) -> list[TimeWindow]:
-    """Returns the windows in which `precompute` of no process may have looked.
-
-    A server that starts beside a full catalogue would otherwise read what it has of a week.
-    """
-    recall, timeline = view.memory.recall, view.snapshot.timeline
-    mark, numbers = _settled(view)
-    if recall is None or not numbers or recall.catalogue.joined(mark, [numbers]) is None:
-        return [TimeWindow.everything()]
-    return [
-        TimeWindow(each.bags[0].start - _BESIDE_NS, each.latest + 1 + _BESIDE_NS)
-        for each in timeline.segments
-        if not timeline.is_settled(each)
-    ]
 
 
 async def keep_backfilled(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,11 +9,8 @@ import pytest
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.columns.store import BagKey
-from ros2_memory.history.context import Call
-from ros2_memory.history.view import TimeRange
 from ros2_memory.index import timeline
 from ros2_memory.index.segment import Segment
-from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.memories import memory_of, recalling
 
@@ -115,24 +110,3 @@ def test_of_stored_messages_those_of_the_segments_asked_last_stay_in_memory(
         assert [each.log_time for each in records] == [T0 + nth * 100 + each for each in range(5)]
     first, second, third = ([*each.numbers.values()] for each in digests)
     assert asked == [*first, *second, *third, *second]
-
-
-@pytest.mark.parametrize("answer", ["", "x", "7", "[]", '["zz", 1, 2]', '{"a": [[1], 2]}'])
-def test_a_cached_answer_that_cannot_be_parsed_is_computed_again(
-    tmp_path: Path, answer: str
-) -> None:
-    for recording in ("a", "b"):
-        messages = [odom(T0 + n, 0.1 * n, 0.0) for n in range(5)]
-        write_mcap(tmp_path / recording / f"{recording}_0.mcap", messages)
-    memory = recalling(memory_of(tmp_path), tmp_path)
-
-    def answers() -> object:
-        way = trajectory_summary(memory, Call(), TimeRange(start_s=0.0, end_s=9e9))
-        return list_recorded_topics(memory, Call()), way
-
-    before = answers()
-    with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
-        changed = base.execute("UPDATE remembered SET answer = ?", (answer,)).rowcount
-        base.commit()
-    assert changed == 1
-    assert answers() == before

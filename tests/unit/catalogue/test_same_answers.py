@@ -23,7 +23,6 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap, recap_or_before
-from ros2_memory.serving.backfill import store_joined
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
 from tests.support.examples import LONG, examples
@@ -147,7 +146,6 @@ def test_what_is_stored_of_many_bags_changes_no_answer(
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
         filling = recalling(replace(plain), bag_dir)
         assert filling.recall is not None
-        store_joined(filling)
         assert filling.columns is not None
         # As another process: nothing is in memory.
         columns = Scanner(filling.columns.store, bag_dir)

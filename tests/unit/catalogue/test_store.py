@@ -35,7 +35,7 @@ KEY = BagKey("rec/rec_0.mcap", 1234, T0, 0)
 def digest_of(*messages: Msg) -> Digest:
     reader = FakeReader()
     path = reader.add(Path("bag.mcap"), messages)
-    return Digester(reader, extractor(), 10.0).digest(path)
+    return Digester(reader, extractor()).digest(path)
 
 
 DIGEST = digest_of(
@@ -107,15 +107,9 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     file = BagFile(path, size, mtime_ns, BagState.CLOSED, *content, sidecar_ns, number)
     assert again.known_files(tmp_path) == {path: file}
     for held in DIGEST.topics:
-        assert again.poses(held.topic, [number]).get(number) == held.poses
-        assert again.standstills(held.topic, [number]).get(number) == held.standstills
         assert again.edges(held.topic, [number]).get(number) == held.edges
         assert again.messages(held.topic, [number]).get(number) == held.kept
-    assert topic(DIGEST, "/odom").poses is not None
     assert topic(DIGEST, "/tf_static").kept is not None
-    standstills = topic(DIGEST, "/odom").standstills
-    assert standstills is not None
-    assert standstills.head
 
 
 def test_digests_are_read_from_a_file_that_replaced_another(
@@ -131,9 +125,8 @@ def test_digests_are_read_from_a_file_that_replaced_another(
     [number] = catalogue.find([KEY])
     assert former is not None
     assert number is not None
-    assert catalogue.standstills("/odom", [former, number]) == {
-        number: topic(DIGEST, "/odom").standstills
-    }
+    kept = topic(DIGEST, "/tf_static").kept
+    assert catalogue.messages("/tf_static", [former, number]) == {number: kept}
 
 
 @pytest.mark.parametrize(
@@ -214,7 +207,7 @@ def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path
     assert after > before
     assert catalogue.newest() == after
     assert not holds(catalogue)
-    assert catalogue.poses("/odom", [before, after]) == {}
+    assert catalogue.messages("/tf_static", [before, after]) == {}
 
 
 def test_compacting_gives_back_what_was_deleted(tmp_path: Path) -> None:
@@ -238,14 +231,7 @@ def test_what_entries_add_up_to_is_kept_only_while_all_of_them_are_there(tmp_pat
     keys = [KEY, KEY._replace(path="rec/rec_1.mcap"), KEY._replace(path="rec/rec_2.mcap")]
     assert catalogue.put_all([(each, digest_of(boolean(T0, True))) for each in keys])
     numbers = [each for each in catalogue.find(keys) if each is not None]
-    catalogue.store_joined("a", [numbers[:2], numbers[2:]], b"together")
-    assert catalogue.joined("a", [numbers[:2], numbers[2:]]) == b"together"
-    assert catalogue.joined("a", [numbers, []]) is None
-    catalogue.store_joined("big", [numbers], random.Random(1).randbytes(9000))
-    assert catalogue.joined("big", [numbers]) == b""
     catalogue.forget([keys[2].path])
-    catalogue.store_joined("late", [numbers[:2], numbers[2:]], b"together")
-    assert catalogue.joined("late", [numbers[:2], numbers[2:]]) is None
     catalogue.cache_answer("what", numbers[:2], "kept")
     catalogue.cache_answer("what", numbers, "late")
     assert catalogue.cached_answers("what") == {tuple(numbers[:2]): "kept"}
@@ -271,7 +257,7 @@ def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
     catalogue.forget([KEY.path])
     catalogue.close()
     with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
-        for table in ("bags", "held", "tales", "kept", "payloads"):
+        for table in ("bags", "held", "kept", "payloads"):
             assert base.execute(f"SELECT count(*) FROM {table}").fetchone() == (0,)  # noqa: S608
 
 
@@ -297,9 +283,9 @@ def test_a_file_that_turns_out_damaged_while_it_is_asked_is_set_aside_then(tmp_p
     [number] = catalogue.find([KEY])
     assert number is not None
     with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
-        base.execute("UPDATE held SET poses = x'00' WHERE poses IS NOT NULL")
+        base.execute("UPDATE held SET undecodable = '{'")
         base.commit()
-    assert catalogue.poses("/odom", [number]) == {}
+    catalogue.undecodable("/odom", [number])
     assert not holds(catalogue)
     assert catalogue.put(KEY, DIGEST)
     assert holds(catalogue)

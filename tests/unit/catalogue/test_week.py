@@ -18,7 +18,6 @@ from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import TimeRange
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from tests.support.bags import detections, odom, tf, transform
@@ -27,7 +26,6 @@ from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.motion.odometry import PoseDigest
     from ros2_memory.recorder.index_manager import IndexManager
 
 T0_S = 1_700_000_000
@@ -60,7 +58,7 @@ def first_bag() -> Digest:
     messages.append(detections(T0, ["cup", "person"], at=(1.0, 0.0, 0.0)))
     messages.append(tf(T0, transform(T0, "odom", "base_link", (0.0, 0.0, 0.0))))
     path = reader.add(Path("bag.mcap"), messages)
-    return Digester(reader, extractor(), 10.0).digest(path)
+    return Digester(reader, extractor()).digest(path)
 
 
 def later(digest: Digest, by: int) -> Digest:
@@ -68,21 +66,7 @@ def later(digest: Digest, by: int) -> Digest:
     shifted = [
         replace(each, first=each.first + by, last=each.last + by) for each in digest.summary.topics
     ]
-    topics = tuple(
-        replace(each, poses=None if each.poses is None else moved(each.poses, by))
-        for each in digest.topics
-    )
-    return Digest(BagSummary(tuple(shifted)), topics)
-
-
-def moved(poses: PoseDigest, by: int) -> PoseDigest:
-    return replace(
-        poses,
-        vertices=tuple(
-            (time + by, (x + by / NS_PER_S / 10, y, z), turn)
-            for time, (x, y, z), turn in poses.vertices
-        ),
-    )
+    return Digest(BagSummary(tuple(shifted)), digest.topics)
 
 
 @pytest.fixture(scope="module")
@@ -110,15 +94,4 @@ def test_frames_of_a_week_are_listed_without_reading_a_bag(
     memory, reader = week
     [edge] = queries.frames(memory, Call()).edges
     assert (edge.parent, edge.child, edge.static) == ("odom", "base_link", False)
-    assert reader.opened == []
-
-
-def test_the_way_of_an_hour_is_summed_without_reading_a_bag(
-    week: tuple[Memory, FakeReader],
-) -> None:
-    memory, reader = week
-    hour = TimeRange(start_s=float(T0_S + 36_000), end_s=float(T0_S + 36_000 + 3599))
-    told = queries.trajectory_summary(memory, Call(), hour)
-    assert told.trajectory.poses == 360
-    assert told.trajectory.totals.distance_m == pytest.approx(359.0, rel=1e-6)
     assert reader.opened == []

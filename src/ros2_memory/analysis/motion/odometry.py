@@ -1,9 +1,8 @@
 """Distance, speed, gaps, jumps and resets along poses in log-time order.
 
-Everything can be joined from parts: a `PoseDigest` describes the poses of one bag, and digests
-joined in order give what all their poses together give. Lengths so joined differ a little from
-those of the same poses in other parts, since noise is estimated in each part; without noise they do
-not.
+Paths can be joined: what is measured of some poses and of those that follow them gives what all of
+them together give. Lengths so joined differ a little from those of the same poses in other parts,
+since noise is estimated in each part; without noise they do not.
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.core.model import Quaternion, Vector3
+    from ros2_memory.analysis.motion.path_length import Marks, Numbers, Rows
+    from ros2_memory.core.model import Vector3
 
 ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
 """The jitter of arrivals: the shortest time that the distance of two poses is divided by.
@@ -65,9 +65,6 @@ _DOUBTFUL: Final = 0.25
 _MAX_RESETS: Final = 1000
 _UNCERTAIN: Final = 4.0
 """Standard deviations by which a step must exceed its neighbours to be longer than them."""
-
-Vertex: TypeAlias = "tuple[Ns, Vector3, Quaternion | float | None]"
-"""A pose on a drawn path: its orientation as a quaternion or as a heading (rad) about Z."""
 
 Times: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 Link: TypeAlias = Literal["driven", "gap", "jump", "reset"]
@@ -338,36 +335,81 @@ class MotionTotals:
         return [leg for leg in (self.head, self.tail) if leg is not None]
 
 
-@dataclass(frozen=True, slots=True)
-class PoseDigest:
-    """The poses of one bag, summed up; a pose is valid where its coordinates are a place.
+class MeasuredPath(NamedTuple):
+    """What is measured of poses in order.
 
     Attributes:
-        poses: how many valid poses.
-        invalid: how many others.
-        totals: what was driven. Without legs where there are few poses: then `vertices` are all of
-            them, and joining measures them again.
-        twist: the highest speed (m/s) that a message states; None where none states one.
-        frames: the frames of all poses, in order of appearance.
-        vertices: the drawn path from the first valid pose to the last, split where the robot jumped
-            (see `polyline.PARTED`).
-        error_m: no valid pose is farther than this from the drawn path.
+        totals: what was driven.
+        step_mps: the highest speed from one pose to the next, where these are too few to measure
+            a speed.
+        parted: which poses a jump or a reset led to.
+        steps_m: what was driven from each pose to the next.
     """
 
-    poses: int
-    invalid: int
     totals: MotionTotals
-    twist: float | None
-    frames: tuple[str, ...]
-    vertices: tuple[Vertex, ...]
-    error_m: float
+    step_mps: float
+    parted: tuple[int, ...]
+    steps_m: Numbers
+
+
+def measured_path(times: Times, positions: Rows, fastest_mps: float) -> MeasuredPath:
+    """Measures poses: the more at a time, the better noise is distinguished from driving.
+
+    Args:
+        times: log times (ns), ascending; at least one.
+        positions: x, y and z (m) of each as a row; places.
+        fastest_mps: a step that would take a higher speed is a jump.
+    """
+    motion, parted, steps_m = Motion(fastest_mps), [], np.zeros(len(times) - 1)
+    apart = np.diff(times)
+    plain_m = np.sqrt((np.diff(positions, axis=0) ** 2).sum(axis=1))
+    begin = 0
+    for index in _odd_steps(apart, plain_m, fastest_mps):
+        sides = (
+            _poses(times, positions, max(begin, index - _NEARBY), index + 1),
+            _poses(times, positions, index + 1, index + 2 + _NEARBY),
+        )
+        # Too few poses do not show what is usual.
+        known = sum(map(len, sides)) >= _NEARBY
+        near = _motion_of(sides[0]).or_more(_motion_of(sides[1])) if known else None
+        here, there = sides[0][-1], sides[1][0]
+        before = motion.totals.newest
+        usual_ns = _usual_ns(apart, index, None if before is None else before.period_ns)
+        kind = link(here, there, usual_ns, fastest_mps, near)
+        if kind == "driven":
+            continue
+        steps_m[begin:index] = motion.add_leg(
+            times[begin : index + 1], positions[begin : index + 1]
+        )
+        motion.count_break(kind, here, there)
+        begin = index + 1
+        if kind != "gap":
+            parted.append(begin)
+    steps_m[begin:] = motion.add_leg(times[begin:], positions[begin:])
+    return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), steps_m)
+
+
+def _odd_steps(apart: Times, steps_m: Numbers, fastest_mps: float) -> list[int]:
+    """Returns after which poses a gap, a jump or a reset may be."""
+    plausible_m = fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
+    beside_m = np.maximum(
+        np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
+    )
+    odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
+    found: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
+    return found
+
+
+def _poses(times: Times, positions: Rows, begin: int, end: int) -> list[TimedPosition]:
+    places = zip(times[begin:end].tolist(), positions[begin:end].tolist(), strict=True)
+    return [TimedPosition(time, (x, y, z)) for time, (x, y, z) in places]
 
 
 class Motion:
-    """Measures poses that come in order, many at a time.
+    """Adds up what was driven.
 
     Attributes:
-        totals: of all poses so far.
+        totals: so far.
         step_mps: the highest speed from one pose to the next where these were too few to measure
             a speed.
     """
@@ -377,56 +419,28 @@ class Motion:
         self.totals = MotionTotals()
         self.step_mps = 0.0
 
-    def add(self, path: Sequence[TimedPosition]) -> list[int]:
-        """Takes the poses that come next; returns the indices of those that a jump or reset led to.
-
-        The more at a time, the better noise is distinguished from driving.
-        """
-        times = np.array([pose.time for pose in path], dtype=np.int64)
-        positions = np.array([pose.position for pose in path], dtype=np.float64)
+    def add_leg(self, times: Times, positions: Rows) -> Numbers:
+        """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
-        steps_m = np.sqrt((np.diff(positions, axis=0) ** 2).sum(axis=1))
-        plausible_m = self._fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
-        parted: list[int] = []
-        begin, newest = 0, self.totals.newest
-        beside_m = np.maximum(
-            np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
+        found = measured((times - times[0]) / NS_PER_S, positions)
+        ends = (
+            _poses(times, positions, 0, _NEARBY + 1),
+            _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times)),
         )
-        odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
-        for index in np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist():
-            here, there = path[index], path[index + 1]
-            leg = self.totals.newest
-            usual_ns = _usual_ns(apart, index, None if leg is None else leg.period_ns)
-            sides = (
-                path[max(begin, index - _NEARBY) : index + 1],
-                path[index + 1 : index + 2 + _NEARBY],
-            )
-            known = sum(map(len, sides))
-            near = _motion_of(sides[0]).or_more(_motion_of(sides[1]))
-            if index < begin + _NEARBY and newest is not None:
-                known += newest.poses
-                near = near.or_more(newest.near_last)
-            # Too few poses do not show what is usual.
-            usual = near if known >= _NEARBY else None
-            kind = link(here, there, usual_ns, self._fastest_mps, usual)
-            if kind == "driven":
-                continue
-            if self._go_on(newest, _leg(path[begin : index + 1])):
-                parted.append(begin)
-            self._break(kind, here, there)
-            begin, newest = index + 1, None
-            if kind != "gap":
-                parted.append(begin)
-        if self._go_on(newest, _leg(path[begin:])):
-            parted.append(begin)
-        return parted
+        period_ns = int(np.median(apart)) if len(apart) else None
+        near = _motion_of(ends[0]), _motion_of(ends[1])
+        leg = Leg(ends[0][0], ends[1][-1], len(times), period_ns, *found[:5], *near)
+        if len(times) <= SPEED_STEPS:
+            self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(ends[0])), 0.0)
+        self._go_on(None, leg, found.speed_mps)
+        return found.steps_m
 
     def join(self, later: MotionTotals) -> bool:
-        """Takes the legs of a digest that come next; returns whether a jump or reset led there."""
+        """Takes the legs that come next; returns whether a jump or reset led there."""
         if later.head is None:
             return False
         totals = self.totals
-        parted = self._go_on(totals.newest, (later.head, later.speed_mps, 0.0))
+        parted = self._go_on(totals.newest, later.head, later.speed_mps)
         totals.jumps += later.jumps
         totals.jumped_m += later.jumped_m
         totals.gaps += later.gaps
@@ -439,16 +453,14 @@ class Motion:
             totals.tail = later.tail
         return parted
 
-    def _go_on(self, before: Leg | None, measured_leg: _MeasuredLeg) -> bool:
+    def _go_on(self, before: Leg | None, leg: Leg, speed_mps: float | None) -> bool:
         """Takes the leg that comes next; returns whether a jump or reset led to it.
 
         `before` is the one before it, unless what ended that is counted already.
         """
-        leg, speed_mps, step_mps = measured_leg
         totals = self.totals
         if speed_mps is not None:
             totals.speed_mps = max(totals.speed_mps or 0.0, speed_mps)
-        self.step_mps = max(self.step_mps, step_mps)
         kind: Link | None = None
         if before is not None:
             periods = [each for each in (before.period_ns, leg.period_ns) if each is not None]
@@ -458,7 +470,7 @@ class Motion:
             usual_ns = max(periods, default=None)
             kind = link(before.last, leg.first, usual_ns, self._fastest_mps, near)
             if kind != "driven":
-                self._break(kind, before.last, leg.first)
+                self.count_break(kind, before.last, leg.first)
             elif totals.tail is not None:
                 totals.tail = before.joined(leg)
                 return False
@@ -480,7 +492,7 @@ class Motion:
             totals.sum_m += totals.tail.sum_m
             totals.tail = None
 
-    def _break(self, kind: Link, before: TimedPosition, after: TimedPosition) -> None:
+    def count_break(self, kind: Link, before: TimedPosition, after: TimedPosition) -> None:
         """Counts what ends a leg."""
         totals = self.totals
         step_m = distance(before.position, after.position)
@@ -495,35 +507,16 @@ class Motion:
             totals.resets = (*totals.resets, after.time)[:_MAX_RESETS]
 
 
-_MeasuredLeg: TypeAlias = "tuple[Leg, float | None, float]"
+def _step_mps(step: tuple[TimedPosition, TimedPosition]) -> float:
+    """Returns the speed of a step; 0 of one that takes no longer than arrivals jitter."""
+    here, there = step
+    elapsed = there.time - here.time
+    if elapsed < ARRIVAL_JITTER_NS:
+        return 0.0
+    return distance(here.position, there.position) / unix_from_ns(elapsed)
 
 
-def _leg(path: Sequence[TimedPosition]) -> _MeasuredLeg:
-    """Measures a leg; returns the highest speed on it or, of few poses, from one to the next."""
-    times = np.array([pose.time for pose in path], dtype=np.int64)
-    apart = np.diff(times)
-    seconds = (times - times[0]) / NS_PER_S
-    positions = [pose.position for pose in path]
-    found = measured(seconds, positions)
-    period_ns = int(np.median(apart)) if len(apart) else None
-    near = (_motion_of(path[: _NEARBY + 1]), _motion_of(path[-_NEARBY - 1 :]))
-    leg = Leg(path[0], path[-1], len(path), period_ns, *found[:5], *near)
-    step_mps = 0.0
-    if len(path) <= SPEED_STEPS:
-        step_mps = max(
-            (
-                distance(here.position, there.position) / unix_from_ns(there.time - here.time)
-                for here, there in pairwise(path)
-                if there.time - here.time >= ARRIVAL_JITTER_NS
-            ),
-            default=0.0,
-        )
-    return leg, found.speed_mps, step_mps
-
-
-def _usual_ns(
-    apart: np.ndarray[tuple[int], np.dtype[np.int64]], index: int, known: Ns | None
-) -> Ns:
+def _usual_ns(apart: Times, index: int, known: Ns | None) -> Ns:
     """Returns the usual time between poses around an interval, which itself counts least."""
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
     own = near.pop(min(index, _NEARBY))
@@ -537,8 +530,8 @@ def is_place(position: Vector3) -> bool:
     return abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M
 
 
-def faster(stated: float | None, speed_mps: float | None) -> float | None:
-    """Returns the higher of two speeds that messages state; NaN and infinity state nothing."""
-    if speed_mps is None or not math.isfinite(speed_mps):
-        return stated
-    return max(stated or 0.0, abs(speed_mps))
+def are_places(positions: Rows) -> Marks:
+    """Does the same for coordinates as rows."""
+    x, y, z = np.abs(positions).T
+    marks: Marks = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
+    return marks

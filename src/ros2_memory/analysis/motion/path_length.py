@@ -37,7 +37,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ros2_memory.core.geometry import distance
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from ros2_memory.core.model import Vector3
 
@@ -151,6 +151,7 @@ class Measured(NamedTuple):
         tail: how it ends.
         still: whether it is one creep from end to end: that of the head and of the tail.
         speed_mps: the highest speed over a second and eight steps; None for too few positions.
+        steps_m: the length of each step; they add up to `length_m` and the creeps at the ends.
     """
 
     length_m: float
@@ -159,37 +160,40 @@ class Measured(NamedTuple):
     tail: End
     still: bool
     speed_mps: float | None
+    steps_m: Numbers
 
 
-def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
+def measured(seconds: Numbers, positions: Rows) -> Measured:
     """Measures the length of a path and the highest speed on it.
 
     Args:
         seconds: when each position was taken, ascending.
-        positions: at least one; metres.
+        positions: x, y and z (m) of each as a row; at least one.
     """
-    points: Rows = np.array(positions, dtype=np.float64)
-    points -= points[0].copy()
+    points = positions - positions[0]
     plain = np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1))
     total = math.fsum(plain.tolist())
     apart = np.diff(seconds)
     if len(points) < FEWEST:
         speed_mps = _sparse_speed(plain, apart)
         ends = [End(step, 0.0, plain=True, creep=None) for step in plain.tolist() or [0.0]]
-        return Measured(total, total, ends[0], ends[-1], still=False, speed_mps=speed_mps)
+        return Measured(total, total, ends[0], ends[-1], False, speed_mps, plain)
     noise = _noise(points)
     lengths, as_plain, stationary = _steps(points, plain, noise)
     if np.median(apart) > _DENSE_S:
         stationary &= _scatters(points, noise)
         lengths, as_plain = plain, ~stationary
+    x, y, z = positions[0].tolist()
     creeps = [
-        (begin, end, _creep(points, noise, begin, end, positions[0]))
+        (begin, end, _creep(points, noise, begin, end, (x, y, z)))
         for begin, end in _rows(stationary)
         if end - begin >= _STATIONARY_STEPS or end - begin == len(plain)
     ]
     moved = lengths.copy()
-    for begin, end, _ in creeps:
+    steps = lengths.copy()
+    for begin, end, creep in creeps:
         moved[begin:end] = 0.0
+        steps[begin:end] = creep.length_m / (end - begin)
     before = next((creep for begin, _, creep in creeps if begin == 0), None)
     after = next((creep for _, end, creep in creeps if end == len(plain)), None)
     inside = [creep.length_m for begin, end, creep in creeps if begin > 0 and end < len(plain)]
@@ -201,6 +205,7 @@ def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
         End(float(moved[-1]), float(spread[-1]), bool(as_plain[-1]), after),
         still=bool(creeps) and creeps[0][:2] == (0, len(plain)),
         speed_mps=_highest_speed(seconds, moved),
+        steps_m=plain if as_plain.all() else steps,
     )
 
 

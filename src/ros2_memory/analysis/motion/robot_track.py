@@ -36,6 +36,8 @@ _SLOT_NS: Final[Ns] = NS_PER_S // 5
 """Of the poses in a slot of the clock the first and the last count: nothing bends a way between."""
 
 _MAX_M: Final = 1e6
+_PER_M: Final = 10_000
+"""Vertices are rounded to 0.1 mm, as the store has poses."""
 _WEIGHT: Final = TOLERANCE_M / TOLERANCE_RAD
 """Metres that count as much as a radian."""
 _TURN: Final = 1 << 22
@@ -118,7 +120,8 @@ def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: in
     """Returns the track by poses in log-time order; those that are no place are left out."""
     fine = np.flatnonzero((np.abs(x) < _MAX_M) & (np.abs(y) < _MAX_M))  # false for NaN
     fine = fine[thinned(times[fine])]
-    times, x, y, heading = times[fine], x[fine], y[fine], heading[fine]
+    times, heading = times[fine], heading[fine]
+    x, y = (np.rint(column[fine] * _PER_M) / _PER_M for column in (x, y))
     known = np.isfinite(heading)
     turns = np.rint(np.where(known, heading, 0.0) / math.tau * _TURN).astype(np.int64)
     stretches = times // STRETCH_NS

@@ -1,49 +1,52 @@
-"""The driven path, measured and drawn in bounded memory.
+"""The driven path, measured and drawn.
 
-Poses are measured many at a time (see `odometry` and `path_length`). The drawn path is simplified
-on the way (see `polyline`); the deviations of all stages add up to at most the tolerance, unless a
-limit on the count of vertices widens it.
+What is measured of poses depends on how many of them are measured together (see `path_length`). So
+a history is measured in slices of `SLICE_NS` of the clock, however it is cut into bags: a
+`PathSlice` is what is kept of one, and `Way.of` joins those of a window. The drawn path is
+simplified twice. The deviations add up and do no more, since a vertex that the second drops is
+beside the same kept segment as its neighbours: so to at most the tolerance, unless a limit on the
+count of vertices widens it. Where the robot jumped, nothing is drawn.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, Literal
 
-from ros2_memory.analysis.motion.odometry import (
-    Motion,
-    MotionTotals,
-    PoseDigest,
-    TimedPosition,
-    Vertex,
-    faster,
-    is_place,
-)
+import numpy as np
+
+from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, are_places, measured_path
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
-from ros2_memory.analysis.motion.polyline import PARTED, DrawnPath
-from ros2_memory.core.geometry import normalised, yaw
+from ros2_memory.analysis.poses import headings, joined_poses
+from ros2_memory.core.geometry import simplified
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import Pose, Quaternion, Vector3
-    from ros2_memory.core.timebase import Ns
+    from numpy.typing import NDArray
 
+    from ros2_memory.analysis.poses import Floats, Poses, Vectors
+    from ros2_memory.core.model import Vector3
+    from ros2_memory.storage.base import IntArray
+
+SLICE_NS: Final[Ns] = 300 * NS_PER_S
+"""Slices are counted from the epoch. Every time zone is a multiple of this off UTC."""
 TOLERANCE_M: Final = 0.05
 """How far a pose may be from the drawn path, unless a limit on count widens it."""
-
 MAX_WAYPOINTS: Final = 50
 """Vertices of the path that is returned, unless more or fewer are asked for."""
 
-_BAG_VERTICES: Final = 32
-"""Vertices of the path that is stored of one bag; all of its poses, where they are no more."""
-
+_MOST_VERTICES: Final = 400
+"""Vertices of the path that is kept of a slice, but for the ends of jumps."""
+_FEW: Final = 32
+"""Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
 _NOISY_M: Final = 0.001
-
-_BATCH: Final = 2048
-"""Poses that are measured together."""
+_BYTES: Final = 3000
+"""About how much memory a slice takes without its vertices."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,184 +101,293 @@ class Trajectory:
         return more_m > max(_NOISY_SHARE * distance_m, _NOISY_M)
 
 
-class _Poses:
-    """Takes poses in log-time order, and measures and draws many of them at a time."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Line:
+    """A drawn path, with the metres driven up to each of its vertices.
 
-    def __init__(self, max_plausible_speed_mps: float, tolerance_m: float) -> None:
-        self._motion = Motion(max_plausible_speed_mps)
-        self._path = DrawnPath(tolerance_m)
-        self._waiting: list[Vertex] = []
-        self._poses = 0
-        self._invalid = 0
-        self._twist: float | None = None
-        self._frames: dict[str, None] = {}
-
-    def add(self, time: Ns, pose: Pose, speed_mps: float | None = None) -> None:
-        """Takes the next pose, and the speed that its message states, if it states one."""
-        self._frames[pose.frame_id] = None
-        if not is_place(pose.position):
-            self._invalid += 1
-            return
-        self._twist = faster(self._twist, speed_mps)
-        self._add((time, pose.position, pose.orientation))
-
-    def _add(self, vertex: Vertex) -> None:
-        self._poses += 1
-        self._waiting.append(vertex)
-        if len(self._waiting) == _BATCH:
-            self._measure()
-
-    def _measure(self) -> None:
-        """Measures and draws the waiting poses."""
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return
-        parted = {
-            *self._motion.add([TimedPosition(time, position) for time, position, _ in waiting])
-        }
-        for index, vertex in enumerate(waiting):
-            if index in parted:
-                self._path.part()
-            self._path.add(vertex)
-
-
-class TrajectoryBuilder(_Poses):
-    """Builds a trajectory from poses in log-time order; holds a bounded number of them.
-
-    A step that would take more than `max_plausible_speed_mps` (m/s) is a jump. The path is drawn
-    with at most `max_waypoints`, within `tolerance_m` (m) where these are enough.
-
-    Raises:
-        ValueError: `max_waypoints` is below 2, or a limit is not positive.
+    Attributes:
+        times: log times (ns), ascending.
+        metres: since the first vertex; without gaps, jumps and what noise adds.
+        places: x, y and z (m), as rows.
+        headings: about z (rad); NaN where it is not known.
+        jumps: whether the robot jumped to the vertex, instead of driving.
     """
 
-    def __init__(
-        self,
-        max_plausible_speed_mps: float,
-        max_waypoints: int = MAX_WAYPOINTS,
-        tolerance_m: float = TOLERANCE_M,
-    ) -> None:
-        if max_waypoints < 2 or not (max_plausible_speed_mps > 0 and tolerance_m > 0):
-            raise ValueError(
-                f"a trajectory needs 2 or more waypoints ({max_waypoints}), a plausible speed"
-                f" ({max_plausible_speed_mps} m/s) and a tolerance ({tolerance_m} m) above 0"
-            )
-        super().__init__(max_plausible_speed_mps, tolerance_m)
-        self._max_waypoints = max_waypoints
+    times: IntArray
+    metres: Floats
+    places: Vectors
+    headings: Floats
+    jumps: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Returns the number of vertices."""
+        return self.times.size
+
+    def rows(self, which: IntArray) -> Line:
+        """Returns some vertices, in the order given."""
+        return Line(
+            self.times[which],
+            self.metres[which],
+            self.places[which],
+            self.headings[which],
+            self.jumps[which],
+        )
+
+    def metres_at(self, times: IntArray) -> Floats:
+        """Returns the metres driven up to some log times (ns); there must be a vertex."""
+        return self._at(times, self.metres)
+
+    def places_at(self, times: IntArray) -> Vectors:
+        """Returns where the robot was at some log times (ns), as rows; there must be a vertex."""
+        return np.stack([self._at(times, axis) for axis in self.places.T], axis=1)
+
+    def at(self, times: IntArray) -> Line:
+        """Returns where the robot was at some log times (ns); beside a jump at the nearer vertex.
+
+        There must be a vertex.
+        """
+        after = np.searchsorted(self.times, times, side="right").clip(max=len(self) - 1)
+        before = np.maximum(after - 1, 0)
+        lasted = np.maximum(self.times[after] - self.times[before], 1)
+        share = ((times - self.times[before]) / lasted).clip(0.0, 1.0)
+        share = np.where(self.jumps[after], np.rint(share), share)
+        turn = np.remainder(self.headings[after] - self.headings[before] + np.pi, 2 * np.pi) - np.pi
+        return Line(
+            times,
+            self.metres_at(times),
+            self.places[before] + (self.places[after] - self.places[before]) * share[:, None],
+            self.headings[before] + turn * share,
+            np.zeros(len(times), np.bool_),
+        )
+
+    def _at(self, times: IntArray, values: Floats) -> Floats:
+        since = self.times[0]
+        found: Floats = np.interp(times - since, self.times - since, values)
+        return found
+
+
+def joined_lines(lines: Sequence[Line]) -> Line:
+    """Returns the vertices of some lines, one line after the other."""
+    return Line(
+        np.concatenate([line.times for line in lines]),
+        np.concatenate([line.metres for line in lines]),
+        np.concatenate([line.places for line in lines]),
+        np.concatenate([line.headings for line in lines]),
+        np.concatenate([line.jumps for line in lines]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathSlice:
+    """The path of the poses of a stretch of time; a pose is valid where it is at a place.
+
+    Attributes:
+        first: log time (ns) of the first pose, valid or not.
+        last: of the last one.
+        poses: how many valid poses.
+        invalid: how many others.
+        totals: what was driven.
+        step_mps: see `odometry.Motion`.
+        twist: the highest speed (m/s) that a message states; None where none states one.
+        frames: the frames of all poses, in order of appearance.
+        line: the drawn path from the first valid pose to the last.
+        error_m: no valid pose is farther than this from it.
+        few: the poses, where they are so few that those beside them decide how they are measured.
+    """
+
+    first: Ns
+    last: Ns
+    poses: int
+    invalid: int
+    totals: MotionTotals
+    step_mps: float
+    twist: float | None
+    frames: tuple[str, ...]
+    line: Line
+    error_m: float
+    few: Poses | None
 
     @property
-    def frames(self) -> tuple[str, ...]:
-        """The frames of all poses so far, valid or not, in order of appearance."""
-        return tuple(self._frames)
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return _BYTES + 49 * len(self.line)
 
-    def join(self, whole: PoseDigest) -> None:
-        """Takes all poses of a bag that come next."""
-        self._frames.update(dict.fromkeys(whole.frames))
-        self._invalid += whole.invalid
-        self._twist = faster(self._twist, whole.twist)
-        if whole.totals.head is None:
-            for vertex in whole.vertices:
-                self._add(vertex)
-            return
-        self._measure()
-        self._poses += whole.poses
-        if self._motion.join(whole.totals):
-            self._path.part()
-        self._path.extend(whole.vertices, whole.error_m)
 
-    def result(self) -> Trajectory:
-        """Returns the trajectory so far; more poses may be added after."""
-        self._measure()
-        totals = replace(self._motion.totals)
-        distance_m, duration_s = totals.distance_m, totals.duration_s
+def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_M) -> PathSlice:
+    """Measures and draws poses.
+
+    Args:
+        poses: in order.
+        fastest_mps: a step that would take a higher speed is a jump.
+        tolerance_m: of the path that is drawn of slices; this one uses a quarter of it.
+    """
+    valid = np.flatnonzero(are_places(poses.positions))
+    known = poses if valid.size == len(poses) else poses.rows(valid)
+    stated = known.speeds[np.isfinite(known.speeds)]
+    totals, step_mps, line, error_m = MotionTotals(), 0.0, NO_LINE, 0.0
+    if len(known):
+        measured = measured_path(known.times, known.positions, fastest_mps)
+        totals, step_mps = measured.totals, measured.step_mps
+        kept = np.arange(len(known))
+        if len(known) > _FEW:
+            parted = np.array(measured.parted, np.intp)
+            ends = np.unique(np.concatenate(([0, len(known) - 1], parted - 1, parted)))
+            seconds = (known.times - known.times[0]) / NS_PER_S
+            kept, error_m = simplified(
+                known.positions, seconds, ends, tolerance_m / 4, _MOST_VERTICES
+            )
+        line = Line(
+            known.times[kept],
+            np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
+            known.positions[kept],
+            headings(known.turns[kept]),
+            np.isin(kept, measured.parted),
+        )
+    return PathSlice(
+        int(poses.times[0]) if len(poses) else 0,
+        int(poses.times[-1]) if len(poses) else 0,
+        len(known),
+        len(poses) - len(known),
+        totals,
+        step_mps,
+        float(stated.max()) if stated.size else None,
+        poses.frames.names(),
+        line,
+        error_m,
+        poses if len(known) <= _FEW else None,
+    )
+
+
+NO_LINE: Final = Line(
+    np.empty(0, np.int64), np.empty(0), np.empty((0, 3)), np.empty(0), np.empty(0, np.bool_)
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """The path of a window.
+
+    Attributes:
+        first: log time (ns) of the first pose, valid or not.
+        last: of the last one.
+        poses: how many valid poses.
+        invalid: how many others.
+        totals: what was driven.
+        frames: the frames of all poses, in order of appearance.
+        line: the drawn path; its metres add up to what was driven.
+        error_m: no valid pose is farther than this from it.
+        twist: the highest speed (m/s) that a message states; None where none states one.
+        step_mps: see `odometry.Motion`.
+    """
+
+    first: Ns
+    last: Ns
+    poses: int
+    invalid: int
+    totals: MotionTotals
+    frames: tuple[str, ...]
+    line: Line
+    error_m: float
+    twist: float | None
+    step_mps: float
+
+    @classmethod
+    def of(cls, slices: Sequence[PathSlice], fastest_mps: float) -> Way:
+        """Joins slices in order, of which there is one at least."""
+        slices = [*_together(slices, fastest_mps)]
+        motion = Motion(fastest_mps)
+        lines: list[Line] = []
+        for some in slices:
+            jumped = motion.join(some.totals)
+            # What joining adds to the slice's own length is driven up to its first vertex.
+            metres = some.line.metres + (motion.totals.distance_m - some.totals.distance_m)
+            jumps = some.line.jumps.copy()
+            jumps[:1] |= jumped
+            lines.append(replace(some.line, metres=metres, jumps=jumps))
+        line = joined_lines(lines)
+        # Where two places turn out to be one, joining takes some metres back.
+        metres = np.maximum.accumulate(np.minimum(line.metres, motion.totals.distance_m))
+        twists = [some.twist for some in slices if some.twist is not None]
+        return cls(
+            slices[0].first,
+            slices[-1].last,
+            sum(each.poses for each in slices),
+            sum(each.invalid for each in slices),
+            motion.totals,
+            tuple(dict.fromkeys(frame for each in slices for frame in each.frames)),
+            replace(line, metres=metres),
+            max(each.error_m for each in slices),
+            max(twists, default=None),
+            max(each.step_mps for each in slices),
+        )
+
+    def trajectory(
+        self, max_waypoints: int = MAX_WAYPOINTS, tolerance_m: float = TOLERANCE_M
+    ) -> Trajectory:
+        """Returns the measurements, and the path drawn with so many waypoints at most.
+
+        It is not drawn at all for 0; else with 2 at least, within `tolerance_m` (m) where these are
+        enough.
+        """
+        distance_m, duration_s = self.totals.distance_m, self.totals.duration_s
         avg_speed = distance_m / duration_s if duration_s > 0 else 0.0
         # Drivers without a twist leave it zero, which is wrong where the robot moved.
-        stated = self._twist if self._twist or not distance_m else None
-        step_mps = self._motion.step_mps if self._poses <= SPEED_STEPS else 0.0
-        measured = totals.speed_mps or step_mps
-        drawn = self._path.drawn(self._max_waypoints)
+        stated = self.twist if self.twist or not distance_m else None
+        step_mps = self.step_mps if self.poses <= SPEED_STEPS else 0.0
+        measured = self.totals.speed_mps or step_mps
+        waypoints: tuple[Waypoint, ...] = ()
+        error_m = 0.0
+        if max_waypoints and len(self.line):
+            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m, tolerance_m)
         return Trajectory(
-            totals=totals,
-            avg_speed=avg_speed,
-            max_speed=max(measured, avg_speed) if stated is None else stated,
-            max_speed_from="positions" if stated is None else "twist",
-            waypoints=tuple(
-                Waypoint(time, position, _heading(turn), jump=place == 0 and number > 0)
-                for number, piece in enumerate(drawn.pieces)
-                for place, (time, position, turn) in enumerate(piece)
-            ),
-            waypoint_error_m=drawn.error_m,
-            poses=self._poses,
-            invalid=self._invalid,
+            self.totals,
+            avg_speed,
+            max(measured, avg_speed) if stated is None else stated,
+            "positions" if stated is None else "twist",
+            waypoints,
+            error_m,
+            self.poses,
+            self.invalid,
         )
 
 
-def joined_poses(
-    found: Sequence[tuple[PoseDigest, tuple[Ns, Ns]]], max_plausible_speed_mps: float
-) -> list[tuple[PoseDigest, tuple[Ns, Ns]]]:
-    """Returns the digests of consecutive bags, with their times, as of few bags.
+def drawn(
+    line: Line, at_most: int, error_m: float = 0.0, tolerance_m: float = TOLERANCE_M
+) -> tuple[tuple[Waypoint, ...], float]:
+    """Draws a line with so many waypoints at most, 2 or more; then the longest jumps alone part it.
 
-    Those of few poses stay as they are: what comes before and after them decides how they are
-    measured.
+    Args:
+        line: of one vertex at least.
+        at_most: see above.
+        error_m: how far poses may be off the line.
+        tolerance_m: how far they may be off what is drawn, where so many waypoints are enough.
+
+    Returns:
+        The waypoints, and how far (m) poses may be off these.
     """
-    joined: list[tuple[PoseDigest, tuple[Ns, Ns]]] = []
-    for has_legs, some in groupby(found, key=lambda each: each[0].totals.head is not None):
-        bags = [*some]
-        if not has_legs or len(bags) == 1:
-            joined += bags
-            continue
-        motion = Motion(max_plausible_speed_mps)
-        vertices: list[Vertex] = []
-        for each, _ in bags:
-            if motion.join(each.totals):
-                vertices.append(PARTED)
-            vertices += each.vertices
-        twist: float | None = None
-        for each, _ in bags:
-            twist = faster(twist, each.twist)
-        whole = PoseDigest(
-            poses=sum(each.poses for each, _ in bags),
-            invalid=sum(each.invalid for each, _ in bags),
-            totals=motion.totals,
-            twist=twist,
-            frames=tuple(dict.fromkeys(frame for each, _ in bags for frame in each.frames)),
-            vertices=tuple(vertices),
-            error_m=max(each.error_m for each, _ in bags),
-        )
-        joined.append((whole, (bags[0][1][0], bags[-1][1][1])))
-    return joined
+    jumps = np.flatnonzero(line.jumps[1:]) + 1
+    far_m = np.linalg.norm(line.places[jumps] - line.places[jumps - 1], axis=1)
+    parted = np.sort(jumps[np.argsort(-far_m, kind="stable")[: at_most // 2 - 1]])
+    ends = np.unique(np.concatenate(([0, len(line) - 1], parted - 1, parted)))
+    seconds = (line.times - line.times[0]) / NS_PER_S
+    left_m = max(tolerance_m - error_m, tolerance_m / 4)
+    kept, off_m = simplified(line.places, seconds, ends, left_m, at_most)
+    chosen = line.rows(kept)
+    parts = (chosen.jumps & np.isin(kept, [0, *parted])).tolist()
+    columns = chosen.times.tolist(), chosen.places.tolist(), chosen.headings.tolist(), parts
+    waypoints = tuple(
+        Waypoint(time, (x, y, z), None if math.isnan(heading) else heading, jump=jump)
+        for time, (x, y, z), heading, jump in zip(*columns, strict=True)
+    )
+    return waypoints, error_m + off_m
 
 
-class PoseCollector(_Poses):
-    """Builds the digest of one bag's poses, which come in log-time order.
-
-    `max_plausible_speed_mps` must be that of the trajectories which join the digest.
-    """
-
-    def __init__(self, max_plausible_speed_mps: float) -> None:
-        super().__init__(max_plausible_speed_mps, TOLERANCE_M / 4)
-
-    def digest(self) -> PoseDigest:
-        """Returns the digest."""
-        few = self._waiting if self._poses <= _BAG_VERTICES else None
-        self._measure()
-        drawn = self._path.drawn(_BAG_VERTICES)
-        vertices = drawn.row() if few is None else few
-        totals = self._motion.totals
-        return PoseDigest(
-            poses=self._poses,
-            invalid=self._invalid,
-            totals=replace(totals) if few is None else replace(totals, head=None, tail=None),
-            twist=self._twist,
-            frames=tuple(self._frames),
-            vertices=tuple((time, position, _heading(turn)) for time, position, turn in vertices),
-            error_m=drawn.error_m if few is None else 0.0,
-        )
-
-
-def _heading(turn: Quaternion | float | None) -> float | None:
-    """Returns the heading (rad) of a vertex; None where it has none."""
-    if turn is None or isinstance(turn, float):
-        return turn
-    unit = normalised(turn)
-    return None if unit is None else yaw(unit)
+def _together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
+    """Yields the slices; of consecutive ones with few poses each one of all these poses."""
+    for are_few, some in groupby(slices, key=lambda each: each.few is not None):
+        found = [*some]
+        few = [each.few for each in found if each.few is not None]
+        if are_few and len(found) > 1:
+            yield path_slice(joined_poses(few), fastest_mps)
+        else:
+            yield from found

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.analysis.conditions import words_of
 from ros2_memory.analysis.topic_events import NO_EVENTS
-from ros2_memory.catalogue.codec import decode_poses, decode_standstills
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.store import Catalogue
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import date
 
-    from ros2_memory.analysis.motion.odometry import PoseDigest
-    from ros2_memory.analysis.motion.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.store import BagKey
     from ros2_memory.core.model import BagFile
@@ -89,14 +86,6 @@ class LakeCatalogue(Catalogue):
     def find(self, keys: Sequence[BagKey]) -> list[int | None]:
         """Returns the numbers of the bags, which all have an entry."""
         return [key.sidecar_ns for key in keys]
-
-    def poses(self, topic: str, numbers: Sequence[int]) -> dict[int, PoseDigest]:
-        """Returns the digests of the topic's poses."""
-        return _decoded(self._packed("poses", topic, numbers), decode_poses)
-
-    def standstills(self, topic: str, numbers: Sequence[int]) -> dict[int, StandstillDigest]:
-        """Returns the standstills among the topic's poses."""
-        return _decoded(self._packed("standstills", topic, numbers), decode_standstills)
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic; of digests of another version nothing is known."""

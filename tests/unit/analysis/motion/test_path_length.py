@@ -14,14 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.odometry import TimedPosition, link
-from ros2_memory.analysis.motion.trajectory import (
-    PoseCollector,
-    Trajectory,
-    TrajectoryBuilder,
-)
-from ros2_memory.catalogue.codec import decode_poses, encode_poses
-from ros2_memory.core.geometry import simplify_to
-from ros2_memory.core.model import Pose
+from ros2_memory.analysis.motion.trajectory import Trajectory
+from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
@@ -31,12 +25,11 @@ from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, recalling
+from tests.support.posed import posed, way_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-
-    from ros2_memory.analysis.motion.odometry import PoseDigest
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -85,20 +78,9 @@ def plain_sum(points: Points) -> float:
 
 
 def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -> Trajectory:
-    """Pose by pose, or as the digests of bags that are cut at these poses."""
-    times = [BEGIN + round(index * S / hertz) for index in range(len(points))]
-    poses = [Pose((x, y, z), None) for x, y, z in points.tolist()]
-    builder = TrajectoryBuilder(10.0)
-    if cuts is None:
-        for time, pose in zip(times, poses, strict=True):
-            builder.add(time, pose)
-        return builder.result()
-    for begin, end in pairwise(sorted({0, *cuts, len(points)})):
-        collector = PoseCollector(10.0)
-        for time, pose in zip(times[begin:end], poses[begin:end], strict=True):
-            collector.add(time, pose)
-        builder.join(decode_poses(encode_poses(collector.digest())))
-    return builder.result()
+    """Measured in slices of the clock, or in parts cut at these poses."""
+    rows = [(BEGIN + round(nth * S / hertz), place) for nth, place in enumerate(points.tolist())]
+    return way_of(posed(rows), 10.0, cuts).trajectory()
 
 
 # Standing
@@ -244,17 +226,6 @@ def test_without_noise_any_cuts_give_the_same_length(seed: int, count: int) -> N
     assert found.totals.distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
 
 
-def test_a_digest_outlives_its_bytes() -> None:
-    poses = np.concatenate([noisy(line(0.5, 50, 5), 0.01), noisy(np.zeros((200, 3)), 0.01)])
-    for some in (poses, poses[:251], poses[251:], poses[:20], poses[:0]):
-        collector = PoseCollector(10.0)
-        for index, (x, y, z) in enumerate(some):
-            collector.add(BEGIN + index * S // 50, Pose((float(x), float(y), float(z)), None))
-        digest: PoseDigest = collector.digest()
-        # As texts, since the vertex between two pieces of a path is no number.
-        assert repr(decode_poses(encode_poses(digest))) == repr(digest)
-
-
 # Speed
 
 
@@ -302,10 +273,8 @@ def test_what_lies_between_two_poses(
 def test_slow_poses_follow_each_other_up_to_five_usual_periods() -> None:
     for missing, gaps in ((4, 0), (5, 1)):
         x = [float(n) for n in range(30) if not 10 < n <= 10 + missing]
-        builder = TrajectoryBuilder(10.0)
-        for place in x:
-            builder.add(BEGIN + round(place * 2 * S), Pose((place + 5, 0.0, 0.0), None))
-        found = builder.result()
+        rows = [(BEGIN + round(place * 2 * S), (place + 5, 0.0, 0.0)) for place in x]
+        found = way_of(posed(rows), 10.0).trajectory()
         assert found.totals.gaps == gaps
         assert found.totals.distance_m + found.totals.gap_m == pytest.approx(29.0)
         assert found.totals.gap_m == (missing + 1 if gaps else 0)
@@ -453,11 +422,8 @@ def test_a_spike_that_comes_back_to_the_origin_is_no_reset() -> None:
 def test_messages_lost_on_the_way_home_are_no_reset(lost: int) -> None:
     poses = np.concatenate([line(1.0, 50, 5)[::-1], np.zeros((100, 3))])
     last = 250 - lost
-    builder = TrajectoryBuilder(10.0)
-    for nth, (x, y, z) in enumerate(poses):
-        if not last < nth < 250:
-            builder.add(BEGIN + nth * S // 50, Pose((float(x), float(y), float(z)), None))
-    found = builder.result()
+    rows = [(BEGIN + nth * S // 50, place) for nth, place in enumerate(poses.tolist())]
+    found = way_of(posed([*rows[: last + 1], *rows[250:]]), 10.0).trajectory()
     assert found.totals.resets == ()
     assert found.totals.distance_m == pytest.approx(5.0)
 
@@ -571,11 +537,11 @@ def test_of_very_many_turns_as_many_as_may_be_are_drawn() -> None:
 def test_no_way_back_is_dropped_that_is_longer_than_twice_the_stated_limit(
     xs: list[float], at_most: int
 ) -> None:
-    times = [float(nth) for nth in range(len(xs))]
-    path = [(x, 0.0, 0.0) for x in xs]
-    kept, error_m = simplify_to(path, 0.05, at_most, times)
+    path = np.array([(x, 0.0, 0.0) for x in xs])
+    clock, ends = np.arange(len(xs), dtype=np.float64), np.array([0, len(xs) - 1])
+    kept, error_m = simplified(path, clock, ends, 0.05, at_most)
     assert len(kept) <= at_most
-    for begin, end in pairwise(kept):
+    for begin, end in pairwise(kept.tolist()):
         rising = 1.0 if xs[end] >= xs[begin] else -1.0
         reach = -math.inf
         for x in xs[begin : end + 1]:

@@ -1,21 +1,15 @@
-"""Sudden losses of speed, and that cuts into bags change none."""
+"""Sudden losses of speed, and that cuts into slices change none."""
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.speed_drops import (
-    NO_DROPS,
-    SLOT_NS,
-    SpeedDrop,
-    SpeedDropBuilder,
-    SpeedDropCollector,
-)
+from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop, speed_drops
+from tests.support.posed import posed, stood_in
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -41,18 +35,9 @@ def driven(*legs: tuple[float, float, float], rate: int = 20) -> list[Pose]:
     return poses
 
 
-def found(poses: list[Pose], cuts: tuple[int, ...] = ()) -> list[SpeedDrop]:
-    """The drops, of whole bags where there are cuts."""
-    builder = SpeedDropBuilder()
-    if not cuts:
-        for pose in poses:
-            builder.add(*pose)
-    for start, stop in pairwise((0, *sorted(cuts), len(poses)) if cuts else ()):
-        collector = SpeedDropCollector()
-        for pose in poses[start:stop]:
-            collector.add(*pose)
-        builder.join(collector.digest())
-    return builder.drops
+def found(poses: list[Pose]) -> list[SpeedDrop]:
+    rows = [(at, place) for at, place, _ in poses]
+    return [*speed_drops(posed(rows, [turn for *_, turn in poses]))]
 
 
 def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
@@ -90,10 +75,8 @@ def test_poses_that_come_too_seldom_show_none() -> None:
 
 
 def test_poses_without_orientation_show_some() -> None:
-    builder = SpeedDropBuilder()
-    for at, place, _ in driven((5, 0.5, 0), (2, 0.0, 0.8)):
-        builder.add(at, place)
-    assert len(builder.drops) == 1
+    poses = driven((5, 0.5, 0), (2, 0.0, 0.8))
+    assert len(speed_drops(posed((at, place) for at, place, _ in poses))) == 1
 
 
 @given(
@@ -104,21 +87,19 @@ def test_poses_without_orientation_show_some() -> None:
         min_size=1,
         max_size=8,
     ),
-    shares=st.lists(st.floats(0, 1), min_size=1, max_size=12),
+    blocks=st.integers(1, 8),
     silent=st.booleans(),
 )
-def test_cuts_into_bags_change_nothing(
-    legs: list[tuple[float, float, float]], shares: list[float], silent: bool
+def test_slices_of_any_length_change_nothing(
+    legs: list[tuple[float, float, float]], blocks: int, silent: bool
 ) -> None:
     poses = driven(*legs, rate=10)
     if silent:
         poses = [each for each in poses if (each[0] - BEGIN) // SLOT_NS % 17 > 1]
-    cuts = tuple(int(share * len(poses)) for share in shares)
-    assert found(poses, cuts) == found(poses)
+    rows = [(at, place) for at, place, _ in poses]
+    turned = posed(rows, [turn for *_, turn in poses])
+    assert stood_in(turned, blocks=blocks)[1] == [*speed_drops(turned)]
 
 
-def test_a_bag_without_a_pose_changes_nothing() -> None:
-    assert SpeedDropCollector().digest() == NO_DROPS
-    builder = SpeedDropBuilder()
-    builder.join(NO_DROPS)
-    assert builder.drops == []
+def test_without_poses_there_is_no_drop() -> None:
+    assert speed_drops(posed([])) == ()

@@ -9,18 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.standstills import (
-    LARGEST_M,
-    SHORTEST_NS,
-    Standstill,
-    StandstillBuilder,
-    StandstillCollector,
-    StandstillDigest,
-    StandstillRun,
-)
-from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
+from ros2_memory.analysis.motion.standstills import LARGEST_M, SHORTEST_NS, Standstill
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
+from tests.support.posed import posed, stood_in
 
 Poses = list[tuple[int, tuple[float, float, float]]]
 S = NS_PER_S
@@ -62,41 +54,12 @@ def world(
     return World(poses, standing, 1 / hz)
 
 
-def standstills_of(poses: Poses) -> tuple[Standstill, ...]:
-    builder = StandstillBuilder()
-    for time, position in poses:
-        builder.add(time, position)
-    return builder.standstills()
+def standstills_of(poses: Poses, blocks: int = 10**6) -> tuple[Standstill, ...]:
+    """The standstills, found in slices of so many blocks of the clock; mostly in one."""
+    return stood_in(posed(poses), blocks=blocks)[0]
 
 
-CUTS = st.lists(st.floats(0, 1), max_size=8)
-"""Where a history is cut into bags, as parts of it."""
-
-
-def cuts_of(poses: Poses, parts: list[float]) -> list[int]:
-    return sorted({max(1, int(part * (len(poses) - 1))) for part in parts})
-
-
-def bags_of(poses: Poses, cuts: list[int]) -> list[StandstillDigest]:
-    """Bags that end before the poses at these places, as the catalogue gives them back."""
-    bags: list[StandstillDigest] = []
-    for begin, end in pairwise([0, *cuts, len(poses)]):
-        collector = StandstillCollector()
-        for time, position in poses[begin:end]:
-            collector.add(time, position)
-        digest = collector.digest()
-        if digest is not None:
-            again = decode_standstills(encode_standstills(digest))
-            assert again == digest
-            bags.append(again)
-    return bags
-
-
-def from_bags(poses: Poses, cuts: list[int]) -> tuple[Standstill, ...]:
-    builder = StandstillBuilder()
-    for each in bags_of(poses, cuts):
-        builder.join(each)
-    return builder.standstills()
+SLICES = st.integers(1, 40)
 
 
 def spans(standstills: tuple[Standstill, ...]) -> list[tuple[float, float]]:
@@ -148,72 +111,18 @@ def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
 
 
 @settings(max_examples=examples(150), deadline=None)
-@given(worlds(), CUTS)
-def test_where_a_history_is_cut_into_bags_changes_no_end_by_more_than_a_message(
-    made: World, parts: list[float]
-) -> None:
-    cuts = cuts_of(made.poses, parts)
-    whole, cut = spans(standstills_of(made.poses)), spans(from_bags(made.poses, cuts))
-    sure = [span for span in whole if span[1] - span[0] >= 3 + 2 * made.period]
-    assert len(cut) >= len(sure)
-    for span in cut:
-        near = min(made.standing, key=lambda each: abs(each[0] - span[0]))
-        assert abs(span[0] - near[0]) <= made.period + 1e-6
-        assert abs(span[1] - near[1]) <= made.period + 1e-6
+@given(st.one_of(worlds(), worlds(noise=0.01)), SLICES)
+def test_slices_of_any_length_change_nothing(made: World, blocks: int) -> None:
+    whole, parts = (
+        stood_in(posed(made.poses), blocks=10**6),
+        stood_in(posed(made.poses), blocks=blocks),
+    )
+    assert parts == whole
 
 
-@settings(max_examples=examples(25), deadline=None)
-@given(worlds(noise=0.01), CUTS)
-def test_noise_is_cut_into_bags_as_it_is_found_without_cuts(
-    made: World, parts: list[float]
-) -> None:
-    cuts = cuts_of(made.poses, parts)
-    whole, cut = standstills_of(made.poses), from_bags(made.poses, cuts)
-    assert len(whole) == len(cut)
-    for one, other in zip(whole, cut, strict=True):
-        assert abs(one.start - other.start) <= made.period * S + 1
-        assert abs(one.end - other.end) <= made.period * S + 1
-
-
-@settings(max_examples=examples(100), deadline=None)
-@given(
-    st.one_of(worlds(), worlds(noise=0.01)),
-    st.integers(2, 15),
-    st.lists(st.integers(1, 12), min_size=1, max_size=4),
-)
-def test_bags_that_are_joined_beforehand_are_as_those_that_come_one_by_one(
-    made: World, bag_s: int, sizes: list[int]
-) -> None:
-    legs = len(made.poses) * made.period / bag_s
-    bags = bags_of(made.poses, cuts_of(made.poses, [nth / legs for nth in range(1, int(legs) + 1)]))
-    alone, joined = StandstillBuilder(), StandstillBuilder()
-    for each in bags:
-        alone.join(each)
-    rest = [*bags]
-    for size in sizes * len(bags):
-        run, rest = rest[:size], rest[size:]
-        if run:
-            joined.join(StandstillRun.of(run))
-    assert joined.standstills() == alone.standstills()
-    assert [*joined.drops] == [*alone.drops]
-    assert joined.last == alone.last
-
-
-def test_of_bags_that_are_joined_beforehand_few_are_joined_again() -> None:
-    made = world([(40.0, 0.0), (20.0, 0.5), (3.5, 0.0), (7.0, -0.5)] * 20, noise=0.005)
-    run = StandstillRun.of(bags_of(made.poses, [*range(500, len(made.poses), 500)]))
-    assert len(run.lead) + len(run.trail) <= 12
-    assert len(run.found) >= 30
-    assert run.drops
-
-
-@pytest.mark.parametrize("bag_s", [None, 1.0, 10.0, 60.0])
-def test_an_hour_of_standing_with_noise_of_a_centimetre_is_one_standstill(
-    bag_s: float | None,
-) -> None:
+def test_an_hour_of_standing_with_noise_of_a_centimetre_is_one_standstill() -> None:
     poses = world([(3600.0, 0.0)], noise=0.01).poses
-    cuts = [] if bag_s is None else list(range(int(bag_s * 50), len(poses), int(bag_s * 50)))
-    [found] = standstills_of(poses) if bag_s is None else from_bags(poses, cuts)
+    [found] = standstills_of(poses)
     assert (found.end - found.start) / S == pytest.approx(3600, abs=0.1)
     assert found.box.diagonal < 0.05
     assert math.dist(found.box.centre, (0, 2, 0)) < 0.01
@@ -224,17 +133,15 @@ def test_an_hour_of_standing_with_noise_of_a_centimetre_is_one_standstill(
 def test_a_robot_that_creeps_does_not_stand(speed: float, hz: int) -> None:
     poses = world([(361.0, speed)], hz=hz).poses
     assert standstills_of(poses) == ()
-    assert from_bags(poses, list(range(77, len(poses), 150))) == ()
 
 
 @pytest.mark.parametrize("speed", [0.004, 0.005, 0.008])
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: float) -> None:
     made = world([(20.0, 0.0), (60.0, speed), (20.0, 0.0)], hz=20, noise=noise)
-    cuts = list(range(77, len(made.poses), 150))
-    for found in (standstills_of(made.poses), from_bags(made.poses, cuts)):
-        assert stood(found) == pytest.approx(40, abs=14)
-        assert all(each.end / S <= 127 or each.start / S >= 173 for each in found)
+    found = standstills_of(made.poses)
+    assert stood(found) == pytest.approx(40, abs=14)
+    assert all(each.end / S <= 127 or each.start / S >= 173 for each in found)
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.03, 0.05])
@@ -247,17 +154,13 @@ def test_a_robot_that_creeps_under_noise_does_not_stand(speed: float) -> None:
 @given(
     st.floats(0.0, 0.06),
     st.sampled_from([0.0, 0.001, 0.01]),
-    st.lists(st.integers(1, 5999), max_size=4, unique=True),
 )
-def test_the_box_of_a_standstill_does_not_grow_with_time(
-    speed: float, noise: float, cuts: list[int]
-) -> None:
+def test_the_box_of_a_standstill_does_not_grow_with_time(speed: float, noise: float) -> None:
     poses = world([(120.0, speed)], noise=noise).poses
-    for found in (standstills_of(poses), from_bags(poses, sorted(cuts))):
-        for each in found:
-            inside = [place for time, place in poses if each.start <= time <= each.end]
-            farthest = max(math.dist(each.box.centre, place) for place in inside)
-            assert farthest <= LARGEST_M / 2 + 6 * noise + 0.005
+    for each in standstills_of(poses):
+        inside = [place for time, place in poses if each.start <= time <= each.end]
+        farthest = max(math.dist(each.box.centre, place) for place in inside)
+        assert farthest <= LARGEST_M / 2 + 6 * noise + 0.005
 
 
 def test_a_standstill_that_drifts_away_ends_where_the_next_one_begins() -> None:
@@ -282,16 +185,13 @@ def test_poses_once_a_second_of_a_robot_that_drives_are_no_standstill() -> None:
 
 def test_poses_once_a_second_of_a_robot_that_stands_are_one_standstill() -> None:
     poses = world([(29, 0.0)], hz=1).poses
-    for cuts in ([], [3], [1, 2, 3, 4], [9, 14, 20]):
-        [found] = from_bags(poses, cuts)
-        assert found.end - found.start == 29 * S
+    [found] = standstills_of(poses)
+    assert found.end - found.start == 29 * S
 
 
 def test_a_silence_ends_a_standstill() -> None:
     poses = world([(5, 0.0)]).poses + world([(5, 0.0)], begin=200).poses
     assert spans(standstills_of(poses)) == [(100.0, 105.0), (200.0, 205.0)]
-    for cuts in ([251], [100, 251, 400], [240, 260]):
-        assert spans(from_bags(poses, cuts)) == [(100.0, 105.0), (200.0, 205.0)]
 
 
 def test_a_jump_ends_a_standstill() -> None:
@@ -300,10 +200,10 @@ def test_a_jump_ends_a_standstill() -> None:
     assert [round(each.box.centre[0], 3) for each in standstills_of(poses)] == [0.0, 3.0]
 
 
-@given(worlds(), CUTS)
+@given(worlds(), SLICES)
 @settings(max_examples=examples(30), deadline=None)
-def test_standstills_are_in_order_apart_and_long(made: World, parts: list[float]) -> None:
-    found = from_bags(made.poses, cuts_of(made.poses, parts))
+def test_standstills_are_in_order_apart_and_long(made: World, blocks: int) -> None:
+    found = standstills_of(made.poses, blocks)
     times = {time for time, _ in made.poses}
     for each in found:
         assert each.end - each.start >= SHORTEST_NS
@@ -339,49 +239,31 @@ def check_disjoint(found: tuple[Standstill, ...], poses: Poses) -> None:
 
 
 @settings(max_examples=examples(150), deadline=None)
-@given(restless(), CUTS)
-def test_standstills_under_any_noise_are_in_order_and_disjoint(
-    poses: Poses, parts: list[float]
-) -> None:
-    check_disjoint(standstills_of(poses), poses)
-    check_disjoint(from_bags(poses, cuts_of(poses, parts)), poses)
+@given(restless(), SLICES)
+def test_standstills_under_any_noise_are_in_order_and_disjoint(poses: Poses, blocks: int) -> None:
+    found = standstills_of(poses)
+    check_disjoint(found, poses)
+    assert standstills_of(poses, blocks) == found
 
 
 @pytest.mark.parametrize("noise", [0.015, 0.02])
-@pytest.mark.parametrize("bag_s", [None, 7])
 def test_a_robot_that_stands_under_noise_does_not_stand_longer_than_there_are_poses(
-    noise: float, bag_s: int | None
+    noise: float,
 ) -> None:
     poses = world([(1800.0, 0.0)], hz=10, noise=noise).poses
-    found = from_bags(poses, [] if bag_s is None else [*range(bag_s * 10, 18_000, bag_s * 10)])
+    found = standstills_of(poses)
     check_disjoint(found, poses)
     assert stood(found) > 900
-
-
-def test_any_number_of_poses_at_one_time_are_held_as_few() -> None:
-    collector = StandstillCollector()
-    for nth in range(20_000):
-        collector.add(S, (nth * 0.1, 0.0, 0.0))
-    digest = collector.digest()
-    assert digest is not None
-    assert len(digest.head) < 40_000
 
 
 def test_a_single_pose_is_no_standstill() -> None:
     assert standstills_of([(S, (0.0, 0.0, 0.0))]) == ()
 
 
-def test_without_poses_there_is_no_digest() -> None:
-    assert StandstillCollector().digest() is None
+def test_without_a_place_there_is_no_standstill() -> None:
+    assert standstills_of([(nth * S, (math.nan, 0.0, 0.0)) for nth in range(9)]) == ()
 
 
-def test_bytes_that_are_no_digest_are_refused() -> None:
-    collector = StandstillCollector()
-    for time, position in world([(9, 0.0)]).poses:
-        collector.add(time, position)
-    digest = collector.digest()
-    assert digest is not None
-    packed = encode_standstills(digest)
-    for wrong in (b"", packed[:-5], packed[:9] + b"x" + packed[10:]):
-        with pytest.raises(ValueError, match="not a digest of standstills"):
-            decode_standstills(wrong)
+def test_a_week_of_drifting_is_found_in_no_time_that_grows_with_its_square() -> None:
+    poses = world([(50_000.0, 0.002)], hz=1).poses
+    assert len(standstills_of(poses)) > 900

@@ -11,16 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.odometry import MotionTotals, PoseDigest
-from ros2_memory.analysis.motion.trajectory import (
-    TOLERANCE_M,
-    PoseCollector,
-    Trajectory,
-    TrajectoryBuilder,
-    joined_poses,
-)
+from ros2_memory.analysis.motion.odometry import MotionTotals
+from ros2_memory.analysis.motion.trajectory import TOLERANCE_M, Trajectory
+from ros2_memory.analysis.poses import Poses
+from ros2_memory.core.geometry import normalised
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
+from tests.support.posed import posed, way_of
 from tests.support.rosbags_oracle import messages
 from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import points
@@ -34,11 +31,6 @@ S = NS_PER_S
 MS = NS_PER_MS
 START = 1_700_000_000 * S
 LIMIT_MPS = 10.0
-
-
-def held_by(builder: TrajectoryBuilder) -> int:
-    """Returns how many poses a builder holds, to measure them and to draw the path."""
-    return builder._path.size + len(builder._waiting)
 
 
 def driven(
@@ -61,11 +53,23 @@ def summarise(
     max_plausible_speed_mps: float,
     max_waypoints: int = 50,
     tolerance_m: float = TOLERANCE_M,
+    cuts: Sequence[int] | None = None,
 ) -> Trajectory:
-    builder = TrajectoryBuilder(max_plausible_speed_mps, max_waypoints, tolerance_m)
-    for time, pose, speed in poses:
-        builder.add(time, pose, speed)
-    return builder.result()
+    way = way_of(arrays(poses), max_plausible_speed_mps, cuts)
+    return way.trajectory(max_waypoints, tolerance_m)
+
+
+def arrays(poses: Iterable[tuple[int, Pose, float | None]]) -> Poses:
+    """These poses as arrays, their quaternions at unit length."""
+    rows = [*poses]
+    turns = [
+        None if each.orientation is None else normalised(each.orientation) for _, each, _ in rows
+    ]
+    return posed(
+        ((time, pose.position) for time, pose, _ in rows),
+        [turn or (math.nan,) * 4 for turn in turns] or None,
+        [math.nan if speed is None else speed for *_, speed in rows] or None,
+    )
 
 
 def path_length(positions: Iterable[Vector3]) -> float:
@@ -231,59 +235,18 @@ def test_of_more_jumps_than_can_be_drawn_the_longest_are() -> None:
 )
 def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], cut: int) -> None:
     poses = driven(along_x(*accumulate(steps)))
-    builder, digests = TrajectoryBuilder(LIMIT_MPS, 200), []
-    for part in (poses[:cut], poses[cut:]):
-        collector = PoseCollector(LIMIT_MPS)
-        for time, pose, speed in part:
-            collector.add(time, pose, speed)
-        digests.append(collector.digest())
-    for digest in digests:
-        builder.join(digest)
-    whole, joined = summarise(poses, LIMIT_MPS, 200), builder.result()
-    drawable = all(digest.totals.jumps <= 15 for digest in digests)
+    cut = min(cut, len(poses) - 1)
+    parts = (poses[:cut], poses[cut:])
+    whole = summarise(poses, LIMIT_MPS, 200, cuts=[])
+    joined = summarise(poses, LIMIT_MPS, 200, cuts=[cut])
+    drawable = all(len(summarise(part, LIMIT_MPS, 200).waypoints) <= 100 for part in parts)
     assert [point.position for point in joined.waypoints if point.jump] == [
         point.position for point in whole.waypoints if point.jump
     ] or not drawable
 
 
-@given(
-    st.lists(st.sampled_from([0.0, 0.1, 0.5, 0.6, 40.0, -0.5]), min_size=40, max_size=160),
-    st.lists(st.integers(1, 60), min_size=1, max_size=5),
-    st.integers(1, 4),
-)
-def test_bags_that_are_joined_beforehand_are_as_those_that_come_one_by_one(
-    steps: list[float], sizes: list[int], at_once: int
-) -> None:
-    rest = driven(along_x(*accumulate(steps)))
-    found: list[tuple[PoseDigest, tuple[int, int]]] = []
-    for size in sizes * len(rest):
-        part, rest = rest[:size], rest[size:]
-        collector = PoseCollector(LIMIT_MPS)
-        for time, pose, speed in part:
-            collector.add(time, pose, speed)
-        if part:
-            found.append((collector.digest(), (part[0][0], part[-1][0])))
-    alone, joined = TrajectoryBuilder(LIMIT_MPS, 200), TrajectoryBuilder(LIMIT_MPS, 200)
-    for digest, _ in found:
-        alone.join(digest)
-    for nth in range(0, len(found), at_once):
-        for digest, _ in joined_poses(found[nth : nth + at_once], LIMIT_MPS):
-            joined.join(digest)
-    one, other = alone.result(), joined.result()
-    assert other.totals.distance_m == pytest.approx(one.totals.distance_m, abs=1e-9)
-    assert other.totals.path_sum_m == pytest.approx(one.totals.path_sum_m, abs=1e-9)
-    for name in ("jumps", "gaps", "resets", "speed_mps", "duration_s"):
-        assert getattr(other.totals, name) == getattr(one.totals, name)
-    for name in ("waypoints", "waypoint_error_m", "poses", "invalid", "max_speed"):
-        assert getattr(other, name) == getattr(one, name)
-
-
-def test_a_path_in_very_many_pieces_is_held_in_bounded_memory() -> None:
-    builder = TrajectoryBuilder(LIMIT_MPS)
-    for n in range(6000):
-        builder.add(n * S, Pose((100.0 * (n % 3), 0.0, 0.0), None))
-    assert held_by(builder) < 25_000
-    found = builder.result()
+def test_a_path_in_very_many_pieces_is_drawn_with_few() -> None:
+    found = summarise(driven((100.0 * (n % 3), 0.0, 0.0) for n in range(6000)), LIMIT_MPS)
     assert (found.totals.jumps, len(found.waypoints) <= 50) == (5999, True)
 
 
@@ -383,37 +346,12 @@ def _noisy_laps(count: int, noise_m: float) -> list[Vector3]:
 
 
 @pytest.mark.parametrize(("noise_m", "count"), [(0.0, 30_000), (0.05, 60_000)])
-def test_a_long_way_is_drawn_in_bounded_memory(noise_m: float, count: int) -> None:
+def test_a_long_way_is_drawn_within_its_error(noise_m: float, count: int) -> None:
     positions = _noisy_laps(count, noise_m)
-    builder = TrajectoryBuilder(LIMIT_MPS, 2000)
-    held = 0
-    for time, pose, speed in driven(positions, 20 * MS):
-        builder.add(time, pose, speed)
-        held = max(held, held_by(builder))
-    found = builder.result()
-    assert held <= 25_000
+    found = summarise(driven(positions, 20 * MS), LIMIT_MPS, 2000)
     assert found.totals.path_sum_m == pytest.approx(path_length(positions), rel=1e-9)
     assert farthest_off(positions[::37], found) <= found.waypoint_error_m + 1e-9
     assert found.waypoint_error_m < (0.05 if noise_m == 0 else 1.0)
-
-
-def test_a_summary_may_be_read_while_poses_still_come() -> None:
-    builder = TrajectoryBuilder(LIMIT_MPS)
-    poses = driven(along_x(0, 1, 2, 2, 2))
-    for time, pose, _ in poses[:3]:
-        builder.add(time, pose)
-    assert builder.result() == summarise(poses[:3], LIMIT_MPS)
-    for time, pose, _ in poses[3:]:
-        builder.add(time, pose)
-    assert builder.result() == summarise(poses, LIMIT_MPS)
-
-
-@pytest.mark.parametrize(
-    "limits", [(0.0, 50, 0.05), (math.nan, 50, 0.05), (10.0, 1, 0.05), (10.0, 50, 0.0)]
-)
-def test_limits_that_allow_nothing_are_refused(limits: tuple[float, int, float]) -> None:
-    with pytest.raises(ValueError, match="a trajectory needs"):
-        TrajectoryBuilder(*limits)
 
 
 # Public robots

@@ -1,0 +1,71 @@
+"""Poses as arrays, and what is measured of them in slices of the clock."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.analysis.motion.standstills import (
+    BESIDE_NS,
+    BLOCK_NS,
+    NO_BLOCKS,
+    joined_blocks,
+    stands_of,
+    standstills_of,
+)
+from ros2_memory.analysis.motion.trajectory import SLICE_NS, Way, path_slice
+from ros2_memory.analysis.poses import Frames, Poses
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from ros2_memory.analysis.motion.speed_drops import SpeedDrop
+    from ros2_memory.analysis.motion.standstills import Standstill
+    from ros2_memory.core.model import Quaternion, Vector3
+
+
+def posed(
+    rows: Iterable[tuple[int, Vector3 | list[float]]],
+    turns: Sequence[Quaternion] | None = None,
+    speeds: Sequence[float] | None = None,
+) -> Poses:
+    """Poses at log times (ns), with unit quaternions and stated speeds (m/s) where given."""
+    times, positions = zip(*rows, strict=True) if (rows := [*rows]) else ((), ())
+    count = len(times)
+    return Poses(
+        np.array(times, np.int64),
+        np.array(positions, np.float64).reshape(-1, 3),
+        np.full((count, 4), math.nan) if turns is None else np.array(turns, np.float64),
+        Frames(np.zeros(count, np.uint32), ("odom",)),
+        np.full(count, math.nan) if speeds is None else np.array(speeds, np.float64),
+    )
+
+
+def way_of(poses: Poses, fastest_mps: float, cuts: Sequence[int] | None = None) -> Way:
+    """The path of poses, measured in slices of the clock, or in parts cut at some poses."""
+    if cuts is None:
+        numbers = poses.times // SLICE_NS
+        cuts = (np.flatnonzero(np.diff(numbers)) + 1).tolist()
+    parts = pairwise(sorted({0, *cuts, len(poses)}))
+    slices = [path_slice(poses.rows(np.arange(*part)), fastest_mps) for part in parts]
+    return Way.of(slices or [path_slice(poses, fastest_mps)], fastest_mps)
+
+
+def stood_in(
+    poses: Poses, *, blocks: int = SLICE_NS // BLOCK_NS
+) -> tuple[tuple[Standstill, ...], list[SpeedDrop]]:
+    """Standstills and sudden losses of speed, found in slices of so many blocks."""
+    length = blocks * BLOCK_NS
+    stands = [
+        stands_of(
+            poses.between(number * length - BESIDE_NS, (number + 1) * length + BESIDE_NS),
+            number * length,
+            (number + 1) * length,
+        )
+        for number in np.unique(poses.times // length).tolist()
+    ]
+    drops = [drop for stand in stands for drop in stand.drops]
+    return standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)])), drops
