@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.joined_sights import joined, packed
 from ros2_memory.analysis.sights import Seen, no_sights, sights_of
+from ros2_memory.columns.sights import joined, packed
 from ros2_memory.columns.table import Texts
 
 if TYPE_CHECKING:

@@ -170,7 +170,7 @@ class Seen(NamedTuple):
 class Sights:
     """What detectors saw in some slices: column 0 of most tables is the slice.
 
-    From `sights_of` it is the slice of the clock; `joined_sights.joined` numbers those of all from
+    From `sights_of` it is the slice of the clock; `columns.sights.joined` numbers those of all from
     0 to `slices`.
     """
 

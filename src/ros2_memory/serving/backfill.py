@@ -32,6 +32,7 @@ from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
 from ros2_memory.insights.drive import make_fragments
 from ros2_memory.queries import list_recorded_topics
+from ros2_memory.things.seen import Watching
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -152,6 +153,7 @@ class Backfill:
         for window in windows:
             try:
                 make_fragments(view, window)
+                Watching(view).make(window)
             except EpisodicError as error:
                 log.warning("fragments_not_made", reason=str(error))
             scanner.write_fragments()

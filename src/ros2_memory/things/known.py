@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.joined_sights import joined
+from ros2_memory.columns.sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import READING_S

@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import Frames, multiply, static_at
-from ros2_memory.analysis.joined_sights import packed
 from ros2_memory.analysis.motion.odometry import FARTHEST_M
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
 from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, fixes_of, sights_of
 from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
+from ros2_memory.columns.sights import packed
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -133,18 +134,45 @@ class Placed(NamedTuple):
     sights: tuple[Sights, ...]
 
 
+class _InBytes(NamedTuple):
+    """What was seen in a stretch; see `in_bytes`. Empty where no detector published."""
+
+    data: bytes
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 200 + len(self.data)
+
+    @classmethod
+    def of(cls, fragment: Fragment) -> _InBytes:
+        """Returns what was stored."""
+        return cls(fragment.arrays["sights"].tobytes())
+
+    def fragment(self) -> Fragment:
+        """Returns it as it is stored."""
+        return Fragment("", {"sights": np.frombuffer(self.data, np.uint8)})
+
+
+SIGHTS: Final = Kind("sights", _InBytes.fragment, _InBytes.of)
+"""What detectors saw in a stretch."""
+
+
 class _Around(NamedTuple):
-    """What the sights of a stretch depend on.
+    """What the sights of a stretch follow from.
 
     Attributes:
         window: the stretch.
         bags: that reach into it, or nearly so.
-        sessions: those that these are of, in the order of their names, each with the one whose
+        parts: the parts of their topics there; None where not all of their rows are in parts, or
+            some of these do not count.
+        sessions: those that the bags are of, in the order of their names, each with the one whose
             transforms hold for it (which is empty where none do).
     """
 
     window: TimeWindow
     bags: Sequence[BagFile]
+    parts: tuple[int, ...] | None
     sessions: Sequence[tuple[Session, Session]]
 
 
@@ -189,9 +217,14 @@ class Watching:
             if any(map(may_have_detections, timeline.types_of(topic)))
         ]
         limits = view.memory.limits
-        self._settings = repr(
-            (VERSION, limits.map_frame, view.pose_topic, limits.tf_topics, limits.tf_clock)
+        self._needed = (
+            *self._topics,
+            view.pose_topic,
+            *limits.tf_topics,
+            *(topic for topic in timeline.topics() if _LOCALISER in timeline.types_of(topic)),
         )
+        self._lasts = not view.stream.may_be_relatched(self._topics)
+        self._followed: tuple[object, str] = None, ""
 
     def newest_first(self) -> Iterator[list[Stretch]]:
         """Yields the sights of all sessions in each stretch that has some.
@@ -203,17 +236,29 @@ class Watching:
         if shipped is not None:
             yield from self._shipped(shipped)
             return
+        for around in self._stretches_in(TimeWindow.everything()):
+            sessions = [own for own, _ in around.sessions]
+            if found := self._unpacked(around.window.start, sessions, self._known(around)):
+                yield found
+
+    def make(self, window: TimeWindow) -> None:
+        """Makes the sights that follow from the parts of a window; those of others are left out.
+
+        Raises:
+            QueryTimeoutError: the deadline has passed.
+        """
+        for around in self._stretches_in(window.widened(STRETCH_NS)):
+            if around.parts is not None:
+                self._known(around)
+
+    def _stretches_in(self, window: TimeWindow) -> Iterator[_Around]:
+        """Yields the stretches of a window in which there may be messages, the newest first."""
         if not self._topics:
             return
-        bags = _Bags(self._view, self._topics)
+        bags = _Bags(self._view, self._topics, self._needed, window)
         for number in bags.stretches():
             self._view.bags.check_deadline()
-            window = _window(number)
-            near, numbers = bags.around(window.widened(_AROUND_NS))
-            around = self._around(window, near)
-            data = self._known(around, numbers)
-            if found := self._stretches(window.start, [own for own, _ in around.sessions], data):
-                yield found
+            yield self._around(_window(number), *bags.around(_window(number).widened(_AROUND_NS)))
 
     def in_bag(self, bag: BagFile) -> list[Placed]:
         """Returns the sights of the messages of one bag that count, in each stretch.
@@ -238,10 +283,10 @@ class Watching:
         """Yields the sights of the bags of a lake, each as a stretch."""
         for bag in reversed(self._view.snapshot.timeline.bags):
             self._view.bags.check_deadline()
-            if found := self._stretches(bag.start, [self._session(bag)], shipped(bag)):
+            if found := self._unpacked(bag.start, [self._session(bag)], shipped(bag)):
                 yield found
 
-    def _stretches(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
+    def _unpacked(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
         """Returns what was seen from its bytes; see `in_bytes`."""
         if not data:
             return []
@@ -261,12 +306,16 @@ class Watching:
             self._of[bag.recording] = self._sessions.of(bag.recording)
         return self._of[bag.recording]
 
-    def _around(self, window: TimeWindow, bags: Sequence[BagFile]) -> _Around:
+    def _around(
+        self, window: TimeWindow, bags: Sequence[BagFile], parts: tuple[int, ...] | None
+    ) -> _Around:
         first: dict[Session, BagFile] = {}
         for bag in bags:
             first.setdefault(self._session(bag), bag)
         sessions = [(own, self._transforms_of(own, bag, window)) for own, bag in first.items()]
-        return _Around(window, bags, sorted(sessions, key=lambda pair: sorted(pair[0])))
+        if len(sessions) > 1:
+            sessions.sort(key=lambda pair: min(pair[0]))
+        return _Around(window, bags, parts, sessions)
 
     def _transforms_of(self, own: Session, bag: BagFile, window: TimeWindow) -> Session:
         """Returns the session whose transforms hold for a bag's; empty where none has any."""
@@ -274,42 +323,57 @@ class Watching:
             return own
         return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
-    def _known(self, around: _Around, numbers: Ints | None) -> bytes:
+    def _known(self, around: _Around) -> bytes:
         """Returns what was seen in a stretch, in bytes; from memory where that is known."""
         scanner = self._view.memory.columns
-        if scanner is None or any(bag.state is BagState.ACTIVE for bag in around.bags):
+        is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
+        if scanner is None or is_open or not self._lasts:
             return self._read(around)
-        key = self._key(around, numbers)
+        before = self._view.notes.added
+        followed = self._follows_from(around)
+        if around.parts is not None:
+            fragments = scanner.fragments(SIGHTS)
+            part_key = FragmentKey(around.window.start, followed, around.parts)
+            known = fragments.get(part_key)
+            if known is None:
+                known = _InBytes(self._read(around))
+                if self._view.notes.added == before:
+                    fragments.put(part_key, known)
+            return known.data
+        # Parts, as these, are of certain recordings.
+        bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
+        key = (around.window.start, followed, tuple(bags))
         data = scanner.sights.get(key)
         if data is None:
-            before = self._view.notes.added
             data = self._read(around)
             if self._view.notes.added == before:
-                scanner.sights.put(key, data, 200 + len(data))
+                scanner.sights.put(key, data, 200 + len(data) + 100 * len(bags))
         return data
 
-    def _key(self, around: _Around, numbers: Ints | None) -> bytes:
-        """Returns what tells the sights of a stretch from others: all that they follow from.
-
-        Args:
-            around: the stretch.
-            numbers: of its bags in the store; None where not all are there.
-        """
-        window, near = around.window, {self._sessions.folder(bag.recording) for bag in around.bags}
-        told: list[object] = [self._settings, window.start]
-        for own, among in around.sessions:
-            static = static_in(static_transforms(self._view, among), window) if among else []
-            held = [
-                (one.parent, one.child, one.transform, max(one.log_time, window.start))
-                for one in static
+    def _follows_from(self, around: _Around) -> str:
+        """Returns what tells apart the sights of other settings, static transforms or sessions."""
+        window = around.window
+        statics = [
+            [
+                (one, one.log_time if window.contains(one.log_time) else 0)
+                for one in static_in(static_transforms(self._view, among), window)
             ]
-            told.append((sorted(own & near), sorted(among & near), held))
-        if numbers is None:
-            told += [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
-        digest = blake2b(repr(told).encode(), digest_size=16)
-        if numbers is not None:
-            digest.update(numbers.tobytes())
-        return digest.digest()
+            for _, among in around.sessions
+            if among
+        ]
+        near = sorted(map(self._sessions.folder, {bag.recording for bag in around.bags}))
+        of = [[(one in own, one in among) for one in near] for own, among in around.sessions]
+        # Mostly they are those of the stretch before, object by object.
+        if self._followed[0] != (statics, of):
+            limits = self._view.memory.limits
+            every = [
+                [(one.parent, one.child, one.transform, time) for one, time in some]
+                for some in statics
+            ]
+            settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
+            digest = blake2b(repr((VERSION, settings, every, of)).encode(), digest_size=12)
+            self._followed = (statics, of), digest.hexdigest()
+        return self._followed[1]
 
     def _read(self, around: _Around) -> bytes:
         of_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
@@ -453,32 +517,34 @@ class Watching:
 
 
 class _Bags:
-    """The bags of a view as arrays, without those of carried messages that nothing is seen by.
+    """The bags of a view in a window, and what is stored of them, as arrays.
+
+    Without those of carried messages that nothing is seen by: they reach over all of the history.
 
     Args:
         view: has the bags.
         topics: those that may have detections.
+        needed: all topics on which sights depend.
+        window: the window.
     """
 
-    def __init__(self, view: View, topics: Sequence[str]) -> None:
+    def __init__(
+        self, view: View, topics: Sequence[str], needed: Sequence[str], window: TimeWindow
+    ) -> None:
         self._view = view
         self._topics = topics
-        limits, timeline = view.memory.limits, view.snapshot.timeline
-        needed = (*topics, view.pose_topic, *limits.tf_topics)
+        self._window = window
+        around = window.widened(_AROUND_NS)
         self._bags = [
             bag
-            for bag in timeline.bags
+            for bag in view.snapshot.timeline.overlapping(around)
             if not is_carried(bag.file) or any(map(bag.summary.of, needed))
         ]
         count = len(self._bags)
         self._starts = np.fromiter((bag.start for bag in self._bags), np.int64, count)
         self._ends = np.fromiter((bag.end for bag in self._bags), np.int64, count)
         self._latest = np.maximum.accumulate(self._ends)
-        scanner = view.memory.columns
-        coverage = None if scanner is None else scanner.coverage(timeline)
-        self._numbers: Ints | None = None
-        if coverage is not None and count == len(timeline.bags):
-            self._numbers = np.concatenate([part.numbers for part in coverage.segments])
+        self._parts = _Parts.of(view, needed, around, self._bags)
 
     def stretches(self) -> list[int]:
         """Returns the numbers of the stretches in which there may be messages, the newest first."""
@@ -487,17 +553,81 @@ class _Bags:
         more = [_numbers_of(self._view, self._topics, self._bags[nth]) for nth in long.tolist()]
         every = np.concatenate([first, last, *(np.array([*some], np.int64) for some in more)])
         numbers: list[int] = np.unique(every)[::-1].tolist()
-        return numbers
+        return [nth for nth in numbers if not _window(nth).intersect(self._window).empty]
 
-    def around(self, window: TimeWindow) -> tuple[list[BagFile], Ints | None]:
-        """Returns the bags that reach into a window, and their numbers if all are stored."""
+    def around(self, window: TimeWindow) -> tuple[list[BagFile], tuple[int, ...] | None]:
+        """Returns the bags that reach into a window, and the parts; see `_Around`."""
         begin = int(np.searchsorted(self._latest, window.start))
         end = int(np.searchsorted(self._starts, window.stop))
         here = begin + np.flatnonzero(self._ends[begin:end] >= window.start)
         bags = [self._bags[nth] for nth in here.tolist()]
-        if self._numbers is None or (self._numbers[here] < 0).any():
-            return bags, None
-        return bags, self._numbers[here]
+        return bags, None if self._parts is None else self._parts.around(window, here)
+
+
+class _Parts(NamedTuple):
+    """The parts of some topics in a window, as arrays.
+
+    Attributes:
+        is_merged: of each bag, whether it is in parts.
+        firsts: of each part, the first log time, ascending.
+        lasts: likewise the last one.
+        latest: the latest of the parts so far.
+        numbers: of the parts.
+        all_count: whether all rows of the part do.
+    """
+
+    is_merged: Flags
+    firsts: Ints
+    lasts: Ints
+    latest: Ints
+    numbers: Ints
+    all_count: Flags
+
+    @classmethod
+    def of(
+        cls, view: View, topics: Sequence[str], window: TimeWindow, bags: Sequence[BagFile]
+    ) -> _Parts | None:
+        """Returns the parts of some topics, and which bags are in parts; None without a store."""
+        scanner = view.memory.columns
+        if scanner is None or scanner.store is None:
+            return None
+        # Before the parts: what becomes a part meanwhile is in none of those that are known.
+        splits = scanner.store.splits()
+        coverage = scanner.coverage(view.snapshot.timeline)
+        if coverage is None:
+            return None
+        merged = {
+            bag.file
+            for part in coverage.segments
+            if window.overlaps(part.segment.bags[0].start, part.segment.latest)
+            for bag, number in zip(part.segment.bags, part.numbers.tolist(), strict=True)
+            if number >= 0 and number not in splits
+        }
+        heads = [head for topic in {*topics} for head in scanner.parts(topic, window, coverage)]
+        heads.sort(key=lambda head: head.first)
+        firsts = np.array([head.first for head in heads], np.int64)
+        lasts = np.array([head.last for head in heads], np.int64)
+        count = [coverage.among(head.bags).size == head.bags.size for head in heads]
+        return cls(
+            np.fromiter((bag.file in merged for bag in bags), np.bool_, len(bags)),
+            firsts,
+            lasts,
+            np.maximum.accumulate(lasts),
+            np.array([head.number for head in heads], np.int64),
+            np.array(count, np.bool_),
+        )
+
+    def around(self, window: TimeWindow, bags: Ints) -> tuple[int, ...] | None:
+        """Returns the parts in a window; None where not all rows of its bags are there, or count.
+
+        `bags` are the positions of the bags.
+        """
+        if not self.is_merged[bags].all():
+            return None
+        begin = int(np.searchsorted(self.latest, window.start))
+        end = int(np.searchsorted(self.firsts, window.stop))
+        here = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
+        return tuple(np.sort(self.numbers[here]).tolist()) if self.all_count[here].all() else None
 
 
 def _window(number: int) -> TimeWindow:

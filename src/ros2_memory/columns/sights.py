@@ -16,7 +16,6 @@ from struct import Struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-import zstandard
 
 from ros2_memory.analysis.sights import (
     SLICE_NS,
@@ -28,6 +27,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
+from ros2_memory.columns.pack import compressed, decompressed
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     Bytes = NDArray[np.uint8]
 
-_LEVEL: Final = 4
 _HEAD: Final = Struct(f"<Bq{len(TABLES) + 1}I")
 _NS_PER_US: Final = 1_000
 _SLICE_US: Final = SLICE_NS // _NS_PER_US
@@ -83,7 +82,7 @@ def packed(sights: Sights) -> bytes:
     names = json.dumps((sights.topics, sights.labels)).encode()
     head = _HEAD.pack(width, begin, *map(len, sights.tables), len(names))
     planes = [_planes(each, width) for each in coded]
-    return zstandard.compress(b"".join((head, names, *planes)), _LEVEL)
+    return compressed(b"".join((head, names, *planes)))
 
 
 def joined(parts: Sequence[bytes], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:
@@ -136,7 +135,7 @@ class _Unpacked:
         counts, slices = [], []
         planes: list[list[Bytes]] = [[] for _ in TABLES]
         for part in parts:
-            data = zstandard.decompress(part)
+            data = decompressed(part)
             width, begin, *rows, size = _HEAD.unpack_from(data)
             at = _HEAD.size + size
             topics, labels = json.loads(data[_HEAD.size : at])
