@@ -22,6 +22,7 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
+from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.unseen import Asked, notes_on
 
 if TYPE_CHECKING:
@@ -303,13 +304,15 @@ class _Finder:
         best = int(sights.spots[rows, Spot.BEST].max())
         if best < 0:
             return None, None
-        mine = np.zeros(len(sights.spots), bool)
-        mine[rows] = True
-        of = mine[sights.scores[:, Score.SPOT]]
-        counts = np.bincount(sights.scores[of, Score.BIN], sights.scores[of, Score.N], SCORE_BINS)
+        first, end = (
+            np.searchsorted(sights.scores[:, Score.SPOT], rows, side=side)
+            for side in ("left", "right")
+        )
+        scores = sights.scores[in_ranges(first, end - first)]
+        counts = np.bincount(scores[:, Score.BIN], scores[:, Score.N], SCORE_BINS)
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
         highest = np.full(len(sights.spots), -1, np.int64)
-        np.maximum.at(highest, sights.scores[of, Score.SPOT], sights.scores[of, Score.BIN])
+        np.maximum.at(highest, scores[:, Score.SPOT], scores[:, Score.BIN])
         known = sights.spots[highest == middle, Spot.BEST]
         median = int(known.max()) / 1000 if len(known) else (middle + 0.5) / SCORE_BINS
         return best / 1000, min(median, best / 1000)
