@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.robot_track import TrackPart
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.fragments import Kind, Sized
@@ -103,7 +102,6 @@ class Scanner:
         events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
         static_runs: by part, when its static transforms change.
-        tracks: by part, frame and transforms, where the robot was.
         statics: by session and topics, the static transforms of a timeline.
     """
 
@@ -117,7 +115,6 @@ class Scanner:
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
         self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
-        self.tracks: ByteLru[TrackPart] = ByteLru(32 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
         self._settings = settings
         self._fragments: dict[str, object] = {}

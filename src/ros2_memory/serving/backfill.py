@@ -33,6 +33,7 @@ from ros2_memory.index.segment import in_time
 from ros2_memory.insights.drive import make_fragments
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import MapDigests
+from ros2_memory.places.region_visits import make_tracks
 from ros2_memory.queries import list_recorded_topics
 
 if TYPE_CHECKING:
@@ -204,6 +205,7 @@ class Backfill:
         for window in windows:
             try:
                 make_fragments(view, window)
+                make_tracks(view, window)
             except EpisodicError as error:
                 log.warning("fragments_not_made", reason=str(error))
             scanner.write_fragments()
