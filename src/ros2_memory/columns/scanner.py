@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
-    from ros2_memory.columns.transforms import Pair, StaticRun
+    from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
@@ -101,7 +101,6 @@ class Scanner:
     Attributes:
         events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
-        static_runs: by part, when its static transforms change.
         statics: by session and topics, the static transforms of a timeline.
     """
 
@@ -114,7 +113,6 @@ class Scanner:
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
-        self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
         self._settings = settings
         self._fragments: dict[str, object] = {}
