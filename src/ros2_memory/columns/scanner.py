@@ -26,14 +26,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.robot_track import TrackPart
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
-    from ros2_memory.columns.transforms import Pair, StaticRun
+    from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
@@ -102,8 +101,6 @@ class Scanner:
     Attributes:
         events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
-        static_runs: by part, when its static transforms change.
-        tracks: by part, frame and transforms, where the robot was.
         statics: by session and topics, the static transforms of a timeline.
         sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
         things: by settings, what was estimated of all bags of a timeline.
@@ -118,8 +115,6 @@ class Scanner:
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
-        self.static_runs: ByteLru[Sequence[StaticRun]] = ByteLru(4 << 20)
-        self.tracks: ByteLru[TrackPart] = ByteLru(32 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
         self.sights: ByteLru[bytes] = ByteLru(16 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.frames import Edge, unit_quaternions
+from ros2_memory.columns.fragments import Fragment, Kind
 from ros2_memory.columns.steps import METRES, QUATERNION
 from ros2_memory.columns.table import Texts
+from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.frames import Edges, Floats
@@ -92,39 +96,63 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
     return frozenset(pairs)
 
 
-class StaticRun(NamedTuple):
-    """A transform of a child from a log time (ns) on; equal ones that follow are left out."""
-
-    time: Ns
-    parent: str
-    child: str
-    numbers: tuple[float, ...]
-
-
-def static_runs(table: Table, times: IntArray, index: IntArray | None) -> list[StaticRun] | None:
-    """Returns when the transforms of each child change in some rows of a table, in order.
+def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:
+    """Returns when some transform differs from the one before of its child, in some rows.
 
     None where only the messages have them. The arguments are as for `edges_in`.
     """
     edges = edges_in(table, times, index)
     if edges is None:
         return None
-    runs: list[StaticRun] = []
-    for child in dict.fromkeys(child for _, child in edges):
-        of_child = [(parent, edge) for (parent, one), edge in edges.items() if one == child]
-        for parent, edge in of_child:
+    found = [np.zeros(0, np.int64)]
+    for child in {child for _, child in edges}:
+        of_child = [edge for (_, one), edge in edges.items() if one == child]
+        for edge in of_child:
             numbers = np.column_stack((edge.translation, edge.rotation))
             new = np.append([True], (numbers[1:] != numbers[:-1]).any(axis=1))
-            if len(of_child) > 1:  # they may alternate
-                new[:] = True
-            where = np.flatnonzero(new)
-            runs += [
-                StaticRun(time, parent, child, tuple(row))
-                for time, row in zip(
-                    edge.log_times[where].tolist(), numbers[where].tolist(), strict=True
-                )
-            ]
-    return sorted(runs)
+            # Those of several parents may alternate.
+            found.append(edge.log_times[new] if len(of_child) == 1 else edge.log_times)
+    return np.unique(np.concatenate(found))
+
+
+@dataclass(frozen=True, slots=True)
+class Statics:
+    """The static transforms of a part, in log-time order, that differ from those before."""
+
+    transforms: tuple[StampedTransform, ...]
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        return 100 + 600 * len(self.transforms)
+
+
+def _statics_fragment(statics: Statics) -> Fragment:
+    rows = [
+        [
+            one.parent,
+            one.child,
+            one.stamp,
+            one.log_time,
+            *one.transform.translation,
+            *one.transform.rotation,
+        ]
+        for one in statics.transforms
+    ]
+    return Fragment(json.dumps(rows), {})
+
+
+def _statics_of(fragment: Fragment) -> Statics:
+    found = []
+    for parent, child, stamp, log_time, x, y, z, *rotation in json.loads(fragment.head):
+        qx, qy, qz, qw = rotation
+        transform = Transform((x, y, z), (qx, qy, qz, qw))
+        found.append(StampedTransform(parent, child, stamp, log_time, transform, static=True))
+    return Statics(tuple(found))
+
+
+STATICS: Final = Kind("statics", _statics_fragment, _statics_of)
+"""The static transforms of a part, exact."""
 
 
 def stamped_between(

@@ -19,12 +19,14 @@ from ros2_memory.analysis.transform_tree import (
     TfClock,
     agreeing_clock,
 )
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.transforms import (
+    STATICS,
     Pair,
-    StaticRun,
+    Statics,
     pairs_in,
     stamped_between,
-    static_runs,
+    static_times,
 )
 from ros2_memory.core.errors import (
     NoDataError,
@@ -37,7 +39,6 @@ from ros2_memory.core.model import StampedTransform, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     MAX_NS,
-    MIN_NS,
     NS_PER_MS,
     NS_PER_S,
     Ns,
@@ -65,7 +66,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment moving transforms are read; the last is the length of tf2's cache."""
@@ -221,7 +221,7 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     """Returns the static transforms of a session, in log-time order.
 
     One that is equal to the one before of its child is left out: each split may have all again.
-    So few messages are read: those by whose columns something is new.
+    So few messages of a part are read: those by whose columns something is new.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -248,9 +248,8 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
 
 
 def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransform]:
-    """Yields the static transforms of a topic that differ from those before in their recording."""
+    """Yields the static transforms of a topic; of equal ones that follow in a part the first."""
     sessions = sessions_of(view)
-    latest: dict[Path, tuple[Ns, dict[str, StaticRun]]] = {}
     spans = sessions.recordings_of(among, (topic,)).values()
     if not spans:
         return
@@ -262,36 +261,30 @@ def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransfo
                 if sessions.has(among, found):
                     yield from decoded_transforms(view, found)
         elif sessions.folder(rows.recording) in among:
-            last, state = latest.get(rows.recording, (MIN_NS, {}))
-            if rows.first <= last:  # of several types, whose tables lie side by side
-                state = {}
-            fresh = _fresh(view, rows, state)
-            for found in messages_of(view, rows if fresh is None else rows.some(fresh)):
-                yield from decoded_transforms(view, found)
-            latest[rows.recording] = max(rows.last, last), state
+            yield from _changes_in(view, rows)
 
 
-def _fresh(view: View, rows: Rows, state: dict[str, StaticRun]) -> IntArray | None:
-    """Returns the positions of rows in which a static transform is new; None: of all.
-
-    `state` has the latest one of each child, and is brought up to the end of the rows.
-    """
+def _changes_in(view: View, rows: Rows) -> Sequence[StampedTransform]:
+    """Returns the static transforms in some rows that differ from those before, as received."""
     scanner, part = view.memory.columns, rows.part
-    runs = None if scanner is None or part is None else scanner.static_runs.get(part)
-    if runs is None:
-        runs = static_runs(rows.table, rows.times, rows.index)
-        if runs is None:
-            state.clear()
-            return None
-        if scanner is not None and part is not None:
-            scanner.static_runs.put(part, runs, 100 + 300 * len(runs))
-    new: set[Ns] = set()
-    for run in runs:
-        before = state.get(run.child)
-        if before is None or (before.parent, before.numbers) != (run.parent, run.numbers):
-            new.add(run.time)
-        state[run.child] = run
-    return np.flatnonzero(np.isin(rows.times, [*new])) if new else np.empty(0, np.int64)
+    if scanner is None or part is None:
+        return [*_decoded(view, rows)]
+    known, key = scanner.fragments(STATICS), FragmentKey(rows.first, "", (part,))
+    made = known.get(key)
+    if made is None:
+        noted = view.notes.added
+        times = static_times(rows.table, rows.times, rows.index)
+        new = None if times is None else np.flatnonzero(np.isin(rows.times, times))
+        received = _decoded(view, rows if new is None else rows.some(new))
+        made = Statics(tuple(_changes(sorted(received, key=lambda one: one.log_time))))
+        if view.notes.added == noted:
+            known.put(key, made)
+    return made.transforms
+
+
+def _decoded(view: View, rows: Rows) -> Iterator[StampedTransform]:
+    for found in messages_of(view, rows):
+        yield from decoded_transforms(view, found)
 
 
 def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:

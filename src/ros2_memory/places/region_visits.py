@@ -7,14 +7,18 @@ shown begin and end at poses.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.insights.clock_steps import elapsed_in
+from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside
 from ros2_memory.results import PlaceVisits, Visit
 
@@ -70,6 +74,14 @@ def _joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     if joined.left_out:
         view.notes.add(f"poses that no transform places in {frame_id} are left out")
     return joined
+
+
+def make_tracks(view: View, window: TimeWindow) -> None:
+    """Makes what the parts in a window say of where the robot was in the frames of places."""
+    with suppress(InvalidArgumentsError, NoDataError):
+        topic = resolve_path_topic(view)
+        for frame in map_placement(view, pose_frame(view, topic), topic).frames:
+            RobotTracks(view, frame).make(window)
 
 
 def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -> RegionVisits:

@@ -6,6 +6,7 @@ not change any more are remembered, so a week is asked again in a tenth of a sec
 
 from __future__ import annotations
 
+import hashlib
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -24,12 +25,15 @@ from ros2_memory.analysis.motion.robot_track import (
 )
 from ros2_memory.analysis.poses import headings
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.steps import QUATERNION
+from ros2_memory.columns.tracks import TRACKS
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Parts, Steps, parts_inside
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Deadline, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows
@@ -38,7 +42,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.frames import Edges, Floats, Mask, Times
@@ -47,7 +51,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import StampedTransform
     from ros2_memory.core.regions import Region
-    from ros2_memory.core.timebase import Deadline
     from ros2_memory.history.driven_path import Body
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
@@ -147,39 +150,67 @@ class RobotTracks:
         tracks = tuple(joined_track(parts) for parts in others)
         return JoinedTrack(joined_track(one), since, left_out, tracks)
 
+    def make(self, window: TimeWindow) -> None:
+        """Makes the tracks that follow from parts alone, of those in a window and beside it.
+
+        Raises:
+            InvalidArgumentsError: messages of the topic of poses carry no position.
+            QueryTimeoutError: the call's time runs out.
+        """
+        around = window.widened(2 * PART_NS)
+        moving = None if self._is_own else _Moving(self._view, around.widened(TF_CACHE_NS))
+        for topic in self._topics:
+            for rows in scan(self._view, topic, around, newest_first=True, stored=True):
+                groups = self._groups(rows, moving)
+                if self._key(rows, groups) is not None:
+                    self._part(rows, groups, Deadline.never())
+
     def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
         """Yields the track table by table, the newest first."""
-        view, scanner = self._view, self._view.memory.columns
-        moving = None if self._is_own else _Moving(view, window.widened(TF_CACHE_NS))
+        moving = None if self._is_own else _Moving(self._view, window.widened(TF_CACHE_NS))
         for topic in self._topics:
-            for rows in scan(view, topic, window, newest_first=True):
-                groups = self._groups(rows, moving)
-                key = self._key(rows, groups)
-                part = None if key is None or scanner is None else scanner.tracks.get(key)
-                if part is None:
-                    if reading.expired():
-                        raise QueryTimeoutError("to place poses takes too long")
-                    noted = view.notes.added, len(self._failures)
-                    placed = self._placed(rows, groups, thins=True)
-                    part = track_part(
-                        placed.times, placed.x, placed.y, placed.heading, placed.left_out
-                    )
-                    is_sure = noted == (view.notes.added, len(self._failures))
-                    if key is not None and scanner is not None and is_sure:
-                        scanner.tracks.put(key, part, part.size)
-                yield rows, part
+            for rows in scan(self._view, topic, window, newest_first=True):
+                yield rows, self._part(rows, self._groups(rows, moving), reading)
 
-    def _key(self, rows: Rows, groups: Sequence[_Group]) -> Hashable | None:
+    def _part(self, rows: Rows, groups: Sequence[_Group], reading: Deadline) -> TrackPart:
+        """Returns the track by some rows: what is stored of it, else made now."""
+        scanner = self._view.memory.columns
+        key = None if scanner is None else self._key(rows, groups)
+        known = None if scanner is None or key is None else scanner.fragments(TRACKS)
+        part = None if known is None or key is None else known.get(key)
+        if part is None:
+            if reading.expired():
+                raise QueryTimeoutError("to place poses takes too long")
+            noted = self._view.notes.added, len(self._failures)
+            placed = self._placed(rows, groups, thins=True)
+            part = track_part(placed.times, placed.x, placed.y, placed.heading, placed.left_out)
+            is_sure = noted == (self._view.notes.added, len(self._failures))
+            if known is not None and key is not None and is_sure:
+                known.put(key, part)
+        return part
+
+    def _key(self, rows: Rows, groups: Sequence[_Group]) -> FragmentKey | None:
         """Returns what the track by some rows follows from; None where that may still change."""
-        parts = [[source.rows.part for source in group.sources] for group in groups]
-        if rows.part is None or any(None in some for some in parts):
+        own = rows.part
+        parts: list[int] = [] if own is None else [own]
+        placed_by: list[object] = []
+        for group in groups:
+            used = [source.rows.part for source in group.sources]
+            numbers = [part for part in used if part is not None]
+            if len(numbers) < len(used) or any(
+                sessions_of(self._view).holds_carried(source.rows.recording)
+                for source in group.sources
+            ):
+                return None
+            parts += [part for part in numbers if part not in parts]
+            # By their places among the parts: those of one recording have one text.
+            which = [parts.index(part) for part in numbers]
+            placed_by.append((group.since, group.static, which))
+        if own is None:
             return None
-        placed_by = tuple(
-            (group.span.start, group.static, tuple(some))
-            for group, some in zip(groups, parts, strict=True)
-        )
         clock = self._view.memory.limits.tf_clock
-        return rows.part, self._frame_id, self._body, clock, placed_by
+        settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
+        return FragmentKey(rows.first, hashlib.sha256(settings.encode()).hexdigest(), tuple(parts))
 
     def _groups(self, rows: Rows, moving: _Moving | None) -> list[_Group]:
         """Returns by what the poses of some rows are placed, each since when; none: by nothing."""
@@ -192,7 +223,7 @@ class RobotTracks:
         for (since, session), end in zip(lenders, ends, strict=True):
             span = TimeWindow(max(since, rows.first), min(end, rows.last + 1))
             used = [source for source in sources if source.is_of(self._view, session)]
-            groups.append(_Group(span, session, self._static(session, span), used))
+            groups.append(_Group(since, span, session, self._static(session, span), used))
         return groups
 
     def _static(self, session: Session, span: TimeWindow) -> tuple[StampedTransform, ...]:
@@ -266,8 +297,12 @@ class RobotTracks:
 
 
 class _Group(NamedTuple):
-    """By what poses of a span of log time are placed: the transforms of one session."""
+    """By what poses of a span of log time are placed: the transforms of one session.
 
+    `since`: from when on it lends them.
+    """
+
+    since: Ns
     span: TimeWindow
     session: Session
     static: tuple[StampedTransform, ...]

@@ -31,6 +31,7 @@ from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
 from ros2_memory.insights.drive import make_fragments
+from ros2_memory.places.region_visits import make_tracks
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
 
@@ -153,6 +154,7 @@ class Backfill:
         for window in windows:
             try:
                 make_fragments(view, window)
+                make_tracks(view, window)
                 Watching(view).make(window)
             except EpisodicError as error:
                 log.warning("fragments_not_made", reason=str(error))

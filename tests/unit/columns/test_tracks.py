@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.robot_track import track_part
-from ros2_memory.columns.tracks import track_bytes, track_from
+from ros2_memory.columns.fragments import Fragment
+from ros2_memory.columns.tracks import TRACKS
 from tests.support.examples import examples
 
 S = 10**9
@@ -33,7 +33,7 @@ def test_a_track_comes_back_from_its_bytes(
     steps, xs, ys, headings = zip(*poses, strict=True) if poses else ((), (), (), ())
     times = begin + np.cumsum(np.array(steps, np.int64))
     part = track_part(times, np.array(xs), np.array(ys), np.array(headings), left_out)
-    found = track_from(track_bytes(part))
+    found = TRACKS.load(Fragment.from_bytes(TRACKS.store(part).to_bytes()))
     assert found.left_out == part.left_out
     for name in ("times", "x", "y", "turns", "known", "settled"):
         assert np.array_equal(getattr(found, name), getattr(part, name)), name
@@ -42,9 +42,4 @@ def test_a_track_comes_back_from_its_bytes(
 def test_a_robot_that_stands_takes_few_bytes() -> None:
     times = np.arange(0, 600 * S, S // 25) + 1_700_000_000 * S
     level = np.ones(times.size)
-    assert len(track_bytes(track_part(times, level, level, level))) < 1000
-
-
-def test_bytes_that_are_no_track_are_refused() -> None:
-    with pytest.raises(ValueError, match="cannot be decompressed"):
-        track_from(b"no track")
+    assert len(TRACKS.store(track_part(times, level, level, level)).to_bytes()) < 1000

