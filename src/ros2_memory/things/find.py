@@ -178,8 +178,10 @@ class _Finder:
         stays = [self._stay(frame, group) for group in _by_place(parts)]
         every = np.concatenate([rows for _, rows in parts])
         labels = self._labels(every)
-        spellings = Counter(name for stay in instance.stays for name in stay.spellings.elements())
-        misread = Counter(name for stay in instance.stays for name in stay.also.elements())
+        spellings, misread = Counter[str](), Counter[str]()
+        for stay in instance.stays:
+            spellings.update(stay.spellings)
+            misread.update(stay.also)
         return replace(
             self._thing(instance.label, frame, _place(last), every, newest),
             labels=tuple(labels) if len(labels) > 1 else (),
@@ -220,11 +222,11 @@ class _Finder:
 
     def _labels(self, rows: Ints) -> list[tuple[str, int]]:
         """Returns how often each label has these spots, the commonest first."""
-        result = self.known.estimate
+        result, labels = self.known.estimate, self.known.labels
+        often = np.bincount(result.sights.spots[rows, Spot.LABEL], result.counts[rows])
         counts: Counter[str] = Counter()
-        labels = result.sights.spots[rows, Spot.LABEL].tolist()
-        for label, n in zip(labels, result.counts[rows].tolist(), strict=True):
-            counts[result.names[self.known.labels.key(result.sights.labels[label])]] += n
+        for label in np.flatnonzero(often).tolist():
+            counts[result.names[labels.key(result.sights.labels[label])]] += int(often[label])
         return counts.most_common()
 
     def _side_by_side(self, rows: Ints) -> int | None:

@@ -416,9 +416,10 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     spots, n = seen.sights.spots[rows], seen.counts[rows]
     x, y, z = (float(np.average(spots[:, at], weights=n)) for at in (Spot.X, Spot.Y, Spot.Z))
     squares = spots[:, Spot.DEV] ** 2 + (spots[:, Spot.X] - x) ** 2 + (spots[:, Spot.Y] - y) ** 2
-    spellings: Counter[str] = Counter()
-    for label, count in zip(spots[:, Spot.LABEL].tolist(), n.tolist(), strict=True):
-        spellings[seen.sights.labels[label]] += count
+    often = np.bincount(spots[:, Spot.LABEL], n).astype(np.int64)
+    spellings = Counter(
+        {seen.sights.labels[label]: int(often[label]) for label in np.flatnonzero(often).tolist()}
+    )
     left = None
     if stay.left is not None:
         of = seen.cells.bag == stay.left
