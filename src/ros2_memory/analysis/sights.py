@@ -310,10 +310,13 @@ def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
 
 def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels."""
-    names = sorted({word[:_MAX_LABEL_CHARS] for word in seen.names})
+    # Those that none has are of other messages, which may be forgotten.
+    used = np.unique(seen.labels).tolist()
+    names = sorted({seen.names[code][:_MAX_LABEL_CHARS] for code in used})
     number = {name: nth for nth, name in enumerate(names)}
-    codes = [number[word[:_MAX_LABEL_CHARS]] for word in seen.names]
-    label = np.array(codes, np.int64)[seen.labels]
+    codes = np.zeros(len(seen.names), np.int64)
+    codes[used] = [number[seen.names[code][:_MAX_LABEL_CHARS]] for code in used]
+    label = codes[seen.labels]
     with np.errstate(invalid="ignore"):
         near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T

@@ -18,7 +18,14 @@ from ros2_memory.analysis.sights import (
     fixes_of,
     no_sights,
 )
-from tests.support.sights import Message, PlacedDetection, joined_of, sights_of_messages
+from ros2_memory.analysis.sights import sights_of as of_arrays
+from tests.support.sights import (
+    Message,
+    PlacedDetection,
+    joined_of,
+    seen_in,
+    sights_of_messages,
+)
 
 HERE = (0.0, 0.0, 0.0)
 SECOND = 10**9
@@ -218,3 +225,12 @@ def test_fixes_are_kept_where_no_detector_published() -> None:
 def test_what_is_seen_at_the_end_of_64_bits_has_a_time_that_fits() -> None:
     [spot] = sights_of_messages([Message("/detections", 2**63 - 1, HERE, [mug(1.0)])]).spots
     assert spot[Spot.LAST] == 2**63 - 808
+
+
+def test_labels_of_other_messages_are_not_in_sights() -> None:
+    found = sights_of([mug(1.0)])
+    seen = seen_in([Message("/detections", 0, HERE, [mug(1.0)])])
+    others = seen._replace(names=("letter", *seen.names), labels=seen.labels + 1)
+    again = of_arrays("/detections", others)
+    assert again.labels == found.labels == ("mug",)
+    assert again.spots[:, Spot.LABEL].tolist() == [0]
