@@ -158,6 +158,18 @@ SIGHTS: Final = Kind("sights", _InBytes.fragment, _InBytes.of)
 """What detectors saw in a stretch."""
 
 
+class _Placing(NamedTuple):
+    """A session, and the one whose transforms hold for it: empty where none do.
+
+    Attributes:
+        slices: in which slices of the clock they hold; None: in all.
+    """
+
+    own: Session
+    among: Session
+    slices: tuple[int, ...] | None = None
+
+
 class _Around(NamedTuple):
     """What the sights of a stretch follow from.
 
@@ -166,14 +178,13 @@ class _Around(NamedTuple):
         bags: that reach into it, or nearly so.
         parts: the parts of their topics there; None where not all of their rows are in parts, or
             some of these do not count.
-        sessions: those that the bags are of, in the order of their names, each with the one whose
-            transforms hold for it (which is empty where none do).
+        sessions: those that the bags are of, in the order of their names.
     """
 
     window: TimeWindow
     bags: Sequence[BagFile]
     parts: tuple[int, ...] | None
-    sessions: Sequence[tuple[Session, Session]]
+    sessions: Sequence[_Placing]
 
 
 def is_named_for_detections(type_name: str) -> bool:
@@ -237,7 +248,7 @@ class Watching:
             yield from self._shipped(shipped)
             return
         for around in self._stretches_in(TimeWindow.everything()):
-            sessions = [own for own, _ in around.sessions]
+            sessions = [one.own for one in around.sessions]
             if found := self._unpacked(around.window.start, sessions, self._known(around)):
                 yield found
 
@@ -312,10 +323,28 @@ class Watching:
         first: dict[Session, BagFile] = {}
         for bag in bags:
             first.setdefault(self._session(bag), bag)
-        sessions = [(own, self._transforms_of(own, bag, window)) for own, bag in first.items()]
-        if len(sessions) > 1:
-            sessions.sort(key=lambda pair: min(pair[0]))
+        sessions = [
+            one
+            for own, bag in first.items()
+            for one in self._placings(own, bag, window, len(first))
+        ]
+        if len(first) > 1:
+            sessions.sort(key=lambda one: (min(one.own), one.slices or ()))
         return _Around(window, bags, parts, sessions)
+
+    def _placings(
+        self, own: Session, bag: BagFile, window: TimeWindow, sessions: int
+    ) -> Iterator[_Placing]:
+        """Yields whose transforms hold for a session, of which a bag is, among so many sessions."""
+        if sessions == 1 or self._sessions.has_all_kinds(own):
+            yield _Placing(own, self._transforms_of(own, bag, window))
+            return
+        slices: dict[Session, list[int]] = defaultdict(list)
+        for number in range(window.start // SLICE_NS, (window.stop - 1) // SLICE_NS + 1):
+            middle = number * SLICE_NS + SLICE_NS // 2
+            slices[self._sessions.lending_to(bag.recording, middle)].append(number)
+        for among, some in slices.items():
+            yield _Placing(own, among, tuple(some))
 
     def _transforms_of(self, own: Session, bag: BagFile, window: TimeWindow) -> Session:
         """Returns the session whose transforms hold for a bag's; empty where none has any."""
@@ -358,11 +387,15 @@ class Watching:
                 (one, one.log_time if window.contains(one.log_time) else 0)
                 for one in static_in(static_transforms(self._view, among), window)
             ]
-            for _, among in around.sessions
+            for _, among, _ in around.sessions
             if among
         ]
         near = sorted(map(self._sessions.folder, {bag.recording for bag in around.bags}))
-        of = [[(one in own, one in among) for one in near] for own, among in around.sessions]
+        begin = window.start // SLICE_NS
+        of = [
+            ([(one in own, one in among) for one in near], [nth - begin for nth in slices or ()])
+            for own, among, slices in around.sessions
+        ]
         # Mostly they are those of the stretch before, object by object.
         if self._followed[0] != (statics, of):
             limits = self._view.memory.limits
@@ -379,11 +412,12 @@ class Watching:
         of_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
         for topic, rows in self._found(around.window):
             of_session[self._sessions.of(rows.recording)].append((topic, rows))
-        placed = [
-            one
-            for nth, (own, among) in enumerate(around.sessions)
-            for one in self._placed(nth, around.window, own, among, of_session[own])
-        ]
+        placed: list[Placed] = []
+        for nth, (own, among, slices) in enumerate(around.sessions):
+            found = of_session[own]
+            if slices is not None:
+                found = [(topic, _in_slices(rows, slices)) for topic, rows in found]
+            placed += self._placed(nth, around.window, own, among, found)
         return in_bytes(placed) if placed else b""
 
     def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
@@ -407,9 +441,8 @@ class Watching:
         detected: dict[str, Detected] = {}
         for topic, some in by_topic.items():
             all_of = joined_detected([self._rows.of(rows) for rows in some])
-            if all_of.found.rows.size or any(
-                is_named_for_detections(rows.table.channel.type) for rows in some
-            ):
+            named = any(is_named_for_detections(rows.table.channel.type) for rows in some)
+            if all_of.found.rows.size or (named and all_of.log_times.size):
                 detected[topic] = all_of
         if not detected:
             return
@@ -628,6 +661,10 @@ class _Parts(NamedTuple):
         end = int(np.searchsorted(self.firsts, window.stop))
         here = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
         return tuple(np.sort(self.numbers[here]).tolist()) if self.all_count[here].all() else None
+
+
+def _in_slices(rows: Rows, slices: Sequence[int]) -> Rows:
+    return rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices)))
 
 
 def _window(number: int) -> TimeWindow:

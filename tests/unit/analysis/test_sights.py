@@ -234,3 +234,12 @@ def test_labels_of_other_messages_are_not_in_sights() -> None:
     again = of_arrays("/detections", others)
     assert again.labels == found.labels == ("mug",)
     assert again.spots[:, Spot.LABEL].tolist() == [0]
+
+
+def test_numbers_of_more_than_32_bits_are_packed() -> None:
+    far = (9e6, -9e6, 1.0)  # m: in mm that is more
+    messages = [
+        Message("/detections", nth * SECOND, pose, []) for nth, pose in enumerate([HERE, far])
+    ]
+    both, _ = joined_of([sights_of_messages(messages), sights_of([mug(1.0)])])
+    assert sorted(both.looks[:, Look.X].tolist()) == [0, 0, 9 * 10**9]

@@ -1,0 +1,128 @@
+"""What detectors saw, ten minutes after the other: however it is cut, and stored once."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.columns.sights import joined
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import View
+from ros2_memory.things import seen
+from ros2_memory.things.find import find_things
+from ros2_memory.things.seen import STRETCH_NS, Watching
+from tests.support.column_worlds import EVERYTHING, World, store_file
+from tests.unit.things.test_find import AWAY, BEGIN, HERE, looked, write
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.analysis.sights import Sights
+    from ros2_memory.history.context import Memory
+    from ros2_memory.results import Thing
+    from tests.support.bags import Msg
+
+APART_S = STRETCH_NS // 10**9
+
+
+def day() -> list[Msg]:
+    """A robot that looks at a mug, turns round, and looks at a cup in other ten minutes."""
+    later = looked(APART_S, APART_S + 40, HERE, ("cup", 2.0, -1.0), ("mug", 3.0, 0.5))
+    return [*looked(0, 30, HERE, ("mug", 3.0, 0.5)), *looked(30, 60, AWAY), *later]
+
+
+def sights_in(memory: Memory) -> Sights:
+    stretches = [one for some in Watching(View(memory, Call())).newest_first() for one in some]
+    return joined([part for stretch in stretches for part in stretch.sights])[0]
+
+
+def things_in(memory: Memory) -> tuple[Thing, ...]:
+    return find_things(memory, Call()).things
+
+
+def made_in(bag_dir: Path) -> World:
+    """A store of all bags, with the sights that follow from its parts."""
+    world = World.of(bag_dir)
+    world.fill()
+    make(world.memory)
+    return world
+
+
+def make(memory: Memory) -> None:
+    assert memory.columns is not None
+    Watching(View(memory, Call())).make(EVERYTHING)
+    memory.columns.write_fragments()
+
+
+def another(world: World) -> Memory:
+    """The memory of another process over the same store."""
+    return replace(world.memory, columns=Scanner(world.store, world.bag_dir))
+
+
+def stored(bag_dir: Path) -> int:
+    with closing(sqlite3.connect(store_file(bag_dir))) as base:
+        [[count]] = base.execute("SELECT count(*) FROM fragment WHERE kind LIKE 'sights%'")
+    return int(count)
+
+
+def test_sights_are_the_same_however_a_history_is_cut(tmp_path: Path) -> None:
+    found = []
+    for split_s in (3.0, 10.0, 47.0, 5000.0):
+        write(tmp_path / f"{split_s}", day(), split_s)
+        found.append(sights_in(World.of(tmp_path / f"{split_s}").memory))
+    for other in found[1:]:
+        assert other.labels == found[0].labels == ("cup", "mug")
+        for table, same in zip(found[0].tables, other.tables, strict=True):
+            assert table.tolist() == same.tolist()
+
+
+def test_another_process_finds_stored_sights_and_reads_no_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path, day())
+    plain = things_in(World.of(tmp_path).memory)
+    world = made_in(tmp_path)
+    assert {thing.label for thing in plain} == {"cup", "mug"}
+    monkeypatch.delattr(seen, "sights_of")  # there is nothing to be made
+    assert things_in(another(world)) == plain
+
+
+def test_sights_go_with_the_parts_that_they_follow_from(tmp_path: Path) -> None:
+    write(tmp_path, day())
+    world = made_in(tmp_path)
+    assert stored(tmp_path) == 2
+    first = [path for path in world.store.paths() if path.endswith(("_0.mcap", "_1.mcap"))]
+    world.store.delete(first)
+    assert stored(tmp_path) == 2  # their part has other bags
+    world.store.delete([path for path in world.store.paths() if "_60" not in path])
+    assert stored(tmp_path) == 1
+
+
+def test_sights_are_made_again_where_a_late_bag_comes_beside_their_parts(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5)))
+    world = made_in(tmp_path)
+    assert [thing.label for thing in things_in(world.memory)] == ["mug"]
+    late = looked(30, 50, HERE, ("vase", 2.0, -1.5))
+    write(tmp_path, [message for message in late if message.log_time >= BEGIN * 10**9])
+    assert {thing.label for thing in things_in(another(world))} == {"mug", "vase"}
+    world.fill()
+    make(world.memory)
+    assert {thing.label for thing in things_in(another(world))} == {"mug", "vase"}
+
+
+@pytest.mark.parametrize("apart_s", [0, 3 * 10**8])
+def test_a_bag_of_odd_times_has_the_sights_of_its_messages_alone(
+    tmp_path: Path, apart_s: int
+) -> None:
+    odd = [
+        *looked(0, 10, HERE, ("mug", 3.0, 0.5)),
+        *looked(apart_s + 20, apart_s + 30, HERE, ("cup", 2.0, 0.0)),
+    ]
+    write(tmp_path, odd, split_s=10.0**10)
+    world = World.of(tmp_path)
+    assert sights_in(world.memory).labels == ("cup", "mug")
