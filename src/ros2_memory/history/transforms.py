@@ -250,18 +250,20 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
 def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransform]:
     """Yields the static transforms of a topic; of equal ones that follow in a part the first."""
     sessions = sessions_of(view)
-    spans = sessions.recordings_of(among, (topic,)).values()
-    if not spans:
-        return
-    # A session is mostly some hours of a week.
-    window = TimeWindow(min(first for first, _ in spans), max(last for _, last in spans) + 1)
-    for rows in scan(view, topic, window, copies=True):
+    for rows in scan(view, topic, _span_of(view, topic, among), copies=True):
         if sessions.holds_carried(rows.recording):
             for found in messages_of(view, rows):
                 if sessions.has(among, found):
                     yield from decoded_transforms(view, found)
         elif sessions.folder(rows.recording) in among:
             yield from _changes_in(view, rows)
+
+
+def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
+    """Returns when a session has a topic: mostly some hours of a week."""
+    spans = sessions_of(view).recordings_of(among, (topic,)).values()
+    first = min((first for first, _ in spans), default=0)
+    return TimeWindow(first, max((last + 1 for _, last in spans), default=first))
 
 
 def _changes_in(view: View, rows: Rows) -> Sequence[StampedTransform]:
@@ -360,6 +362,8 @@ def _pairs_in(
 ) -> Iterator[frozenset[Pair]]:
     """Yields the pairs of a topic in a window, table by table, those of the newest first."""
     sessions, scanner = sessions_of(view) if among is not None else None, view.memory.columns
+    if among is not None:
+        window = window.intersect(_span_of(view, topic, among))
     for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
         is_mixed = False
         if sessions is not None and among is not None:
