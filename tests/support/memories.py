@@ -31,6 +31,7 @@ from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.places.bag_statics import BagStatics
 from ros2_memory.places.map_digests import map_settings
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.replies import Replies, Reply
@@ -132,7 +133,7 @@ def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scann
     # The newest first, as the server does: numbers of bags are in no order of time.
     for bag in waiting[: round(part * len(waiting))][::-1]:
         filling.fill(bag, timeline)
-    filling.merge(timeline)
+    make_fragments(replace(memory, columns=scanner), filling.merge(timeline))
     return scanner
 
 
