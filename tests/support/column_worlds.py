@@ -19,6 +19,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
+from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.leaves import Comparison
 from tests.support.memories import memory_of
@@ -77,7 +78,7 @@ class World:
             timeline = self.memory.index.snapshot().timeline
             stored = sum(self.filling.fill(bag, timeline) for bag in self.filling.waiting(timeline))
             if merge:
-                self.filling.merge(timeline)
+                make_fragments(self.memory, self.filling.merge(timeline))
             self.filling.trim()
             if not stored:
                 return done

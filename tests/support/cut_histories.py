@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.serving.backfill import make_fragments
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -133,7 +134,7 @@ def fill_some(world: World, draw: Random) -> None:
     for bag in waiting[: draw.randint(0, len(waiting))]:
         world.filling.fill(bag, timeline)
         if draw.random() < 0.3:
-            world.filling.merge(timeline)
+            make_fragments(world.memory, world.filling.merge(timeline))
     if draw.random() < 0.3:
         world.prune()
 

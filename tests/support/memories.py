@@ -27,6 +27,7 @@ from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.replies import Replies, Reply
@@ -120,7 +121,7 @@ def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scann
     # The newest first, as the server does: numbers of bags are in no order of time.
     for bag in waiting[: round(part * len(waiting))][::-1]:
         filling.fill(bag, timeline)
-    filling.merge(timeline)
+    make_fragments(replace(memory, columns=scanner), filling.merge(timeline))
     return scanner
 
 

@@ -11,12 +11,13 @@ import numpy as np
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-from ros2_memory.analysis.motion.standstills import Blocks, Stands
+from ros2_memory.analysis.motion.standstills import BLOCK_NS, PER_METRE, Blocks, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.fragments import Fragment, Kind
 
 if TYPE_CHECKING:
+    from ros2_memory.columns.fragments import Array
     from ros2_memory.core.model import Vector3
 
 
@@ -107,19 +108,32 @@ def _vector(numbers: Vector3) -> Vector3:
 
 
 def _stands_fragment(stands: Stands) -> Fragment:
-    arrays = {field.name: getattr(stands.blocks, field.name) for field in fields(Blocks)}
+    blocks = stands.blocks
+    begins = blocks.numbers * BLOCK_NS
+    arrays: dict[str, Array] = {
+        "numbers": blocks.numbers,
+        "firsts": (blocks.firsts - begins).astype(np.uint32),
+        "lasts": (blocks.lasts - begins).astype(np.uint32),
+        "noises": blocks.noises.astype(np.float32),
+        "lows": np.rint(blocks.lows * PER_METRE).astype(np.int64),
+        "highs": np.rint(blocks.highs * PER_METRE).astype(np.int64),
+        "starts": blocks.starts,
+        "ends": blocks.ends,
+    }
     return Fragment(json.dumps([stands.drops, stands.last]), arrays)
 
 
 def _stands_of(fragment: Fragment) -> Stands:
     drops, last = json.loads(fragment.head)
+    numbers = fragment.integers("numbers")
+    begins = numbers * BLOCK_NS
     blocks = Blocks(
-        fragment.integers("numbers"),
-        fragment.integers("firsts"),
-        fragment.integers("lasts"),
-        fragment.floats("noises"),
-        fragment.vectors("lows"),
-        fragment.vectors("highs"),
+        numbers,
+        begins + fragment.integers("firsts"),
+        begins + fragment.integers("lasts"),
+        fragment.floats("noises").astype(np.float64),
+        fragment.vectors("lows") / PER_METRE,
+        fragment.vectors("highs") / PER_METRE,
         fragment.integers("starts"),
         fragment.integers("ends"),
     )

@@ -250,18 +250,20 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
 def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransform]:
     """Yields the static transforms of a topic; of equal ones that follow in a part the first."""
     sessions = sessions_of(view)
-    spans = sessions.recordings_of(among, (topic,)).values()
-    if not spans:
-        return
-    # A session is mostly some hours of a week.
-    window = TimeWindow(min(first for first, _ in spans), max(last for _, last in spans) + 1)
-    for rows in scan(view, topic, window, copies=True):
+    for rows in scan(view, topic, _span_of(view, topic, among), copies=True):
         if sessions.holds_carried(rows.recording):
             for found in messages_of(view, rows):
                 if sessions.has(among, found):
                     yield from decoded_transforms(view, found)
         elif sessions.folder(rows.recording) in among:
             yield from _changes_in(view, rows)
+
+
+def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
+    """Returns when a session has a topic: mostly some hours of a week."""
+    spans = sessions_of(view).recordings_of(among, (topic,)).values()
+    first = min((first for first, _ in spans), default=0)
+    return TimeWindow(first, max((last + 1 for _, last in spans), default=first))
 
 
 def _changes_in(view: View, rows: Rows) -> Sequence[StampedTransform]:
@@ -359,31 +361,41 @@ def _pairs_in(
     view: View, topic: str, window: TimeWindow, among: Session | None
 ) -> Iterator[frozenset[Pair]]:
     """Yields the pairs of a topic in a window, table by table, those of the newest first."""
-    sessions, scanner = sessions_of(view) if among is not None else None, view.memory.columns
+    scanner = view.memory.columns
+    if among is not None:
+        window = window.intersect(_span_of(view, topic, among))
     for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
-        is_mixed = False
-        if sessions is not None and among is not None:
-            is_mixed = sessions.holds_carried(rows.recording)
-            if not is_mixed and sessions.folder(rows.recording) not in among:
-                continue
-        part = None if scanner is None or is_mixed else rows.part
-        pairs = None if scanner is None or part is None else scanner.pairs.get(part)
-        if pairs is None:
-            pairs = None if is_mixed else pairs_in(rows.table, rows.index)
-            if pairs is None and not is_mixed:
-                every = [pairs_in(table, index) for table, index in tables_of(view, rows)]
-                known = [each for each in every if each is not None]
-                if every and len(known) == len(every):
-                    pairs = frozenset[Pair]().union(*known)
-            if pairs is None:
-                found = messages_of(view, rows)
-                if is_mixed and sessions is not None and among is not None:
-                    found = (each for each in found if sessions.has(among, each))
-                read = (one for each in found for one in decoded_transforms(view, each))
-                pairs = frozenset((one.parent, one.child) for one in read)
+        if among is not None and sessions_of(view).holds_carried(rows.recording):
+            sessions = sessions_of(view)
+            found = (each for each in messages_of(view, rows) if sessions.has(among, each))
+            yield _pairs_of(view, found)
+        elif among is None or sessions_of(view).folder(rows.recording) in among:
+            part = rows.part
+            known = None if scanner is None or part is None else scanner.pairs.get(part)
+            pairs = _pairs_of_rows(view, rows) if known is None else known
             if scanner is not None and part is not None:
                 scanner.pairs.put(part, pairs, 200 + 200 * len(pairs))
-        yield pairs
+            yield pairs
+
+
+def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
+    """Returns the pairs in some rows: by their columns, by those of their bags, by their messages.
+
+    A topic beyond its share has none in the store.
+    """
+    pairs = pairs_in(rows.table, rows.index)
+    if pairs is not None:
+        return pairs
+    every = [pairs_in(table, index) for table, index in tables_of(view, rows)]
+    known = [each for each in every if each is not None]
+    if every and len(known) == len(every):
+        return frozenset[Pair]().union(*known)
+    return _pairs_of(view, messages_of(view, rows))
+
+
+def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
+    read = (one for each in messages for one in decoded_transforms(view, each))
+    return frozenset((one.parent, one.child) for one in read)
 
 
 def _is_edge(pair: tuple[str, str]) -> bool:

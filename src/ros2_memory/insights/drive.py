@@ -172,11 +172,8 @@ def _stands(view: View, blocks: Iterable[PoseRows]) -> list[Stands]:
     ]
 
 
-def make_fragments(view: View, window: TimeWindow) -> None:
-    """Makes what the columns of a window say of the robot's path, and of where it stood.
-
-    What is not in parts yet is left out.
-    """
+def slice_drive(view: View, window: TimeWindow) -> None:
+    """Makes the slices of the path in a window, and of where the robot stood, by parts alone."""
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_pose_topic(view)
         rows = pose_rows(view, topic, window.widened(SLICE_NS), [], newest_first=True, stored=True)

@@ -99,7 +99,26 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
     every.sort(key=lambda visit: visit[0], reverse=True)
     elapsed = elapsed_in(view, window)
     tracks = RobotTracks(view, frame_id)
+    ends = window.start, window.stop - 1
+    every = [
+        (one, track)
+        for one, track in every
+        if (one.start not in ends and one.stop not in ends)
+        or _has_pose(tracks, one, track, where.region)
+    ]
     return RegionVisits(joined.track, every, elapsed, joined.since is None, tracks)
+
+
+def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Region) -> bool:
+    """Returns whether a visit that a window cuts off has a pose in the window."""
+    first = int(np.searchsorted(track.times, one.start, side="left"))
+    last = int(np.searchsorted(track.times, one.stop, side="right"))
+    vertices = zip(track.x[first:last].tolist(), track.y[first:last].tolist(), strict=True)
+    if any(region.contains(x, y) for x, y in vertices):
+        return True
+    poses = tracks.poses(TimeWindow(one.start, one.stop + 1))
+    places = zip(poses.x.tolist(), poses.y.tolist(), strict=True)
+    return any(region.contains(x, y) for x, y in places)
 
 
 def visit_of(found: RegionVisits, nth: int, where: Where, newest: Ns | None) -> Visit:

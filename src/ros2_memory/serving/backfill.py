@@ -30,7 +30,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
-from ros2_memory.insights.drive import make_fragments
+from ros2_memory.insights.drive import slice_drive
 from ros2_memory.places.region_visits import make_tracks
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
@@ -143,22 +143,7 @@ class Backfill:
         if self.filling is not None and snapshot.problem is None:
             merged = self.filling.merge(snapshot.timeline)
             self.filling.trim()
-            self._make_fragments(merged)
-
-    def _make_fragments(self, windows: Sequence[TimeWindow]) -> None:
-        """Makes and stores what follows from the parts of some times."""
-        scanner = self._memory.columns
-        if scanner is None or not windows:
-            return
-        view = View(self._memory, Call())
-        for window in windows:
-            try:
-                make_fragments(view, window)
-                make_tracks(view, window)
-                Watching(view).make(window)
-            except EpisodicError as error:
-                log.warning("fragments_not_made", reason=str(error))
-            scanner.write_fragments()
+            make_fragments(self._memory, merged)
 
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""
@@ -279,6 +264,21 @@ class Backfill:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
+
+
+def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
+    """Makes and stores what follows from the parts of some times."""
+    if memory.columns is None or not windows:
+        return
+    view = View(memory, Call())
+    for window in windows:
+        try:
+            slice_drive(view, window)
+            make_tracks(view, window)
+            Watching(view).make(window)
+        except EpisodicError as error:
+            log.warning("fragments_not_made", reason=str(error))
+        memory.columns.write_fragments()
 
 
 async def keep_backfilled(

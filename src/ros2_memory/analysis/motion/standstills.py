@@ -68,7 +68,7 @@ CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
 _NOISE_FACTOR: Final = 5.5
 _NEAREST_M: Final = 0.0003
 """Poses without noise are at one place if they are no farther apart than this."""
-_PER_METRE: Final = 10_000
+PER_METRE: Final = 10_000
 """Means of positions are rounded: nothing depends on the order in which they are added up."""
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
 _BLOCKS_AT_ONCE: Final = 64
@@ -238,12 +238,14 @@ def _blocks(slots: _Slots, among: Ints, chains: Ints, starts: Ints, ends: Ints) 
     stops = np.r_[begins[1:], among.size]
     if not begins.size:
         return NO_BLOCKS
-    means = np.rint(slots.means[among] * _PER_METRE) / _PER_METRE
+    means = np.rint(slots.means[among] * PER_METRE) / PER_METRE
+    noises = slots.noises[among] / np.sqrt(slots.counts[among])
     return Blocks(
         numbers[begins],
         slots.firsts[among[begins]],
         slots.lasts[among[stops - 1]],
-        np.maximum.reduceat(slots.noises[among] / np.sqrt(slots.counts[among]), begins),
+        # As they are stored.
+        np.maximum.reduceat(noises, begins).astype(np.float32).astype(np.float64),
         np.minimum.reduceat(means, begins),
         np.maximum.reduceat(means, begins),
         starts[among[begins]],

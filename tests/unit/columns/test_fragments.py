@@ -1,0 +1,171 @@
+"""What follows from parts: stored once, found by other processes, and gone with its parts."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.columns.fragments import DAY_NS, Fragment, FragmentKey, Fragments, Kind
+from ros2_memory.columns.motion import PATHS, STANDS
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.history.driven_path import blocks_back, slices_of_path
+from ros2_memory.history.view import View
+from tests.support.bags import odom, write_mcap
+from tests.support.column_worlds import EVERYTHING, World, store_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.columns.store import ColumnStore
+
+S = NS_PER_S
+T0 = 1_700_000_400 * S
+
+
+class Words:
+    """A value to store: some words."""
+
+    def __init__(self, words: str) -> None:
+        self.words = words
+
+    @property
+    def memory_bytes(self) -> int:
+        return 100
+
+
+WORDS = Kind("words", lambda made: Fragment(made.words, {}), lambda found: Words(found.head))
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> World:
+    """Ten minutes in ten bags, all in parts."""
+    for number in range(10):
+        start = T0 + number * 60 * S
+        poses = [odom(start + n * S // 5, number + n / 300, 0.1 * (n % 7)) for n in range(300)]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", poses)
+    world = World.of(tmp_path)
+    world.fill()
+    return world
+
+
+def part_of(store: ColumnStore) -> int:
+    [head] = store.parts("/odom")
+    return head.number
+
+
+def fragments_in(file: Path) -> int:
+    with closing(sqlite3.connect(file)) as base:
+        return int(base.execute("SELECT count(*) FROM fragment").fetchone()[0])
+
+
+arrays = st.one_of(
+    st.lists(st.integers(-(2**63), 2**63 - 1)).map(lambda rows: np.array(rows, np.int64)),
+    st.lists(st.floats()).map(lambda rows: np.array(rows, np.float64)),
+    st.lists(st.booleans()).map(lambda rows: np.array(rows, np.bool_)),
+    st.integers(0, 5).map(lambda rows: np.arange(3.0 * rows).reshape(-1, 3)),
+)
+
+
+@given(st.text().filter(lambda head: "\n" not in head), st.dictionaries(st.text(), arrays))
+def test_a_fragment_is_the_same_once_it_was_stored(
+    head: str, named: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]]
+) -> None:
+    found = Fragment.from_bytes(Fragment(head, named).to_bytes())
+    assert found.head == head
+    assert [*found.arrays] == [*named]
+    for name, array in named.items():
+        assert found.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(found.arrays[name], array)
+
+
+def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world: World) -> None:
+    store, key = world.store, FragmentKey(T0, "any", (part_of(world.store),))
+    one, other = Fragments(store, WORDS, "", 10**6), Fragments(store, WORDS, "", 10**6)
+    assert other.get(key) is None
+    one.put(key, Words("there"))
+    assert other.get(key) is None
+    one.write()
+    found = other.get(key)
+    assert found is not None
+    assert found.words == "there"
+
+
+def test_a_fragment_of_other_parts_settings_or_days_is_another(world: World) -> None:
+    part = part_of(world.store)
+    known = Fragments(world.store, WORDS, "", 10**6)
+    known.put(FragmentKey(T0, "any", (part,)), Words("there"))
+    known.write()
+    for other in (
+        FragmentKey(T0, "any", ()),
+        FragmentKey(T0, "other", (part,)),
+        FragmentKey(T0 + DAY_NS, "any", (part,)),
+    ):
+        assert Fragments(world.store, WORDS, "", 10**6).get(other) is None
+    assert Fragments(world.store, WORDS, "else", 10**6).get(FragmentKey(T0, "any", (part,))) is None
+
+
+def test_fragments_go_with_their_part(world: World, tmp_path: Path) -> None:
+    assert fragments_in(store_file(tmp_path)) > 0
+    for path in sorted(tmp_path.glob("rec/*.mcap")):
+        path.unlink()
+    write_mcap(tmp_path / "other" / "other_0.mcap", [odom(T0 + 9000 * S, 0, 0)])
+    world.prune()
+    assert fragments_in(store_file(tmp_path)) == 0
+
+
+def test_a_fragment_of_a_part_that_went_meanwhile_is_not_stored(
+    world: World, tmp_path: Path
+) -> None:
+    key = FragmentKey(T0, "any", (part_of(world.store),))
+    known = Fragments(world.store, WORDS, "", 10**6)
+    known.put(key, Words("secret"))
+    world.store.delete(world.store.paths())
+    known.write()
+    assert fragments_in(store_file(tmp_path)) == 0
+
+
+def test_a_damaged_fragment_is_made_again(world: World, tmp_path: Path) -> None:
+    world.store.close()
+    with closing(sqlite3.connect(store_file(tmp_path), isolation_level=None)) as base:
+        base.execute("UPDATE fragment SET data = x'00'")
+    again = World.of(tmp_path)
+    view = View(again.memory, Call())
+    slices = [*slices_of_path(view, blocks_back(view, "/odom", EVERYTHING, []))]
+    assert sum(path.poses for _, path in slices) == 3000
+
+
+@pytest.mark.parametrize("kind", [PATHS, STANDS], ids=lambda kind: kind.name)
+def test_filling_makes_the_slices_of_a_drive_that_a_question_would(
+    world: World, tmp_path: Path, kind: Kind[Words]
+) -> None:
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        like = f"{kind.name} %"
+        rows = base.execute("SELECT data FROM fragment WHERE kind LIKE ?", (like,)).fetchall()
+    assert rows
+    for (data,) in rows:
+        loaded = kind.load(Fragment.from_bytes(data))
+        stored = kind.store(loaded)
+        assert stored.to_bytes() == data
+
+
+def test_stored_slices_of_a_path_are_those_that_are_measured_now(world: World) -> None:
+    scanner = Scanner(world.store, world.bag_dir)
+    assert scanner.store is not None
+    view = View(world.memory, Call())
+    window = TimeWindow(T0, T0 + 600 * S)
+    stored = [path for _, path in slices_of_path(view, blocks_back(view, "/odom", window, []))]
+    plain = View(world.unstored().memory, Call())
+    made = [path for _, path in slices_of_path(plain, blocks_back(plain, "/odom", window, []))]
+    assert [path.totals for path in stored] == [path.totals for path in made]
+    for one, other in zip(stored, made, strict=True):
+        np.testing.assert_array_equal(one.line.times, other.line.times)
+        np.testing.assert_array_equal(one.line.metres, other.line.metres)
