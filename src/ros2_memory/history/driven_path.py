@@ -67,12 +67,16 @@ _STEP_NS: Final[Ns] = NS_PER_S // 20
 
 @dataclass(frozen=True, slots=True)
 class DrivenPath:
-    """A path, its frames in order of appearance, and the times of its first and last message."""
+    """A path, its frames in order of appearance, and the times of its first and last message.
+
+    From `since` (log time, ns) on, where older bags were not read.
+    """
 
     trajectory: Trajectory
     frames: tuple[str, ...]
     first: Ns
     last: Ns
+    since: Ns | None = None
 
 
 class FoundWay(NamedTuple):
@@ -99,7 +103,7 @@ def driven_path(
     note_known_since(view, since)
     if way is None:
         return None
-    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last)
+    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last, since)
 
 
 def note_known_since(view: View, since: Ns | None) -> None:

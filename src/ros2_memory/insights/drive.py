@@ -22,6 +22,7 @@ from ros2_memory.analysis.motion.standstills import (
 from ros2_memory.analysis.motion.trajectory import SLICE_NS
 from ros2_memory.columns.motion import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MIN_NS,
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Stands, Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.poses import PoseRows
@@ -106,7 +106,8 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
         path = driven_path(view, topic, window, 0)
-        standstills, drops = _standstills_in(view, topic, window)
+        since = window.start if path is None or path.since is None else path.since
+        standstills, drops = _standstills_in(view, topic, TimeWindow(since, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed=elapsed)
