@@ -533,6 +533,30 @@ class ColumnStore(Database):
 
         return self.write(write) and stored
 
+    def renew(self, key: BagKey, bag: BagFile) -> bool:
+        """Keeps what is stored of a bag whose sidecar is another one now; returns whether it did.
+
+        Only if it was stored with as many messages of each topic as it has now.
+        """
+        kept = False
+
+        def write(connection: sqlite3.Connection) -> None:
+            nonlocal kept
+            cursor = connection.execute(
+                "UPDATE bag SET sidecar_ns = ?1 WHERE sidecar_ns <> ?1 AND path = ?2 AND size = ?3"
+                " AND mtime_ns = ?4 AND counts = ?5"
+                " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
+                (
+                    key.sidecar_ns,
+                    *key[:3],
+                    bag.summary.packed,
+                    bag.summary.schema.to_json(),
+                ),
+            )
+            kept = cursor.rowcount > 0
+
+        return self.write(write) and kept
+
     def put_long(
         self,
         key: BagKey,
