@@ -219,16 +219,19 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Bl
     is_long = slots.lasts[edges[1]] - slots.firsts[edges[0]] >= SHORTEST_NS
     is_long |= (slots.firsts[firsts] < start) | (slots.lasts[lasts] >= stop)
     if goes_on:
-        is_long |= (firsts == 0) | (lasts == len(slots) - 1)
+        is_long |= (edges[0] == 0) | (edges[1] == len(slots) - 1)
     starts = np.full(len(slots), MIN_NS)
     ends = np.full(len(slots), MIN_NS)
     among = np.zeros(len(slots), np.bool_)
     for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
         among[first : last + 1] = True
-        if start <= slots.firsts[first] < stop and not (goes_on and first == 0):
+        if start <= slots.firsts[first] < stop:
             starts[first] = slots.begin_of(first)
-        if start <= slots.firsts[last] < stop and not (goes_on and last == len(slots) - 1):
+        if start <= slots.firsts[last] < stop:
             ends[last] = slots.end_of(last)
+    if goes_on:
+        starts[starts == slots.times[0]] = MIN_NS
+        ends[ends == slots.times[-1]] = MIN_NS
     among &= (slots.firsts >= start) & (slots.firsts < stop)
     return _blocks(slots, np.flatnonzero(among), np.cumsum(is_first), starts, ends)
 
