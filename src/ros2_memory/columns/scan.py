@@ -218,17 +218,12 @@ class Scan:
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
-        for number in self._scanner.store.splits():
-            split = coverage.bag(number)
-            if (
-                split is not None
-                and split.summary.of(topic)
-                and reach.overlaps(split.start, split.end)
-            ):
-                yield _Source(*split.summary.span_of([topic]), None, split, number)
-        for bag in coverage.missing:
-            if reach.overlaps(bag.start, bag.end) and bag.summary.of(topic):
-                yield _Source(*bag.summary.span_of([topic]), None, bag)
+        splits = ((number, coverage.bag(number)) for number in self._scanner.store.splits())
+        for number, bag in (*splits, *((-1, bag) for bag in coverage.missing)):
+            if bag is not None and bag.summary.of(topic):
+                first, last = bag.summary.span_of([topic])
+                if reach.overlaps(first, last):
+                    yield _Source(first, last, None, bag, number)
 
     def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:

@@ -312,11 +312,13 @@ class PieceNumbers:
 
 def _decoded(view: View, rows: Rows) -> Iterator[Rows]:
     """Yields some rows as their bags have them."""
+    channel, times = rows.table.channel, rows.times
     for bag, positions in rows.bag_rows():
-        wanted = rows.times[positions]
-        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
+        wanted = times[positions]
+        window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
+        for nth, table in enumerate(view.bags.tables(bag, channel.topic, window)):
             index = np.flatnonzero(np.isin(table.log_times, wanted))
-            if table.channel.type == rows.table.channel.type and index.size:
+            if table.channel.type == channel.type and index.size:
                 unit = BagUnit(bag, table, nth)
                 yield Rows.of(unit, index)
 

@@ -51,7 +51,7 @@ def scan(
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed, columns=columns)
+        return view.bags.tables(bag, topic, window, hashed=hashed, columns=columns, around=True)
 
     def check(at: Ns) -> None:
         reached(at)
@@ -81,13 +81,14 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
+    window = TimeWindow.everything()
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed, columns=False)
+        return view.bags.tables(bag, topic, window, hashed=hashed, columns=False, around=True)
 
     asked = Asked(
         topic,
-        TimeWindow.everything(),
+        window,
         view.snapshot.timeline,
         decode,
         shared=view.snapshot.timeline.shared_times,
