@@ -144,6 +144,16 @@ class Limited(Deadline):
         return next(self.looks, True)  # type: ignore[attr-defined]
 
 
+def test_a_mean_lies_between_the_least_and_the_greatest_number(tmp_path: Path) -> None:
+    position = 1.221303095  # a column says 1.2213
+    write(tmp_path, [odom(BEGIN + n * S, position * n, 0.0) for n in range(3)])
+    memory = storing(memory_of(tmp_path, limits=LATEST), tmp_path, Random(1))
+    window = TimeRange(BEGIN / S + 1, BEGIN / S + 1)
+    answer = count_range(memory, Call(), "/odom", window, "day", fields=["position.x"])
+    ends = [cells(answer, f"position.x.{name}") for name in ("min", "mean", "max")]
+    assert ends == [[position] * 2] * 3
+
+
 def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched(
     tmp_path: Path,
 ) -> None:
