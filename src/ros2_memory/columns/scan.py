@@ -212,14 +212,13 @@ class Scan:
         """Yields the sources that may have rows in a window."""
         topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
-            bags = {bag.file: bag for bag, *_ in timeline.extents(topic, reach)}
-            for bag in bags.values():
-                yield _Source(*bag.summary.span_of([topic]), None, bag)
+            plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
+            yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
-        splits = ((number, coverage.bag(number)) for number in self._scanner.store.splits())
-        for number, bag in (*splits, *((-1, bag) for bag in coverage.missing)):
+        splits = [(coverage.bag(number), number) for number in self._scanner.store.splits()]
+        for bag, number in [*splits, *((missing, -1) for missing in coverage.missing)]:
             if bag is not None and bag.summary.of(topic):
                 first, last = bag.summary.span_of([topic])
                 if reach.overlaps(first, last):
