@@ -62,6 +62,11 @@ class Extreme(NamedTuple):
         """Whether the number and its first message are known."""
         return self.low == self.high and self.first == self.last
 
+    @property
+    def middle(self) -> float:
+        """The number, off by no more than its column is."""
+        return (self.low + self.high) / 2
+
 
 class Part(NamedTuple):
     """The numbers of a field in some messages of one piece.
