@@ -198,11 +198,11 @@ def test_a_catalogue_locked_by_another_keeps_no_question_waiting(tmp_path: Path)
                 assert not filler.digest(bag)
                 assert not filler.digest(bag)
             assert told(memory, count=13) == right
-        assert warned(logs) == ["catalogue_failed"]
+        assert warned(logs) == ["database_failed"]
         assert trouble_of(filler) == "cannot be used: database is locked"
     with structlog.testing.capture_logs() as logs:
         fill_up(filler)
-    assert "catalogue_works_again" in [each["event"] for each in logs]
+    assert "database_works_again" in [each["event"] for each in logs]
     assert trouble_of(filler) is None
     assert filler.progress().waiting == 0
     assert told(memory, count=13) == right
