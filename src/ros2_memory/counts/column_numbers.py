@@ -288,7 +288,8 @@ class PieceNumbers:
                     "out of time before bags were read for the exact least and greatest numbers: "
                     f"those of {self._fields[field]} may be off in their last digits"
                 )
-            self._settled[key] = found or extreme._replace(low=extreme.high, last=extreme.first)
+            number, first = extreme.middle, extreme.first
+            self._settled[key] = found or Extreme(number, number, first, first)
         return self._settled[key]
 
     def _read_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
