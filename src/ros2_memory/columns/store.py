@@ -84,8 +84,9 @@ CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQU
   hashed INTEGER NOT NULL, definitions TEXT NOT NULL, summary INTEGER NOT NULL,
   counts BLOB NOT NULL);
 CREATE TABLE summary (id INTEGER PRIMARY KEY, topics TEXT NOT NULL UNIQUE);
-CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, encoding TEXT NOT NULL,
-  latched INTEGER NOT NULL, definition INTEGER NOT NULL, layout TEXT NOT NULL,
+CREATE TABLE topic (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL,
+  encoding TEXT NOT NULL, latched INTEGER NOT NULL, definition INTEGER NOT NULL,
+  layout TEXT NOT NULL,
   UNIQUE (name, encoding, latched, definition, layout));
 CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TEXT NOT NULL,
   text BLOB NOT NULL, UNIQUE (type, encoding, text));
