@@ -91,7 +91,7 @@ def unpacked(file: Path) -> bytes:
     return b"".join(map(decompressed, packed(file)))
 
 
-DERIVED = {True: {"part", "part_column", "zone"}, False: {"split"}}
+DERIVED = {True: {"part", "part_column", "fragment", "zone"}, False: {"split"}}
 
 
 @pytest.mark.parametrize("merged", DERIVED)
