@@ -101,6 +101,7 @@ class LakeRobot:
             recall,
             stated=stated_in,
             sights=catalogue.sights,
+            shipped=catalogue.fragment,
         )
 
     @property
