@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
 
 
 def scan(
@@ -128,17 +127,3 @@ def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
             if left[found.time] and found.record.channel.type == channel.type:
                 left[found.time] -= 1
                 yield found
-
-
-def tables_of(view: View, rows: Rows) -> Iterator[tuple[Table, IntArray]]:
-    """Yields some rows as tables with all columns, decoded from their bags.
-
-    Where the store holds no columns of them, being beyond its share. With each table come the
-    positions of the rows in it.
-    """
-    times, channel = rows.times, rows.table.channel
-    for bag, positions in rows.bag_rows():
-        wanted = times[positions]
-        for table in view.bags.tables(bag, channel.topic, hashed=False):
-            if table.channel.type == channel.type:
-                yield table, np.flatnonzero(np.isin(table.log_times, wanted))
