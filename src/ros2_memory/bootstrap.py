@@ -39,7 +39,7 @@ from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -407,7 +407,7 @@ def build_memory(
         sources=() if settings.data.recording else (bag_dir / FOLDER / FILE,),
         waits_for=bag_dir,
     )
-    columns = build_columns(settings, reader, shared.extractor.types_that_place())
+    columns = build_columns(settings, reader)
 
     def known_files() -> dict[str, BagFile]:
         stored = {} if columns is None else columns.known_files(bag_dir)
@@ -455,13 +455,10 @@ def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     return (*beside, cache / PACKAGE / name / file) if cache.is_absolute() else beside
 
 
-def build_columns(
-    settings: Settings, reader: BagReader, first: Collection[str] = ()
-) -> ColumnStore | None:
+def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
     """Returns the store of columns; None where the configuration wants none.
 
-    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes. `first`
-    is as in `ColumnStore`.
+    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
@@ -473,7 +470,6 @@ def build_columns(
         partial(column_paths, settings),
         reader.definition,
         definitions=_hash_of(_definitions_of(settings)),
-        first=first,
         # What a recorder's server stored serves who only looks, too.
         sources=(bag_dir / OWN_FOLDER / FILE,),
         waits_for=bag_dir,

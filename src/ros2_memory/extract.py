@@ -361,11 +361,6 @@ class SchemaExtractor:
             plan = self._plans.get(type_name.replace("/", "/msg/"))
         return UNMAPPED if plan is None else plan
 
-    def types_that_place(self) -> frozenset[str]:
-        """Returns the types of messages that say where something is: transforms, mapped poses."""
-        poses = (name for name, plan in self._plans.items() if plan.poses or plan.geodetic)
-        return frozenset((TF_MESSAGE, *poses))
-
     def _whole(self, rendering: ExactJson, message: object, type_name: str) -> JsonValue:
         plan = self.plan(type_name)
         nodes = [(name, _converted(name, _at(message, path))) for name, path in plan.fields.items()]

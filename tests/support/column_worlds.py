@@ -25,7 +25,6 @@ from tests.support.leaves import Comparison
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
@@ -56,12 +55,11 @@ class World:
         file: Path | None = None,
         clock: Clock | None = None,
         definitions: str = "",
-        first: Collection[str] = (),
     ) -> World:
         reader = BagDirReader(Rosbag2Reader(), bag_dir)
         memory = memory_of(bag_dir, clock=clock, reader=reader)
         paths = [file or store_file(bag_dir)]
-        store = ColumnStore(paths, reader.definition, definitions=definitions, first=first)
+        store = ColumnStore(paths, reader.definition, definitions=definitions)
         memory = replace(memory, columns=Scanner(store, bag_dir))
         assert memory.columns is not None
         filling = Filling(memory.columns, reader, bag_dir, memory.clock, limits or StoreLimits())
@@ -79,6 +77,7 @@ class World:
             stored = sum(self.filling.fill(bag, timeline) for bag in self.filling.waiting(timeline))
             if merge:
                 make_fragments(self.memory, self.filling.merge(timeline))
+                self.filling.thin()
             self.filling.trim()
             if not stored:
                 return done

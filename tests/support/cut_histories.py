@@ -135,6 +135,8 @@ def fill_some(world: World, draw: Random) -> None:
         world.filling.fill(bag, timeline)
         if draw.random() < 0.3:
             make_fragments(world.memory, world.filling.merge(timeline))
+            if draw.random() < 0.5:
+                world.filling.thin()
     if draw.random() < 0.3:
         world.prune()
 

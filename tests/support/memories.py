@@ -122,6 +122,7 @@ def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scann
     for bag in waiting[: round(part * len(waiting))][::-1]:
         filling.fill(bag, timeline)
     make_fragments(replace(memory, columns=scanner), filling.merge(timeline))
+    filling.thin()
     return scanner
 
 

@@ -91,6 +91,7 @@ class Filling:
         self._refused: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
         self._merged: list[tuple[Ns, Ns]] = []
+        self._whole_parts: list[tuple[list[int], list[BagFile]]] = []
 
     def waiting(self, timeline: Timeline) -> list[BagFile]:
         """Returns the bags to be stored, the newest first.
@@ -130,6 +131,8 @@ class Filling:
     def merge(self, timeline: Timeline) -> list[TimeWindow]:
         """Makes parts of bags whose ten minutes are over and all stored.
 
+        They have all columns until `thin` is called: what follows from parts is made of these.
+
         Returns:
             The times in which there are parts since the last call, the newest first.
         """
@@ -145,11 +148,24 @@ class Filling:
                 slots[(*slot, number in hashed)].append((number, bag))
         for (_, begin, _), bags in slots.items():
             if self._is_over(begin, timeline):
-                budget = self._budget([bag for _, bag in bags])
-                if self.store.merge([number for number, _ in bags], budget):
+                parts = self.store.merge([number for number, _ in bags])
+                if parts:
                     self._merged.append((begin, begin + PART_NS))
+                    self._whole_parts.append((parts, [bag for _, bag in bags]))
         merged, self._merged = united(self._merged), []
         return [TimeWindow(*span) for span in reversed(merged)]
+
+    def thin(self) -> None:
+        """Drops columns of the parts that `merge` made, as far as they are beyond the share.
+
+        A robot that drives has more to store than one that stands: what other bags left of their
+        share is theirs.
+        """
+        parts, self._whole_parts = self._whole_parts, []
+        for some, bags in parts:
+            stored, taken = self.store.merged_bytes()
+            spare = round(self._limits.max_share * stored) - taken
+            self.store.thin(some, self._share(bags), spare)
 
     def prune(self, timeline: Timeline) -> None:
         """Deletes the bags whose files are gone; nothing where no bag is left.
@@ -205,21 +221,13 @@ class Filling:
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
         every = (self._whole(bag, tables) for tables in chain(begin, groups))
-        budget = self._budget([bag])
+        stored, taken = self.store.merged_bytes()
+        left = round(self._limits.max_share * stored) - taken
+        budget = self._share([bag]) + max(left, 0)
         self._merged.append((bag.start, bag.end + 1))
         return self.store.put_long(
             key, bag, every, hashed=hashed, budget=budget, is_current=is_current
         )
-
-    def _budget(self, bags: Sequence[BagFile]) -> int:
-        """Returns how many bytes the columns of some bags may take.
-
-        A robot that drives has more to store than one that stands: what other bags left of their
-        share is theirs.
-        """
-        others, taken = self.store.merged_bytes()
-        left = round(self._limits.max_share * others) - taken
-        return self._share(bags) + max(left, 0)
 
     def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)

@@ -35,7 +35,7 @@ ZONE_ALONE: Final = "zone"
 """The codec of a column of which there is never more than the zone."""
 DROPPED: Final = "dropped"
 """The codec of a column of which only the zone is stored: its topic is beyond its share."""
-_ALWAYS: Final = frozenset({LOG_TIME, PUBLISH_TIME, PAYLOAD_HASH, BAG})
+ALWAYS: Final = frozenset({LOG_TIME, PUBLISH_TIME, PAYLOAD_HASH, BAG})
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,6 @@ class PackedPart:
         messages: how many rows.
         bags: the numbers of the bags that its rows are of, ascending.
         columns: by their paths, packed; the data is compressed.
-        dropped_bytes: how many bytes the data took that it has no more.
     """
 
     first: Ns
@@ -56,23 +55,11 @@ class PackedPart:
     messages: int
     bags: tuple[int, ...]
     columns: Mapping[str, Packed]
-    dropped_bytes: int = 0
 
     @property
     def size(self) -> int:
         """How many bytes its data takes."""
         return sum(len(packed.data) for packed in self.columns.values())
-
-    def without_data(self) -> PackedPart:
-        """Returns the part with the zones of its columns alone, and the times of its messages."""
-        columns = {
-            path: packed
-            if path in _ALWAYS or not packed.data
-            else replace(packed, codec=DROPPED, data=b"")
-            for path, packed in self.columns.items()
-        }
-        part = replace(self, columns=columns)
-        return replace(part, dropped_bytes=self.size - part.size)
 
 
 def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:

@@ -34,13 +34,12 @@ from ros2_memory.columns.writing import (
     PART_NS,
     Layouts,
     LongBag,
-    Share,
     delete_bags,
     insert_bag,
     insert_parts,
     lacks_definitions,
+    thin_parts,
     topic_of,
-    within,
     zone_of,
 )
 from ros2_memory.columns.zones import Zones
@@ -50,7 +49,7 @@ from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
@@ -201,8 +200,6 @@ class ColumnStore(Database):
         definition_of: returns the definition of a channel, as `BagReader.definition`.
         definitions: tells the configured message definitions apart. Bags with messages that these
             could not decode are stored only for them.
-        first: types of messages whose columns are stored before those of other large topics: what
-            places the robot, without which hardly any question is answered fast.
     """
 
     def __init__(
@@ -211,14 +208,12 @@ class ColumnStore(Database):
         definition_of: DefinitionOf,
         *,
         definitions: str = "",
-        first: Collection[str] = (),
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
     ) -> None:
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
         self._definition_of = definition_of
         self._definitions = definitions
-        self._first = first
         self._topics: tuple[int, dict[int, Topic]] = (0, {})
         self._layouts = Layouts()
 
@@ -583,10 +578,10 @@ class ColumnStore(Database):
             bag: the bag, for its times.
             groups: all of its messages, in several goes. What they raise is raised here.
             hashed: whether all tables have the hashes of their payloads.
-            budget: how many bytes the parts may take, as for `merge`.
+            budget: how many bytes the parts may take.
             is_current: as for `put`, asked with each group.
         """
-        long = LongBag(key, bag, self._definitions, is_current, Share(budget, self._first))
+        long = LongBag(key, bag, self._definitions, is_current, budget)
         if not (self.write(partial(long.begin, hashed=hashed)) and long.goes_on):
             return False
         is_whole = False
@@ -600,17 +595,17 @@ class ColumnStore(Database):
                 self.write(long.delete_half)
         return is_whole
 
-    def merge(self, bags: Sequence[int], budget: int) -> bool:
-        """Makes parts of bags of one recording; returns whether it did.
+    def merge(self, bags: Sequence[int]) -> list[int]:
+        """Makes parts of bags of one recording; returns their numbers, none if it did not.
 
         Args:
             bags: their numbers. Nothing is done unless each of them is a split.
-            budget: how many bytes the parts may take; the columns of the largest topics are
-                dropped beyond that.
         """
         topics = self.topics()
+        made: list[int] = []
 
         def write(connection: sqlite3.Connection) -> None:
+            made.clear()
             numbers = [bag - self.offset for bag in bags]
             rows = connection.execute(
                 "SELECT bag, tables FROM split WHERE bag IN (SELECT value FROM json_each(?))"
@@ -628,11 +623,27 @@ class ColumnStore(Database):
                 topic: [packed_part(topics[topic].layout, tables)]
                 for topic, tables in found.items()
             }
-            insert_parts(connection, within(connection, packed, Share(budget, self._first)))
+            made.extend(insert_parts(connection, packed))
             connection.execute(
                 "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
                 (json.dumps(numbers),),
             )
+
+        is_written = self.write(write)
+        return [self.offset + part for part in made] if is_written else []
+
+    def thin(self, parts: Sequence[int], at_least: int, spare: int) -> bool:
+        """Drops the columns of the largest topics of some parts, beyond what these may take.
+
+        Args:
+            parts: their numbers.
+            at_least: how many bytes they may take in any case.
+            spare: how many they may take more than now; of less than 0, by how many less.
+        """
+
+        def write(connection: sqlite3.Connection) -> None:
+            if all(map(self.is_current, parts)):
+                thin_parts(connection, [part - self.offset for part in parts], at_least, spare)
 
         return self.write(write)
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import DROPPED, ZONE_ALONE, pack_rows
+from ros2_memory.columns.parts import ALWAYS, DROPPED, ZONE_ALONE, pack_rows
 from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.columns.parts import PackedPart
     from ros2_memory.columns.store import BagKey
@@ -26,16 +26,7 @@ if TYPE_CHECKING:
 PART_NS: Final[Ns] = 600 * NS_PER_S
 """Bags of one recording that begin in the same ten minutes become one part for each topic."""
 _MOST_INTEGER: Final = 2**63 - 1
-_WEIGHT_OF_FIRST: Final = 0.25
-"""What a byte of the topics that come first counts: before large ones, not before all the small."""
 _MOST_LAYOUTS: Final = 4_096
-
-
-class Share(NamedTuple):
-    """What parts may take: so many bytes, and topics of which types come first."""
-
-    size: int
-    first: Collection[str] = ()
 
 
 class LongBag:
@@ -49,7 +40,7 @@ class LongBag:
         bag: the bag.
         definitions: as `ColumnStore` has them.
         is_current: whether the bag may be stored.
-        share: what its parts may take.
+        budget: how many bytes its parts may take.
     """
 
     def __init__(
@@ -58,14 +49,14 @@ class LongBag:
         bag: BagFile,
         definitions: str,
         is_current: Callable[[], bool],
-        share: Share,
+        budget: int,
     ) -> None:
         self.goes_on = False
         self._key = key
         self._bag = bag
         self._definitions = definitions
         self._is_current = is_current
-        self._share = share
+        self._share = budget / max(_messages_of(bag), 1)
         self._lacks_definitions = False
         self._number = 0
         self._layouts = Layouts()
@@ -89,9 +80,8 @@ class LongBag:
             for rows in _in_parts(table) if len(table) else ():
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
-        part = sum(len(table) for table in tables) / max(_messages_of(self._bag), 1)
-        share = self._share._replace(size=round(self._share.size * part))
-        insert_parts(connection, within(connection, packed, share))
+        parts = insert_parts(connection, packed)
+        thin_parts(connection, parts, round(self._share * sum(len(table) for table in tables)))
 
     def end(self, connection: sqlite3.Connection) -> None:
         """Gives the bag its key: now it is stored."""
@@ -114,35 +104,50 @@ class LongBag:
         return self.goes_on
 
 
-def within(
-    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], share: Share
-) -> dict[int, list[PackedPart]]:
-    """Returns the parts of topics; of the largest that are beyond the share no data.
+def thin_parts(
+    connection: sqlite3.Connection, parts: Sequence[int], at_least: int, spare: int = -(2**62)
+) -> None:
+    """Drops the columns of the largest topics of some parts; see `ColumnStore.thin`.
 
     Those that are the largest in all parts, so that not each topic has some parts without data.
-    Topics of the types that come first lose theirs after others that are as large.
     """
+    usual = dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
+    sizes: dict[int, dict[int, int]] = defaultdict(dict)
+    for part, topic, size in connection.execute(
+        "SELECT id, topic, bytes FROM part WHERE id IN (SELECT value FROM json_each(?))"
+        " AND dropped = ''",
+        (json.dumps(parts),),
+    ):
+        sizes[topic][part] = size
+    left = max(sum(sum(some.values()) for some in sizes.values()) + spare, at_least)
+    for topic in sorted(sizes, key=lambda topic: usual[topic]):
+        left -= sum(sizes[topic].values())
+        if left < 0:
+            for part in sizes[topic]:
+                _drop_columns(connection, topic, part)
+
+
+def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> None:
+    """Leaves of a part the zones of its columns, and the times of its messages."""
     rows = connection.execute(
-        "SELECT topic.id FROM topic JOIN definition ON definition.id = topic.definition"
-        " WHERE type IN (SELECT value FROM json_each(?))",
-        (json.dumps([*share.first]),),
+        "SELECT path FROM part_column WHERE part = ? AND length(data) > 0", (part,)
     )
-    weights = {topic: _WEIGHT_OF_FIRST for (topic,) in rows}
-    sizes = {topic: sum(part.size for part in parts[topic]) for topic in parts}
-    usual: dict[int, float] = dict(
-        connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic")
+    paths = [path for (path,) in rows if path not in ALWAYS]
+    if not paths:
+        return
+    among = (topic, part, json.dumps(paths))
+    connection.execute(
+        f"UPDATE zone SET codec = '{DROPPED}' WHERE topic = ? AND part = ?"
+        " AND path IN (SELECT value FROM json_each(?))",
+        among,
     )
-    budget = share.size
-    found: dict[int, list[PackedPart]] = {}
-
-    def rank(topic: int) -> float:
-        return weights.get(topic, 1.0) * (sizes[topic] + usual.get(topic, 0))
-
-    for topic in sorted(parts, key=rank):
-        budget -= sizes[topic]
-        kept = budget >= 0
-        found[topic] = [part if kept else part.without_data() for part in parts[topic]]
-    return found
+    connection.execute(
+        "DELETE FROM part_column WHERE part = ? AND path IN (SELECT value FROM json_each(?))",
+        among[1:],
+    )
+    connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (json.dumps(paths), part))
+    # Who knows the part looks again.
+    connection.execute("INSERT INTO deletion DEFAULT VALUES")
 
 
 def _in_parts(table: Table) -> Iterator[Table]:
@@ -176,29 +181,27 @@ def insert_bag(
     return int(cursor.lastrowid or 0)
 
 
-def insert_parts(connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]]) -> None:
-    """Inserts parts, by the numbers of their topics."""
-    for topic, some in parts.items():
-        for part in some:
-            _insert_part(connection, topic, part)
+def insert_parts(
+    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]]
+) -> list[int]:
+    """Inserts parts, by the numbers of their topics; returns their ids."""
+    return [_insert_part(connection, topic, part) for topic, some in parts.items() for part in some]
 
 
-def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> None:
-    paths = [path for path, packed in part.columns.items() if packed.codec == DROPPED]
-    dropped, size = json.dumps(paths) if paths else "", part.size + part.dropped_bytes
+def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> int:
     cursor = connection.execute(
         "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags), dropped, size),
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), "", part.size),
     )
-    number = cursor.lastrowid
+    number = int(cursor.lastrowid or 0)
     connection.executemany(
         "INSERT INTO part_column VALUES (?, ?, ?)",
         [
             (number, path, packed.data)
             for path, packed in part.columns.items()
             # Numbers that are rounded to one take no bytes, but are no constant.
-            if packed.data or packed.codec.split()[-1] not in {"constant", DROPPED, ZONE_ALONE}
+            if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}
         ],
     )
     connection.executemany(
@@ -219,6 +222,7 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
             for path, packed in part.columns.items()
         ],
     )
+    return number
 
 
 def _storable(bound: int | float | None) -> float | str | None:  # noqa: PYI041 - unlike

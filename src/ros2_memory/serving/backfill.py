@@ -141,9 +141,9 @@ class Backfill:
         """Makes parts of what is stored and over, and keeps the store within what it may take."""
         snapshot = self._memory.index.snapshot()
         if self.filling is not None and snapshot.problem is None:
-            merged = self.filling.merge(snapshot.timeline)
+            make_fragments(self._memory, self.filling.merge(snapshot.timeline))
+            self.filling.thin()
             self.filling.trim()
-            make_fragments(self._memory, merged)
 
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""

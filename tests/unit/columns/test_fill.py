@@ -364,29 +364,6 @@ def test_the_topic_that_is_the_largest_in_all_parts_is_dropped_first(tmp_path: P
     assert odometry < said_then
 
 
-@pytest.mark.parametrize(
-    ("first", "dropped"), [((), "/odom"), (("nav_msgs/msg/Odometry",), "/big")]
-)
-def test_topics_that_come_first_are_dropped_after_others_as_large(
-    tmp_path: Path, first: tuple[str, ...], dropped: str
-) -> None:
-    draw = random.Random(1)
-    messages = [odom(T0 + n * S // 53, draw.uniform(-9, 9), 0.0) for n in range(1600)]
-    said = [f"{draw.getrandbits(2000):x}" for _ in range(30)]
-    messages += [text(T0 + n * S + 7, word, topic="/big") for n, word in enumerate(said[:9])]
-    messages += [text(T0 + n * S + 8, word[:9]) for n, word in enumerate(said)]
-    messages.sort(key=lambda message: message.log_time)
-    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    os.utime(path, ns=(T0, T0))
-    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0), first=first)
-    assert world.fill() == 1
-    with closing(sqlite3.connect(store_file(tmp_path))) as base:
-        rows = base.execute(
-            "SELECT name FROM part JOIN topic ON topic.id = topic WHERE dropped <> ''"
-        ).fetchall()
-    assert rows == [(dropped,)]
-
-
 @pytest.mark.usefixtures("small_groups")
 def test_columns_of_a_long_bag_keep_within_the_share_too(tmp_path: Path) -> None:
     write_bag(tmp_path, 0, rows=2000, hz=100)
