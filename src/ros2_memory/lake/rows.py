@@ -300,7 +300,7 @@ class _BagRows:
     def _add_things(self) -> None:
         placed = Watching(View(self._memory, Call())).in_bag(self._bag)
         if placed:
-            self._add_digest("", "sights", in_bytes(placed))
+            self._add_digest("", "sights", in_bytes([(0, one) for one in placed]))
         for one in placed:
             for sights in one.sights:
                 for spot in sights.spots.tolist():
