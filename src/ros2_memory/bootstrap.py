@@ -407,7 +407,7 @@ def build_memory(
         sources=() if settings.data.recording else (bag_dir / FOLDER / FILE,),
         waits_for=bag_dir,
     )
-    columns = build_columns(settings, reader, shared.extractor.types_that_place())
+    columns = build_columns(settings, reader, shared.extractor.types_of_poses())
 
     def known_files() -> dict[str, BagFile]:
         stored = {} if columns is None else columns.known_files(bag_dir)

@@ -157,7 +157,6 @@ _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
 POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
 """Names of the schema map under which an array of three numbers is shown as x, y and z."""
-TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
 POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
 _VELOCITY_FRAMES: Final = {**POSE_FRAMES, 3: "body FRD"}
 """The constants of px4_msgs/msg/VehicleOdometry."""
@@ -361,10 +360,9 @@ class SchemaExtractor:
             plan = self._plans.get(type_name.replace("/", "/msg/"))
         return UNMAPPED if plan is None else plan
 
-    def types_that_place(self) -> frozenset[str]:
-        """Returns the types of messages that say where something is: transforms, mapped poses."""
-        poses = (name for name, plan in self._plans.items() if plan.poses or plan.geodetic)
-        return frozenset((TF_MESSAGE, *poses))
+    def types_of_poses(self) -> frozenset[str]:
+        """Returns the types of the schema map whose messages say where something is."""
+        return frozenset(name for name, plan in self._plans.items() if plan.poses or plan.geodetic)
 
     def _whole(self, rendering: ExactJson, message: object, type_name: str) -> JsonValue:
         plan = self.plan(type_name)

@@ -200,8 +200,8 @@ class ColumnStore(Database):
         definition_of: returns the definition of a channel, as `BagReader.definition`.
         definitions: tells the configured message definitions apart. Bags with messages that these
             could not decode are stored only for them.
-        first: types of messages whose columns are stored before those of other large topics: what
-            places the robot, without which hardly any question is answered fast.
+        first: types of messages whose columns are stored before those of other large topics: poses,
+            of which many questions are. Transforms are none of them: what they place is stored.
     """
 
     def __init__(
