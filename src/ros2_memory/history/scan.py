@@ -56,7 +56,9 @@ def scan(
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return () if stored else view.bags.tables(bag, topic, hashed=hashed, columns=columns)
+        if stored:
+            return ()
+        return view.bags.tables(bag, topic, window, hashed=hashed, columns=columns, around=True)
 
     def check(at: Ns) -> None:
         reached(at)
@@ -86,13 +88,14 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
+    window = TimeWindow.everything()
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed, columns=False)
+        return view.bags.tables(bag, topic, window, hashed=hashed, columns=False, around=True)
 
     asked = Asked(
         topic,
-        TimeWindow.everything(),
+        window,
         view.snapshot.timeline,
         decode,
         shared=view.snapshot.timeline.shared_times,
@@ -106,7 +109,8 @@ def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
     """Yields some rows as their bags have them."""
     for bag, positions in rows.bag_rows():
         wanted = rows.times[positions]
-        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
+        window = TimeWindow(int(wanted.min()), int(wanted.max()) + 1)
+        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, window)):
             index = np.flatnonzero(np.isin(table.log_times, wanted))
             if table.channel.type == rows.table.channel.type and index.size:
                 unit = BagUnit(bag, table, nth)
@@ -135,6 +139,7 @@ def tables_of(view: View, rows: Rows) -> Iterator[tuple[Table, IntArray]]:
     times, channel = rows.times, rows.table.channel
     for bag, positions in rows.bag_rows():
         wanted = times[positions]
-        for table in view.bags.tables(bag, channel.topic, hashed=False):
+        window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
+        for table in view.bags.tables(bag, channel.topic, window):
             if table.channel.type == channel.type:
                 yield table, np.flatnonzero(np.isin(table.log_times, wanted))

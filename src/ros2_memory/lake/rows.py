@@ -28,6 +28,7 @@ from ros2_memory.analysis.topic_events import (
     state_of,
 )
 from ros2_memory.catalogue.digest import DIGEST_VERSION
+from ros2_memory.columns.motion import PATHS, STANDS
 from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -44,7 +45,7 @@ from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
-from ros2_memory.things.seen import Watching, in_bytes, may_have_detections
+from ros2_memory.things.seen import SIGHTS, Watching, in_bytes, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -284,6 +285,11 @@ class _BagRows:
             found = events.get(topic, NO_EVENTS)
             if found is not NO_EVENTS:
                 add(topic, "events", encode_topic_events(found))
+        if self._poses is not None:
+            path = path_slice(self._poses, self._memory.limits.max_plausible_speed_mps)
+            stands = stands_of(self._poses, MIN_NS, MAX_NS, goes_on=True)
+            add(self._pose_topic, PATHS.name, PATHS.store(path).to_bytes())
+            add(self._pose_topic, STANDS.name, STANDS.store(stands).to_bytes())
 
     def _add_digest(self, topic: str, kind: str, packed: bytes | None) -> None:
         if packed is None:
@@ -300,7 +306,8 @@ class _BagRows:
     def _add_things(self) -> None:
         placed = Watching(View(self._memory, Call())).in_bag(self._bag)
         if placed:
-            self._add_digest("", "sights", in_bytes([(0, one) for one in placed]))
+            packed = SIGHTS.store(in_bytes([(0, one) for one in placed])).to_bytes()
+            self._add_digest(self._pose_topic, SIGHTS.name, packed)
         for one in placed:
             for sights in one.sights:
                 for spot in sights.spots.tolist():

@@ -28,13 +28,14 @@ from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import BagFile, StampedTransform
+    from ros2_memory.history.context import Shipped
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
@@ -91,7 +92,7 @@ class Stretch(NamedTuple):
     sights: tuple[bytes, ...]
 
 
-class _InBytes(NamedTuple):
+class SeenBytes(NamedTuple):
     """What was seen in a stretch; see `in_bytes`. Empty where no detector published."""
 
     data: bytes
@@ -102,7 +103,7 @@ class _InBytes(NamedTuple):
         return 200 + len(self.data)
 
     @classmethod
-    def of(cls, fragment: Fragment) -> _InBytes:
+    def of(cls, fragment: Fragment) -> SeenBytes:
         """Returns what was stored."""
         return cls(fragment.arrays["sights"].tobytes())
 
@@ -111,7 +112,7 @@ class _InBytes(NamedTuple):
         return Fragment("", {"sights": np.frombuffer(self.data, np.uint8)})
 
 
-SIGHTS: Final = Kind("sights", _InBytes.fragment, _InBytes.of)
+SIGHTS: Final = Kind("sights", SeenBytes.fragment, SeenBytes.of)
 """What detectors saw in a stretch."""
 
 
@@ -149,7 +150,7 @@ def may_have_detections(type_name: str) -> bool:
     return type_name == _TEXT or type_name.partition("/")[0] not in _NO_DETECTIONS
 
 
-def in_bytes(placed: Sequence[tuple[int, SessionSights]]) -> bytes:
+def in_bytes(placed: Sequence[tuple[int, SessionSights]]) -> SeenBytes:
     """Returns what was seen as bytes: of each session what there is, as JSON, then the sights.
 
     With each comes which of the sessions around it is.
@@ -160,7 +161,8 @@ def in_bytes(placed: Sequence[tuple[int, SessionSights]]) -> bytes:
         for (nth, one), own in zip(placed, parts, strict=True)
     ]
     described = json.dumps(head).encode()
-    return b"".join((_SIZE.pack(len(described)), described, *chain.from_iterable(parts)))
+    data = (_SIZE.pack(len(described)), described, *chain.from_iterable(parts))
+    return SeenBytes(b"".join(data) if placed else b"")
 
 
 class Watching:
@@ -197,9 +199,8 @@ class Watching:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        shipped = self._view.memory.sights
-        if shipped is not None:
-            yield from self._shipped(shipped)
+        if self._view.memory.shipped is not None:
+            yield from self._shipped(self._view.memory.shipped)
             return
         for around in self._stretches_in(TimeWindow.everything()):
             sessions = [one.own for one in around.sessions]
@@ -246,12 +247,13 @@ class Watching:
             found += [] if placed is None else [placed]
         return found
 
-    def _shipped(self, shipped: Callable[[BagFile], bytes]) -> Iterator[list[Stretch]]:
+    def _shipped(self, shipped: Shipped) -> Iterator[list[Stretch]]:
         """Yields the sights of the bags of a lake, each as a stretch."""
         for bag in reversed(self._view.snapshot.timeline.bags):
             self._view.bags.check_deadline()
-            if found := self._unpacked(bag.start, [self._session(bag)], shipped(bag)):
-                yield found
+            known = shipped(bag, SIGHTS)
+            if known is not None:
+                yield self._unpacked(bag.start, [self._session(bag)], known.data)
 
     def _unpacked(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
         """Returns what was seen from its bytes; see `in_bytes`."""
@@ -321,7 +323,7 @@ class Watching:
             part_key = FragmentKey(around.window.start, followed, around.parts)
             known = fragments.get(part_key)
             if known is None:
-                known = _InBytes(self._read(around))
+                known = SeenBytes(self._read(around))
                 if self._view.notes.added == before:
                     fragments.put(part_key, known)
             return known.data
@@ -376,7 +378,7 @@ class Watching:
             seen = self._placer.placed(around.window, own, among, found)
             if seen is not None:
                 placed.append((nth, seen))
-        return in_bytes(placed) if placed else b""
+        return in_bytes(placed).data
 
     def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
         """Yields the rows in a window that may have detections."""

@@ -12,6 +12,7 @@ from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.catalogue.topic_digest import EdgeDigest
+from ros2_memory.columns.fragments import Fragment
 from ros2_memory.lake.event_codec import decode_topic_events
 from ros2_memory.lake.partitions import locations
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from datetime import date
 
     from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import BagKey
     from ros2_memory.core.model import BagFile
     from ros2_memory.lake.files import Lake
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
+S = TypeVar("S", bound="Sized")
 
 _PART_BYTES: Final = 1 << 20
 """Days are read together, of so many bytes in all: a home robot's day, or weeks of a rare one."""
@@ -87,6 +90,12 @@ class LakeCatalogue(Catalogue):
         """Returns the numbers of the bags, which all have an entry."""
         return [key.sidecar_ns for key in keys]
 
+    def fragment(self, bag: BagFile, kind: Kind[S]) -> S | None:
+        """Returns what followed from a bag when it was shipped; None if unknown."""
+        number = self._index.number(bag)
+        packed = self._packed(kind.name, self._index.pose_topic, [number]).get(number)
+        return None if packed is None else kind.load(Fragment.from_bytes(packed))
+
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic; of digests of another version nothing is known."""
         found = self._packed("events", topic, numbers)
@@ -103,11 +112,6 @@ class LakeCatalogue(Catalogue):
             return {}
         found = self._digests("labels", topic, numbers)
         return {number: words if isinstance(words, str) else "" for number, words in found}
-
-    def sights(self, bag: BagFile) -> bytes:
-        """Returns what detectors saw in a bag, as `things.seen.in_bytes` has it; or nothing."""
-        number = bag.sidecar_ns
-        return self._packed("sights", "", [number]).get(number, b"")
 
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns that all messages could be decoded: rows are made of those alone."""

@@ -101,7 +101,7 @@ class LakeRobot:
             own,
             recall,
             stated=stated_in,
-            sights=catalogue.sights,
+            shipped=catalogue.fragment,
         )
 
     @property
