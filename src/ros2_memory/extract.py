@@ -157,7 +157,6 @@ _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
 POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
 """Names of the schema map under which an array of three numbers is shown as x, y and z."""
-TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
 POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
 _VELOCITY_FRAMES: Final = {**POSE_FRAMES, 3: "body FRD"}
 """The constants of px4_msgs/msg/VehicleOdometry."""

@@ -123,9 +123,8 @@ class Memory:
     digests of the bags, for what does not scan yet. Every answer is the same with them and without.
     `stated` is
     set for a lake, which stores what messages state instead of the messages: it returns that, or
-    None for a message that can be decoded. The poses of a lake are thinned; `shipped` has what was
-    measured of all poses of a bag before. `sights` has what detectors saw in a bag: rows have no
-    transforms that place it.
+    None for a message that can be decoded. The poses of a lake are thinned, and its rows have no
+    transforms that place what was seen; `shipped` has what followed from all of a bag before.
     """
 
     index: SnapshotSource
@@ -136,7 +135,6 @@ class Memory:
     recall: DigestCache | None = None
     columns: Scanner | None = None
     stated: Callable[[Record], State | None] | None = None
-    sights: Callable[[BagFile], bytes] | None = None
     shipped: Shipped | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:

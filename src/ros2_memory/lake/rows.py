@@ -45,7 +45,7 @@ from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
-from ros2_memory.things.seen import Watching, in_bytes, may_have_detections
+from ros2_memory.things.seen import SIGHTS, Watching, in_bytes, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -306,7 +306,8 @@ class _BagRows:
     def _add_things(self) -> None:
         placed = Watching(View(self._memory, Call())).in_bag(self._bag)
         if placed:
-            self._add_digest("", "sights", in_bytes(placed))
+            packed = SIGHTS.store(in_bytes([(0, one) for one in placed])).to_bytes()
+            self._add_digest(self._pose_topic, SIGHTS.name, packed)
         for one in placed:
             for sights in one.sights:
                 for spot in sights.spots.tolist():

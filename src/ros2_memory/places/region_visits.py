@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import FLICKER_NS
+from ros2_memory.analysis.motion.robot_track import STRETCH_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.insights.clock_steps import elapsed_in
@@ -28,11 +32,14 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.regions import Place, Region
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.robot_tracks import Inside, JoinedTrack
     from ros2_memory.places.where import Where
+
+
+_CLOSE_NS: Final[Ns] = 60 * NS_PER_S
+_MOST_JOINED: Final = 50
 
 
 class RegionVisits(NamedTuple):
@@ -91,14 +98,14 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
         QueryTimeoutError: the call's time runs out before any result.
     """
     joined = _joined_in(view, frame_id, window)
+    tracks = RobotTracks(view, frame_id)
     every = [
         (one, track)
         for track in (joined.track, *joined.others)
-        for one in robot_inside(track, where.region, window)
+        for one in _joined_visits(tracks, robot_inside(track, where.region, window), where.region)
     ]
     every.sort(key=lambda visit: visit[0], reverse=True)
     elapsed = elapsed_in(view, window)
-    tracks = RobotTracks(view, frame_id)
     ends = window.start, window.stop - 1
     every = [
         (one, track)
@@ -109,26 +116,79 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
     return RegionVisits(joined.track, every, elapsed, joined.since is None, tracks)
 
 
+def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) -> list[Inside]:
+    """Returns visits in order; those as one between which the robot's poses did not leave.
+
+    Along the edge of a region its track may be outside where it was inside. The newest
+    `_MOST_JOINED` of such visits are looked at.
+    """
+    found: list[Inside] = []
+    looked_at = 0
+    for older in reversed(visits):
+        newer = found[-1] if found else None
+        is_close = newer is not None and newer.start - older.stop < _CLOSE_NS
+        if newer is None or not (newer.entered and older.left and is_close):
+            found.append(older)
+            continue
+        looked_at += 1
+        if looked_at <= _MOST_JOINED and _stays(tracks, region, older, newer):
+            found[-1] = newer._replace(start=older.start, entered=older.entered)
+        else:
+            found.append(older)
+    return found[::-1]
+
+
+def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) -> bool:
+    """Returns whether poses between two visits were never outside for as long as leaving takes."""
+    first = max(older.start, older.stop - STRETCH_NS)
+    last = min(newer.stop, newer.start + STRETCH_NS)
+    poses = tracks.poses(TimeWindow(first, last + 1))
+    places = zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True)
+    inside = [time for time, x, y in places if region.contains(x, y)]
+    in_both = inside and inside[0] <= older.stop and inside[-1] >= newer.start
+    apart = (later - earlier for earlier, later in pairwise(inside))
+    return bool(in_both) and max(apart, default=0) < FLICKER_NS
+
+
 def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Region) -> bool:
     """Returns whether a visit that a window cuts off has a pose in the window."""
-    first = int(np.searchsorted(track.times, one.start, side="left"))
-    last = int(np.searchsorted(track.times, one.stop, side="right"))
-    vertices = zip(track.x[first:last].tolist(), track.y[first:last].tolist(), strict=True)
-    if any(region.contains(x, y) for x, y in vertices):
+    if _vertices_inside(track, one, region):
         return True
     poses = tracks.poses(TimeWindow(one.start, one.stop + 1))
     places = zip(poses.x.tolist(), poses.y.tolist(), strict=True)
     return any(region.contains(x, y) for x, y in places)
 
 
-def visit_of(found: RegionVisits, nth: int, where: Where, newest: Ns | None) -> Visit:
-    """Returns one of the visits for the reply; `newest` is the newest pose, if it is recent enough.
+def shown_visits(
+    found: RegionVisits, limit: int, where: Where, newest: Ns | None
+) -> tuple[tuple[Visit, ...], RegionVisits]:
+    """Returns the newest visits for the reply, and all without those that turned out to be none.
+
+    `newest` is the newest pose, if it is recent enough.
+    """
+    shown: list[Visit] = []
+    every = [*found.all]
+    while len(shown) < min(limit, len(every)):
+        visit = _visit_of(found, every[len(shown)], where, newest)
+        if visit is None:
+            del every[len(shown)]
+        else:
+            shown.append(visit)
+    return tuple(shown), found._replace(all=every)
+
+
+def _visit_of(
+    found: RegionVisits, coarse: tuple[Inside, RobotTrack], where: Where, newest: Ns | None
+) -> Visit | None:
+    """Returns a visit for the reply; None where it has no pose.
 
     Its times are those of poses: of the first and the last one inside, and of the closest.
     """
-    coarse, track = found.all[nth]
+    by_track, track = coarse
     found = found._replace(track=track)
-    one = _by_poses(found, coarse, where.region)
+    one = _by_poses(found, by_track, where.region)
+    if one is None:
+        return None
     there_still = newest is not None and one.stop >= newest
     distance_m, at = None, None
     if isinstance(where.region, Circle):
@@ -146,17 +206,30 @@ def visit_of(found: RegionVisits, nth: int, where: Where, newest: Ns | None) -> 
     )
 
 
-def _by_poses(found: RegionVisits, one: Inside, region: Region) -> Inside:
-    """Returns a visit from its first to its last pose inside, where it was entered and left."""
+def _by_poses(found: RegionVisits, one: Inside, region: Region) -> Inside | None:
+    """Returns a visit from its first to its last pose inside, where it was entered and left.
+
+    None where no pose is inside: the robot's line alone touches the region.
+    """
+    within = _vertices_inside(found.track, one, region)
+    start, stop = one.start, one.stop
     if one.entered:
         poses = _poses_around(found, one.start)
         inside = [time for time, x, y in poses if time <= one.stop and region.contains(x, y)]
-        one = one._replace(start=inside[0] if inside else one.start)
+        start = min((*inside[:1], *within[:1]), default=MAX_NS)
     if one.left:
         poses = _poses_around(found, one.stop)
         inside = [time for time, x, y in poses if time >= one.start and region.contains(x, y)]
-        one = one._replace(stop=inside[-1] if inside else one.stop)
-    return one
+        stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
+    return one._replace(start=start, stop=stop) if start <= stop else None
+
+
+def _vertices_inside(track: RobotTrack, one: Inside, region: Region) -> list[Ns]:
+    """Returns the times of a visit's vertices that are inside."""
+    first = int(np.searchsorted(track.times, one.start, side="left"))
+    last = int(np.searchsorted(track.times, one.stop, side="right"))
+    columns = (column[first:last].tolist() for column in (track.times, track.x, track.y))
+    return [time for time, x, y in zip(*columns, strict=True) if region.contains(x, y)]
 
 
 def _poses_around(found: RegionVisits, at: Ns) -> list[tuple[Ns, float, float]]:
@@ -239,14 +312,18 @@ def place_visits(
         of_place = RegionVisits(track, every, elapsed, is_all=True, tracks=tracks)
         entries = [one for one in inside if one.entered]
         exits = [one for one in inside if one.left]
+        first, last = (
+            _by_poses(of_place, some[nth], place.region) or some[nth] if some else None
+            for some, nth in ((entries, 0), (exits, -1))
+        )
         found.append(
             PlaceVisits(
                 place=place.name,
                 entries=len(entries),
                 exits=len(exits),
                 duration=of_place.duration,
-                first=_by_poses(of_place, entries[0], place.region).start if entries else None,
-                last=_by_poses(of_place, exits[-1], place.region).stop if exits else None,
+                first=None if first is None else first.start,
+                last=None if last is None else last.stop,
             )
         )
     return tuple(sorted(found, key=lambda each: (-each.duration, each.place)))

@@ -29,7 +29,7 @@ from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits, region_visits, visit_of
+from ros2_memory.places.region_visits import place_visits, region_visits, shown_visits
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import Visit, Visits
 
@@ -171,8 +171,7 @@ def _by_track(
     found = region_visits(view, frame_id, place, window)
     newest = _newest(view, topic, found.track, window)
     current = newest if _is_current(view, newest, now) else None
-    some = range(min(limit, len(found.all)))
-    shown = tuple(visit_of(found, nth, place, current) for nth in some)
+    shown, found = shown_visits(found, limit, place, current)
     entries, exits = sum(one.entered for one, _ in found.all), sum(one.left for one, _ in found.all)
     return _Known(
         shown, len(found.all), found.duration, newest, entries, exits, is_all=found.is_all

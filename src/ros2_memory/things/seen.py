@@ -1,19 +1,14 @@
 """What detectors saw in a history: the sights of one stretch of the clock after the other.
 
 A stretch is ten minutes, of one session: what is seen in it is placed by the transforms and poses
-of that session then. So sights are the same however a history is cut into bags.
-
-Which topics are of detectors shows in their messages: they hold detections, or their type is named
-for them. Other messages of such a topic count as looks that saw nothing.
+of that session then. So sights are the same however a history is cut into bags. They are made once,
+where all that they follow from is in parts of the store: then they are stored beside these.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import replace
 from hashlib import blake2b
 from itertools import accumulate, chain, pairwise
 from struct import Struct
@@ -21,33 +16,26 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Frames, multiply, static_at
-from ros2_memory.analysis.motion.odometry import FARTHEST_M
-from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
-from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, fixes_of, sights_of
+from ros2_memory.analysis.frames import static_at
+from ros2_memory.analysis.sights import SLICE_NS
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
 from ros2_memory.columns.sights import packed
-from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.history.detections import DetectionRows, joined_detected
-from ros2_memory.history.frames import frames_over
-from ros2_memory.history.poses import pose_rows
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.scan import scan
 from ros2_memory.history.transforms import sessions_of, static_transforms
+from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.frames import Rotations
-    from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import BagFile, StampedTransform
-    from ros2_memory.history.detections import Detected
+    from ros2_memory.history.context import Shipped
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
@@ -83,22 +71,6 @@ _NO_DETECTIONS: Final = frozenset(
 )
 """Packages whose messages hold no detections, so that nothing is looked for in them."""
 _TEXT: Final = "std_msgs/msg/String"
-_OF_DETECTORS: Final = ("detection", "recognizedobject")
-_LOCALISER: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
-_NEAR_NS: Final[Ns] = NS_PER_S
-"""Farther from a pose, where the robot was is not known."""
-_AROUND_NS: Final[Ns] = 12 * NS_PER_S
-"""How far around a stretch poses and transforms bear on it."""
-_FIX_NS: Final[Ns] = 2 * NS_PER_S
-"""How far apart it is looked where odometry is in the map."""
-_AHEAD_NS: Final[Ns] = 3 * _FIX_NS
-"""How far beyond the last detection: a jump soon after it shows that localisation was off."""
-_MOST_FIXES: Final = 2_000
-_SAID_NS: Final[Ns] = NS_PER_S // 2
-"""What a localiser says more often than that is not read."""
-_SAME_M: Final = 0.1
-"""What changes less from one look to the next is left out."""
-_COVARIANCE: Final = 36
 
 
 class Stretch(NamedTuple):
@@ -120,21 +92,7 @@ class Stretch(NamedTuple):
     sights: tuple[bytes, ...]
 
 
-class Placed(NamedTuple):
-    """What one session saw in a stretch.
-
-    Attributes:
-        nth: which of the sessions around the stretch, in the order of their names.
-        frame_id: as of a `Stretch`.
-        sights: of each topic.
-    """
-
-    nth: int
-    frame_id: str
-    sights: tuple[Sights, ...]
-
-
-class _InBytes(NamedTuple):
+class SeenBytes(NamedTuple):
     """What was seen in a stretch; see `in_bytes`. Empty where no detector published."""
 
     data: bytes
@@ -145,7 +103,7 @@ class _InBytes(NamedTuple):
         return 200 + len(self.data)
 
     @classmethod
-    def of(cls, fragment: Fragment) -> _InBytes:
+    def of(cls, fragment: Fragment) -> SeenBytes:
         """Returns what was stored."""
         return cls(fragment.arrays["sights"].tobytes())
 
@@ -154,7 +112,7 @@ class _InBytes(NamedTuple):
         return Fragment("", {"sights": np.frombuffer(self.data, np.uint8)})
 
 
-SIGHTS: Final = Kind("sights", _InBytes.fragment, _InBytes.of)
+SIGHTS: Final = Kind("sights", SeenBytes.fragment, SeenBytes.of)
 """What detectors saw in a stretch."""
 
 
@@ -187,26 +145,24 @@ class _Around(NamedTuple):
     sessions: Sequence[_Placing]
 
 
-def is_named_for_detections(type_name: str) -> bool:
-    """Returns whether a type is one of a detector by its name."""
-    name = type_name.rpartition("/")[2].casefold()
-    return any(word in name for word in _OF_DETECTORS)
-
-
 def may_have_detections(type_name: str) -> bool:
     """Returns whether messages of a type may hold detections, as far as its name tells."""
     return type_name == _TEXT or type_name.partition("/")[0] not in _NO_DETECTIONS
 
 
-def in_bytes(placed: Sequence[Placed]) -> bytes:
-    """Returns what was seen as bytes: of each session what there is, as JSON, then the sights."""
-    parts = [[packed(sights) for sights in one.sights] for one in placed]
+def in_bytes(placed: Sequence[tuple[int, SessionSights]]) -> SeenBytes:
+    """Returns what was seen as bytes: of each session what there is, as JSON, then the sights.
+
+    With each comes which of the sessions around it is.
+    """
+    parts = [[packed(sights) for sights in one.sights] for _, one in placed]
     head = [
-        (one.nth, one.frame_id, sum(len(sights.spots) for sights in one.sights), [*map(len, own)])
-        for one, own in zip(placed, parts, strict=True)
+        (nth, one.frame_id, sum(len(sights.spots) for sights in one.sights), [*map(len, own)])
+        for (nth, one), own in zip(placed, parts, strict=True)
     ]
     described = json.dumps(head).encode()
-    return b"".join((_SIZE.pack(len(described)), described, *chain.from_iterable(parts)))
+    data = (_SIZE.pack(len(described)), described, *chain.from_iterable(parts))
+    return SeenBytes(b"".join(data) if placed else b"")
 
 
 class Watching:
@@ -218,7 +174,7 @@ class Watching:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._rows = DetectionRows(view)
+        self._placer = Placer(view)
         self._sessions = sessions_of(view)
         self._of: dict[Path, Session] = {}
         timeline = view.snapshot.timeline
@@ -232,7 +188,7 @@ class Watching:
             *self._topics,
             view.pose_topic,
             *limits.tf_topics,
-            *(topic for topic in timeline.topics() if _LOCALISER in timeline.types_of(topic)),
+            *(topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)),
         )
         self._lasts = not view.stream.may_be_relatched(self._topics)
         self._followed: tuple[object, str] = None, ""
@@ -243,9 +199,8 @@ class Watching:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        shipped = self._view.memory.sights
-        if shipped is not None:
-            yield from self._shipped(shipped)
+        if self._view.memory.shipped is not None:
+            yield from self._shipped(self._view.memory.shipped)
             return
         for around in self._stretches_in(TimeWindow.everything()):
             sessions = [one.own for one in around.sessions]
@@ -269,16 +224,16 @@ class Watching:
         bags = _Bags(self._view, self._topics, self._needed, window)
         for number in bags.stretches():
             self._view.bags.check_deadline()
-            yield self._around(_window(number), *bags.around(_window(number).widened(_AROUND_NS)))
+            yield self._around(_window(number), *bags.around(_window(number).widened(AROUND_NS)))
 
-    def in_bag(self, bag: BagFile) -> list[Placed]:
+    def in_bag(self, bag: BagFile) -> list[SessionSights]:
         """Returns the sights of the messages of one bag that count, in each stretch.
 
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
         own = self._session(bag)
-        found: list[Placed] = []
+        found: list[SessionSights] = []
         for number in _numbers_of(self._view, self._topics, bag):
             window = _window(number).intersect(TimeWindow(bag.start, bag.end + 1))
             rows = [
@@ -287,15 +242,18 @@ class Watching:
                 for each, positions in some.bag_rows()
                 if each.file == bag.file
             ]
-            found += self._placed(0, window, own, self._transforms_of(own, bag, window), rows)
+            among = self._transforms_of(own, bag, window)
+            placed = self._placer.placed(window, own, among, rows)
+            found += [] if placed is None else [placed]
         return found
 
-    def _shipped(self, shipped: Callable[[BagFile], bytes]) -> Iterator[list[Stretch]]:
+    def _shipped(self, shipped: Shipped) -> Iterator[list[Stretch]]:
         """Yields the sights of the bags of a lake, each as a stretch."""
         for bag in reversed(self._view.snapshot.timeline.bags):
             self._view.bags.check_deadline()
-            if found := self._unpacked(bag.start, [self._session(bag)], shipped(bag)):
-                yield found
+            known = shipped(bag, SIGHTS)
+            if known is not None:
+                yield self._unpacked(bag.start, [self._session(bag)], known.data)
 
     def _unpacked(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
         """Returns what was seen from its bytes; see `in_bytes`."""
@@ -365,7 +323,7 @@ class Watching:
             part_key = FragmentKey(around.window.start, followed, around.parts)
             known = fragments.get(part_key)
             if known is None:
-                known = _InBytes(self._read(around))
+                known = SeenBytes(self._read(around))
                 if self._view.notes.added == before:
                     fragments.put(part_key, known)
             return known.data
@@ -409,144 +367,24 @@ class Watching:
         return self._followed[1]
 
     def _read(self, around: _Around) -> bytes:
-        of_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
+        every: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
         for topic, rows in self._found(around.window):
-            of_session[self._sessions.of(rows.recording)].append((topic, rows))
-        placed: list[Placed] = []
+            every[self._sessions.of(rows.recording)].append((topic, rows))
+        placed: list[tuple[int, SessionSights]] = []
         for nth, (own, among, slices) in enumerate(around.sessions):
-            found = of_session[own]
+            found = every[own]
             if slices is not None:
                 found = [(topic, _in_slices(rows, slices)) for topic, rows in found]
-            placed += self._placed(nth, around.window, own, among, found)
-        return in_bytes(placed) if placed else b""
+            seen = self._placer.placed(around.window, own, among, found)
+            if seen is not None:
+                placed.append((nth, seen))
+        return in_bytes(placed).data
 
     def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
         """Yields the rows in a window that may have detections."""
         for topic in self._topics:
-            for rows in scan(self._view, topic, window, may_match=self._rows.may_match):
+            for rows in scan(self._view, topic, window, may_match=self._placer.rows.may_match):
                 yield topic, rows
-
-    def _placed(
-        self,
-        nth: int,
-        window: TimeWindow,
-        own: Session,
-        among: Session,
-        found: Sequence[tuple[str, Rows]],
-    ) -> Iterator[Placed]:
-        """Yields the sights of one session, if a detector published."""
-        by_topic: dict[str, list[Rows]] = defaultdict(list)
-        for topic, rows in sorted(found, key=_place_of):
-            by_topic[topic].append(rows)
-        detected: dict[str, Detected] = {}
-        for topic, some in by_topic.items():
-            all_of = joined_detected([self._rows.of(rows) for rows in some])
-            named = any(is_named_for_detections(rows.table.channel.type) for rows in some)
-            if all_of.found.rows.size or (named and all_of.log_times.size):
-                detected[topic] = all_of
-        if not detected:
-            return
-        poses = self._poses(own, window)
-        target, frames = self._frames(among, window, poses)
-        sights = [sights_of(topic, _seen(each, poses, frames)) for topic, each in detected.items()]
-        if target == self._view.memory.limits.map_frame and len(poses):
-            times = np.concatenate([each.log_times for each in detected.values()])
-            fixes = self._fixes(own, poses.frames.words[0], frames, times)
-            sights[0] = sights[0].with_fixes(fixes)
-        yield Placed(nth, target, tuple(sights))
-
-    def _poses(self, own: Session, window: TimeWindow) -> Poses:
-        """Returns the robot's poses in the frame that most of them are in."""
-        failures: list[UndecodableError] = []
-        found = pose_rows(
-            self._view,
-            self._view.pose_topic,
-            window.widened(2 * _NEAR_NS),
-            failures,
-            among=lambda recording: self._sessions.of(recording) == own,
-        )
-        try:
-            poses = joined_poses([each.poses for each in found])
-        except InvalidArgumentsError:  # the topic is of no poses
-            return NO_POSES
-        if not len(poses):
-            return poses
-        # Poses of one topic nearly always have one frame: those of others are left out.
-        frame = int(np.bincount(poses.frames.codes).argmax())
-        is_place = (np.abs(poses.positions) < FARTHEST_M).all(axis=1)
-        is_one = (poses.frames.codes == frame) & is_place
-        poses = poses.rows(np.flatnonzero(is_one))
-        words = poses.frames.words[frame : frame + 1]
-        return replace(
-            poses, frames=poses.frames._replace(codes=poses.frames.codes * 0, words=words)
-        )
-
-    def _frames(self, among: Session, window: TimeWindow, poses: Poses) -> tuple[str, Frames]:
-        """Returns the frame to place all in (the map if transforms lead there), and the frames."""
-        own = poses.frames.words[0] if len(poses) else ""
-        target = self._view.memory.limits.map_frame or own
-        if not among:
-            target = own if len(poses) else target
-            return target, Frames((), {}, target)
-        frames = frames_over(self._view, among, window, target)
-        if not len(poses) or (own and (own == target or frames.reaches(own))):
-            return target, frames
-        return own, frames_over(self._view, among, window, own)
-
-    def _fixes(self, own: Session, frame: str, frames: Frames, seen: Ints) -> Ints:
-        """Returns where odometry was in the map around detections, where that changes."""
-        first, last = int(seen.min()), int(seen.max()) + _AHEAD_NS
-        step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS
-        most = MAX_NS // step
-        begin, end = max(first // step - 1, -most), min(last // step + 2, most)
-        times = np.arange(begin, end) * step
-        around = TimeWindow(int(seen.min()), int(seen.max())).widened(_AROUND_NS)
-        said, sigma = self._localised(own, around)
-        found = frames.poses(frame, times) if frame != frames.target else None
-        pose = np.zeros((len(times), 3))
-        if found is not None:
-            x, y, _ = found.translation
-            pose = np.stack((x, y, _yaw(found.rotation)), axis=1)[found.valid]
-            times = times[found.valid]
-        elif not len(said):
-            return fixes_of(times[:0], pose[:0], sigma[:0])
-        known = np.append(sigma, [math.nan])[np.searchsorted(said, times, side="right") - 1]
-        changed = np.abs(np.diff(pose, axis=0)).max(axis=1, initial=0.0) > _SAME_M
-        changed |= np.abs(np.diff(np.nan_to_num(known, nan=-1.0))) > _SAME_M
-        # One in each slice of the clock besides, however little changes.
-        kept = times // SLICE_NS != (times - step) // SLICE_NS
-        kept[1:] |= changed
-        kept[:-1] |= changed
-        kept &= (times >= first - step) & (times <= last)
-        return fixes_of(times[kept], pose[kept], known[kept])
-
-    def _localised(self, own: Session, window: TimeWindow) -> tuple[Ints, Floats]:
-        """Returns what the localiser said: when, and its standard deviation (m)."""
-        timeline = self._view.snapshot.timeline
-        topics = [topic for topic in timeline.topics() if _LOCALISER in timeline.types_of(topic)]
-        found = sorted(each for topic in topics for each in self._covariances(topic, own, window))
-        times = np.array([time for time, _ in found], np.int64)
-        return times, np.array([sigma for _, sigma in found], np.float64)
-
-    def _covariances(
-        self, topic: str, own: Session, window: TimeWindow
-    ) -> Iterator[tuple[Ns, float]]:
-        """Yields what a localiser says, now and then: covariances have no columns."""
-        memory = self._view.memory
-        for rows in scan(self._view, topic, window):
-            if self._sessions.of(rows.recording) != own:
-                continue
-            numbers = rows.times // _SAID_NS
-            first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
-            for found in messages_of(self._view, rows.some(first)):
-                try:
-                    message = memory.reader.decode(found.record)
-                except UndecodableError:
-                    continue
-                frame = memory.extractor.frame(message).lstrip("/")
-                sigma = _sigma_ahead(getattr(getattr(message, "pose", None), "covariance", None))
-                if sigma is not None and frame == memory.limits.map_frame:
-                    yield found.time, sigma
 
 
 class _Bags:
@@ -567,7 +405,7 @@ class _Bags:
         self._view = view
         self._topics = topics
         self._window = window
-        around = window.widened(_AROUND_NS)
+        around = window.widened(AROUND_NS)
         self._bags = [
             bag
             for bag in view.snapshot.timeline.overlapping(around)
@@ -685,74 +523,8 @@ def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Sequence[int
     return found
 
 
-def _place_of(found: tuple[str, Rows]) -> tuple[Ns, Ns, str]:
-    """Returns what orders tables, however they are stored."""
-    _, rows = found
-    return rows.first, rows.last, str(rows.recording)
-
-
 def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[StampedTransform]:
     """Returns the static transforms of a session that hold in a window."""
     return static_at(static, window.start) + [
         one for one in static if window.contains(one.log_time)
     ]
-
-
-def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:
-    """Returns messages with the robot's poses and the detections placed in the target frame."""
-    found = detected.found
-    places = np.full(found.places.shape, math.nan)
-    has_place = ~np.isnan(found.places).any(axis=1)
-    for code, frame in enumerate(found.frames.words):
-        some = np.flatnonzero(has_place & (found.frames.codes == code))
-        known = (
-            frames.poses(frame, detected.times[found.rows[some]]) if frame and len(some) else None
-        )
-        if known is not None:
-            x, y, z = found.places[some].T
-            placed = np.stack(known.points((x, y, z)), axis=1)
-            places[some] = np.where(known.valid[:, None], placed, math.nan)
-    robot = _robot_at(poses, detected.times, frames)
-    labels = found.labels.codes.astype(np.int64), found.labels.words
-    return Seen(detected.log_times, robot, found.rows, *labels, places, found.scores)
-
-
-def _robot_at(poses: Poses, times: Ints, frames: Frames) -> Floats:
-    """Returns x, y (m) and heading (rad) of the robot at some times; NaN where not known.
-
-    That is farther than 1 s from a pose, or where no transform leads from its frame.
-    """
-    robot = np.full((len(times), 3), math.nan)
-    placed = frames.poses(poses.frames.words[0], times) if len(poses) else None
-    if placed is None:
-        return robot
-    last = len(poses) - 1
-    after = np.searchsorted(poses.times, times, side="right")
-    before, after = np.clip(after - 1, 0, last), np.clip(after, 0, last)
-    start, stop = poses.times[before], poses.times[after]
-    ratio = np.clip((times - start) / np.maximum(stop - start, 1), 0.0, 1.0)
-    is_known = np.minimum(np.abs(times - start), np.abs(stop - times)) <= _NEAR_NS
-    is_known &= (stop - start <= 2 * _NEAR_NS) & placed.valid
-    a, b = poses.positions[before], poses.positions[after]
-    x, y, z = (a + (b - a) * ratio[:, None]).T
-    heading = headings(poses.turns)
-    turn = np.remainder(heading[after] - heading[before] + np.pi, 2 * np.pi) - np.pi
-    half = (heading[before] + turn * ratio) / 2
-    level = np.zeros(len(times))
-    x, y, _ = placed.points((x, y, z))
-    yaw = _yaw(multiply(placed.rotation, (level, level, np.sin(half), np.cos(half))))
-    return np.where(is_known[:, None], np.stack((x, y, yaw), axis=1), math.nan)
-
-
-def _yaw(rotation: Rotations) -> Floats:
-    x, y, z, w = rotation
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def _sigma_ahead(covariance: object) -> float | None:
-    """Returns the standard deviation (m) of a point `AHEAD_MM` before a pose; None if unknown."""
-    if not isinstance(covariance, Sequence | np.ndarray) or len(covariance) != _COVARIANCE:
-        return None
-    x, y, yaw = (float(covariance[nth]) for nth in (0, 7, 35))
-    variance = max(x, y) + yaw * (AHEAD_MM / 1000) ** 2
-    return math.sqrt(variance) if variance >= 0 and math.isfinite(variance) else None

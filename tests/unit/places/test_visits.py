@@ -514,3 +514,17 @@ def test_a_bag_left_open_is_named_only_where_its_time_is_asked_for(tmp_path: Pat
 
     assert is_named(1_784_000_000.0)
     assert not is_named(1_784_001_000.0)
+
+
+def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path: Path) -> None:
+    """Its poses are 1 cm inside or outside, at random; the track is within 5 cm of them."""
+    draw = random.Random(3)
+    edge = [(BEGIN + n * S // 5, 1.0 + draw.uniform(-0.01, 0.01)) for n in range(600)]
+    there = [(BEGIN + n * S // 5 - 20 * S, 5.0 - n * 0.04) for n in range(100)]
+    messages = [odom(at, x, 0.0, 0.0) for at, x in (*there, *edge)]
+    found = visits(remembering(tmp_path, messages), Call(), 0.0, 0.0, radius_m=1.0)
+    inside = [at for at, x in edge if x <= 1.0]
+    assert [(one.arrived, one.departed) for one in found.visits] in (
+        [(inside[0], inside[-1])],
+        [(inside[0], None)],
+    )

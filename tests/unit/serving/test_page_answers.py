@@ -22,8 +22,6 @@ from ros2_memory.bag_dir.moment_file import (
     make_moment_folder,
     write_saved_moment,
 )
-from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.cli.plot.scene import opened, recap_in
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -485,22 +483,6 @@ def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None
 
     assert sorted(labels(memory)) == ["of robin", "of wren"]
     assert labels(Recordings().alone(memory, "wren")) == ["of wren"]
-
-
-def test_a_look_after_a_warm_up_reads_nothing_that_is_stored(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory = recalling(memory_of(bag_dir), bag_dir)
-    dispatcher = Dispatcher(memory, [], Replies(bag_dir, 9_000), call_timeout_s=5)
-    expected = shown(memory, "last=1000")
-    assert memory.recall is not None
-    fresh = replace(memory, recall=DigestCache(memory.recall.catalogue, bag_dir))
-    assert warm_up(fresh, dispatcher)
-    for name in ("sights",):
-        monkeypatch.setattr(Catalogue, name, lambda *_given, **_more: pytest.fail("was read"))
-    found = shown(fresh, "last=1000")
-    for key in ("path", "events", "things", "distance_m"):
-        assert found[key] == expected[key]
 
 
 def test_a_transform_after_a_warm_up_gathers_no_static_ones(

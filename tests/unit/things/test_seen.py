@@ -13,7 +13,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.sights import joined
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
-from ros2_memory.things import seen
+from ros2_memory.things import placing
 from ros2_memory.things.find import find_things
 from ros2_memory.things.seen import STRETCH_NS, Watching
 from tests.support.column_worlds import EVERYTHING, World, store_file
@@ -88,7 +88,7 @@ def test_another_process_finds_stored_sights_and_reads_no_messages(
     plain = things_in(World.of(tmp_path).memory)
     world = made_in(tmp_path)
     assert {thing.label for thing in plain} == {"cup", "mug"}
-    monkeypatch.delattr(seen, "sights_of")  # there is nothing to be made
+    monkeypatch.delattr(placing, "sights_of")  # there is nothing to be made
     assert things_in(another(world)) == plain
 
 

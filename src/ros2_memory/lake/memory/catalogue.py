@@ -91,7 +91,7 @@ class LakeCatalogue(Catalogue):
         return [key.sidecar_ns for key in keys]
 
     def fragment(self, bag: BagFile, kind: Kind[S]) -> S | None:
-        """Returns what was measured of the poses of a bag when it was shipped; None if unknown."""
+        """Returns what followed from a bag when it was shipped; None if unknown."""
         number = self._index.number(bag)
         packed = self._packed(kind.name, self._index.pose_topic, [number]).get(number)
         return None if packed is None else kind.load(Fragment.from_bytes(packed))
@@ -112,11 +112,6 @@ class LakeCatalogue(Catalogue):
             return {}
         found = self._digests("labels", topic, numbers)
         return {number: words if isinstance(words, str) else "" for number, words in found}
-
-    def sights(self, bag: BagFile) -> bytes:
-        """Returns what detectors saw in a bag, as `things.seen.in_bytes` has it; or nothing."""
-        number = bag.sidecar_ns
-        return self._packed("sights", "", [number]).get(number, b"")
 
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns that all messages could be decoded: rows are made of those alone."""

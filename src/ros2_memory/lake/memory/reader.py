@@ -85,6 +85,7 @@ class LakeReader(BagReader):
         index: its bags.
         map_frame: the frame of the map.
         tf_topics: those of transforms.
+        static_topics: those of static ones, of which a lake has none: positions are placed already.
     """
 
     def __init__(
@@ -95,12 +96,14 @@ class LakeReader(BagReader):
         *,
         map_frame: str | None,
         tf_topics: Sequence[str],
+        static_topics: Sequence[str] = (),
     ) -> None:
         self._lake = lake
         self._robot = robot
         self._index = index
         self._map_frame = map_frame
         self._tf_topics = tf_topics
+        self._static_topics = static_topics
         self._served = threading.local()
         self._lock = threading.Lock()
         self._known: OrderedDict[tuple[str, str], Sequence[Record] | Tracks] = OrderedDict()
@@ -233,6 +236,8 @@ class LakeReader(BagReader):
             own = self._index.pose_topic
             rows = self._rows_of_day("poses", _POSES, "time_ns", here, own)
             return Tracks(bag, own, rows, self._map_frame)
+        if topic in self._static_topics:
+            return ()
         [summary, *_] = bag.summary.of(topic)
         if has_events(summary.type) or has_levels(summary.type):
             return [*states(topic, summary.type, self._runs(bag, here, topic))]

@@ -87,6 +87,7 @@ class LakeRobot:
             self._index,
             map_frame=limits.map_frame,
             tf_topics=limits.tf_topics,
+            static_topics=limits.tf_static_topics,
         )
         catalogue = LakeCatalogue(lake, name, self._index, limits.tf_static_topics)
         recall = DigestCache(catalogue, self._index.bag_dir)
@@ -100,7 +101,6 @@ class LakeRobot:
             own,
             recall,
             stated=stated_in,
-            sights=catalogue.sights,
             shipped=catalogue.fragment,
         )
 

@@ -398,7 +398,7 @@ def _last(track: RobotTrack) -> JsonObject | None:
         "t": _s(int(track.times[-1])),
         "x": rounded(float(track.x[-1]), 3),
         "y": rounded(float(track.y[-1]), 3),
-        "yaw": degrees(float(track.heading[-1]) % math.tau),
+        "yaw": degrees(math.remainder(float(track.heading[-1]), math.tau)),
     }
 
 
