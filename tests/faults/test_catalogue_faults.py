@@ -198,11 +198,11 @@ def test_a_catalogue_locked_by_another_keeps_no_question_waiting(tmp_path: Path)
                 assert not filler.digest(bag)
                 assert not filler.digest(bag)
             assert told(memory, count=13) == right
-        assert warned(logs) == ["catalogue_failed"]
+        assert warned(logs) == ["database_failed"]
         assert trouble_of(filler) == "cannot be used: database is locked"
     with structlog.testing.capture_logs() as logs:
         fill_up(filler)
-    assert "catalogue_works_again" in [each["event"] for each in logs]
+    assert "database_works_again" in [each["event"] for each in logs]
     assert trouble_of(filler) is None
     assert filler.progress().waiting == 0
     assert told(memory, count=13) == right
@@ -290,7 +290,7 @@ async def test_bags_that_cannot_be_digested_have_the_helper_started_no_second_ti
 ) -> None:
     write_bags(tmp_path, BACKLOG + 1)
     memory, _ = served(tmp_path)
-    filler = Counted(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
+    filler = Counted(memory, Refusing(memory.reader, memory.extractor), tmp_path)
     started = tmp_path / "started"
     helper = ["sh", "-c", f"echo once >> {started}"]
     async with anyio.create_task_group() as tasks:
@@ -314,7 +314,7 @@ def test_a_bag_that_could_not_be_digested_is_tried_again_later(tmp_path: Path) -
     memory, _ = served(tmp_path)
     clock = SettableClock(NOW.now())
     memory = replace(memory, clock=clock)
-    refusing = Backfill(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
+    refusing = Backfill(memory, Refusing(memory.reader, memory.extractor), tmp_path)
     fill_up(refusing)
     assert refusing.progress() == Progress(2, 0, 2)
     clock.at += RETRY_NS
@@ -332,28 +332,4 @@ def test_an_empty_bag_directory_purges_nothing(tmp_path: Path) -> None:
     assert memory.recall is not None
     assert len(memory.recall.catalogue.paths()) == 3
     away.rename(bag_dir / "rec")
-    assert filler.progress().waiting == 0
-
-
-def test_entries_that_another_program_makes_anew_are_not_taken_for_the_lost_ones(
-    tmp_path: Path,
-) -> None:
-    memory, filler = served(tmp_path)
-    for first in (0, 6):
-        write_bags(tmp_path, 6, first=first)
-        fill_up(filler)
-    right = plainly(tmp_path)
-    path = tmp_path / FOLDER / FILE
-    assert told(memory) == right
-    assert memory.recall is not None
-    with closing(sqlite3.connect(path)) as base:
-        base.execute("UPDATE held SET poses = x'00' WHERE poses IS NOT NULL")
-        base.commit()
-    # It is noticed by the next question about the way driven, which has other bounds.
-    [run] = memory.index.snapshot().timeline.segments
-    notes = memory.recall.digests_for(run, memory.recall.catalogue.newest())
-    notes.catalogue.poses("/odom", [*notes.numbers.values()])
-    _, other = served(tmp_path)
-    fill_up(other)
-    assert told(memory) == right
     assert filler.progress().waiting == 0

@@ -17,15 +17,18 @@ from ros2_memory.columns import database, fill
 from ros2_memory.columns.writing import LongBag
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
-from tests.unit.columns.test_fill import in_groups, write_bag, write_long_bag
+from tests.support.memories import asked, assert_same_counts
+from tests.unit.columns.test_fill import T0, S, in_groups, write_bag, write_long_bag
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from multiprocessing.process import BaseProcess
     from pathlib import Path
 
     from ros2_memory.columns.database import Tables
 
 KILLS = 100 if LONG else 5
+SPANNED = {"get_topic_in_range", "find_matches"}
 ROWS = 12 * 21 + 120
 # Not forked: SQLite must not have a file open across that.
 SPAWNED = multiprocessing.get_context("spawn")
@@ -73,6 +76,42 @@ def started(bag_dir: Path, kill_at: int = 0) -> BaseProcess:
     return process
 
 
+ASKED: tuple[tuple[str, Mapping[str, object]], ...] = (
+    ("list_recorded_topics", {}),
+    ("data_time_range", {}),
+    ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"], "by": "hour"}),
+    ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"], "max_samples": 5}),
+    (
+        "find_matches",
+        {
+            "topic": "/odom",
+            "condition_type": "above",
+            "field": "position.x",
+            "value": 8,
+            "by": "day",
+        },
+    ),
+    *(
+        ("find_last_match", {"topic": "/chatter", "condition_type": "contains", "value": word})
+        for word in ("word 3", "never")
+    ),
+)
+
+
+def answers(world: World) -> list[object]:
+    """What tools answer of everything."""
+    spans = {"start": T0 / S - 3600, "end": T0 / S + 7200}
+    return [
+        asked(world.memory, world.bag_dir, name, **given, **(spans if name in SPANNED else {}))
+        for name, given in ASKED
+    ]
+
+
+def assert_same_answers(world: World, right: Sequence[object]) -> None:
+    for reply, expected in zip(answers(world), right, strict=True):
+        assert_same_counts(reply, expected)
+
+
 def assert_whole(bag_dir: Path) -> None:
     """Each bag is stored whole or not at all, and what is stored of it once."""
     with closing(sqlite3.connect(store_file(bag_dir))) as base:
@@ -86,11 +125,14 @@ def assert_whole(bag_dir: Path) -> None:
         assert size < 0 or bool(is_split) != bool(parts), path
 
 
-def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_answers(
+    tmp_path: Path,
+) -> None:
     whole = tmp_path / "whole"
     write_bags(whole)
     statements = fill_up(whole)
     assert check_all(World.of(whole)) == ROWS
+    right = answers(World.of(whole).unstored())
     draw = random.Random()
     for _ in range(KILLS):
         kill_at = draw.randint(1, statements)
@@ -100,13 +142,16 @@ def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all(tmp_path: Path)
         process.join()
         assert process.exitcode == -signal.SIGKILL
         if store_file(bag_dir).exists():
-            assert check_all(World.of(bag_dir)) == ROWS
+            killed = World.of(bag_dir)
+            assert check_all(killed) == ROWS
+            assert_same_answers(killed, right)
             assert_whole(bag_dir)
         fill_up(bag_dir)
         world = World.of(bag_dir)
         assert len(world.stored()) == 13
         assert_whole(bag_dir)
         assert check_all(world) == ROWS
+        assert_same_answers(world, right)
         shutil.rmtree(bag_dir)
 
 

@@ -48,9 +48,9 @@ def test_a_catalogue_that_cannot_be_written_costs_no_answer_and_is_filled_later(
         assert "cannot be used" in (trouble_of(filler) or "")
         assert filler.progress().waiting == 3
         assert told(memory, count=6) == right
-    events = [each["event"] for each in logs if each["event"].startswith("catalogue")]
+    events = [each["event"] for each in logs if each["event"].startswith("database")]
     # Once each: the file of digests, and that of columns.
-    assert events == ["catalogue_failed"] * 2
+    assert events == ["database_failed"] * 2
     filler.look_after(thorough=True)
     fill_up(filler)
     assert (trouble_of(filler), filler.progress().waiting) == (None, 0)

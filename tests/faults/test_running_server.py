@@ -99,7 +99,7 @@ def test_a_catalogue_that_another_program_holds_is_said_and_waited_for(tmp_path:
         recovers(running, COUNT)
         with closing(sqlite3.connect(path, isolation_level=None)) as other:
             other.execute("BEGIN EXCLUSIVE")
-            before = len(running.events("catalogue_failed"))
+            before = len(running.events("database_failed"))
             write_bag(bag_dir, COUNT)
             says(running, "the catalogue cannot be used: database is locked")
             answers = running.ask_all(COUNT + 1)
@@ -107,7 +107,7 @@ def test_a_catalogue_that_another_program_holds_is_said_and_waited_for(tmp_path:
         assert running.ask_all(COUNT + 1) == answers
         assert "thing12" in answers[3]
         # Once by the server, and by its child that digested the first bags, if that still ran.
-        assert len(running.events("catalogue_failed")) - before in {1, 2}
+        assert len(running.events("database_failed")) - before in {1, 2}
 
 
 def test_a_bag_directory_that_is_renamed_away_and_back_is_the_same_again(tmp_path: Path) -> None:

@@ -51,8 +51,8 @@ def test_two_servers_share_a_directory_and_one_goes_on_without_the_other(tmp_pat
             until(partial(is_ready, first, COUNT + 2))
         right = first.ask_all(COUNT + 2)
         for each in (first, second):
-            assert each.events("catalogue_set_aside") == []
-            assert each.events("catalogue_lost") == []
+            assert each.events("database_set_aside") == []
+            assert each.events("database_lost") == []
             assert each.events("tool_failed") == []
     path = bag_dir / FOLDER / FILE
     assert entries(path) == sorted({f"rec/rec_{n}.mcap" for n in range(COUNT + 2)})

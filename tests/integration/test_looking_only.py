@@ -158,7 +158,7 @@ async def test_when_a_recorder_comes_the_catalogue_goes_beside_the_bags_with_all
         known = entries(cached)
         assert known > 0
         recorded_before(strangers)
-        until(lambda: "catalogue_moved" in {each["event"] for each in served.events()})
+        until(lambda: "database_moved" in {each["event"] for each in served.events()})
         digested = [each for each in served.events() if each["event"] == "bag_digested"]
         assert entries(beside) == known == len(digested)
         async with Client(served.url("/mcp")) as client:

@@ -39,7 +39,7 @@ ELSEWHERE: Final = {
     "tools.md": "tests/project/test_reference.py",
     "errors.md": "tests/project/test_reference.py",
     "files.md": "tests/project/test_reference.py",
-    "forget.md": "tests/unit/cli/test_forget_messages.py",
+    "forget.md": "tests/project/test_forget_page.py",
     "metrics.md/Scraping": "tests/project/test_metrics_page.py",
     "metrics.md/Alerts": "tests/project/test_metrics_page.py",
     "tls.md/nginx": "tests/integration/test_proxy.py",

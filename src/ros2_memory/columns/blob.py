@@ -93,6 +93,16 @@ def pack_tables(entries: Sequence[Entry]) -> bytes:
     )
 
 
+def topics_in(blob: bytes) -> list[int]:
+    """Returns the numbers of the topics of the tables in a blob.
+
+    Raises:
+        ValueError: the blob is damaged, or of another format.
+    """
+    heads, _ = _heads(decompressed(blob))
+    return cast("list[int]", heads["topic"].tolist())
+
+
 def unpack_tables(blob: bytes, topics: Mapping[int, Topic]) -> Iterator[tuple[int, Table]]:
     """Yields the tables of a blob, each with its number, in the order in which they were packed.
 
@@ -104,10 +114,7 @@ def unpack_tables(blob: bytes, topics: Mapping[int, Topic]) -> Iterator[tuple[in
         ValueError: the blob is damaged, of another format, or not of these layouts.
     """
     data = decompressed(blob)
-    form, tables = _BEGIN.unpack_from(data)
-    if form != FORMAT:
-        raise ValueError(f"the blob of columns is of format {form}, this program reads {FORMAT}")
-    heads = np.frombuffer(data, _HEAD, tables, _BEGIN.size)
+    heads, at = _heads(data)
     found = [topics[number] for number in heads["topic"].tolist()]
     times = np.where(heads["hashed"], _HASHED, 1)
     kinds = np.concatenate(
@@ -120,11 +127,20 @@ def unpack_tables(blob: bytes, topics: Mapping[int, Topic]) -> Iterator[tuple[in
             ),
         ]
     )
-    values = _Values(data, _BEGIN.size + heads.nbytes, kinds)
+    values = _Values(data, at, kinds)
     first = 0
     for number, topic, count in zip(heads["topic"].tolist(), found, times.tolist(), strict=True):
         yield number, _table(values, first, topic, count)
         first += count + len(topic.layout.slots)
+
+
+def _heads(data: bytes) -> tuple[np.ndarray[tuple[int], np.dtype[np.void]], int]:
+    """Returns the topics of the tables, and where the counts begin."""
+    form, tables = _BEGIN.unpack_from(data)
+    if form != FORMAT:
+        raise ValueError(f"the blob of columns is of format {form}, this program reads {FORMAT}")
+    heads = np.frombuffer(data, _HEAD, tables, _BEGIN.size)
+    return heads, _BEGIN.size + heads.nbytes
 
 
 class _Values:

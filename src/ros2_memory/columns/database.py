@@ -130,7 +130,7 @@ class Database:
         self._closed = False
         self._tried_s = 0.0
         self.trouble: str | None = None
-        """What is wrong, as the end of a sentence about the catalogue, or None."""
+        """What is wrong, as the end of a sentence about the database, or None."""
         self.is_failing = False
         """Whether it failed, and has not been written since."""
         self.failures = 0
@@ -207,12 +207,12 @@ class Database:
                 except (ValueError, OverflowError) as error:
                     self.refusals += 1
                     self.refused_for = str(error)
-                    log.warning("catalogue_refused", reason=str(error))
+                    log.warning("database_refused", path=str(opened.path), reason=str(error))
                     return False
                 else:
                     if self.is_failing:
                         self.trouble, self.is_failing = None, False
-                        log.info("catalogue_works_again")
+                        log.info("database_works_again", path=str(opened.path))
                     return True
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
@@ -315,9 +315,9 @@ class Database:
             self._databases += 1
             self.trouble, self.is_failing = None, False
             if before.path is None:
-                log.info("catalogue_in_file_again", path=str(found.path))
+                log.info("database_in_file_again", path=str(found.path))
             else:
-                log.info("catalogue_moved", path=str(found.path))
+                log.info("database_moved", path=str(found.path))
 
     def _failed(self, error: Exception) -> None:
         """Sets a damaged database aside; one that is only busy or full is asked again."""
@@ -328,7 +328,7 @@ class Database:
         trouble = f"cannot be used: {error}"
         if trouble != self.trouble:
             path = None if self._opened is None else self._opened.path
-            log.warning("catalogue_failed", path=str(path), reason=str(error))
+            log.warning("database_failed", path=str(path), reason=str(error))
         self.trouble, self.is_failing = trouble, True
 
     def _lose(self, reason: str, *, aside: bool) -> None:
@@ -341,12 +341,12 @@ class Database:
         with suppress(sqlite3.Error):
             opened.connection.close()
         if opened.path is None or not aside:
-            log.warning("catalogue_lost", path=str(opened.path), reason=reason)
+            log.warning("database_lost", path=str(opened.path), reason=reason)
             return
         try:
             _set_aside(opened.path, reason)
         except OSError as error:
-            log.warning("catalogue_not_set_aside", path=str(opened.path), reason=str(error))
+            log.warning("database_not_set_aside", path=str(opened.path), reason=str(error))
 
 
 def _transact(
@@ -403,10 +403,10 @@ def open_file(
         except (OSError, sqlite3.Error) as error:
             if is_busy(error):
                 tell = log.debug if again else log.warning
-                tell("catalogue_locked", path=str(path), instead="memory")
+                tell("database_locked", path=str(path), instead="memory")
                 return "another program has locked its file"
             tell = log.debug if again else log.info
-            tell("catalogue_place_refused", path=str(path), reason=str(error))
+            tell("database_place_refused", path=str(path), reason=str(error))
             reason = str(error.strerror if isinstance(error, OSError) else error)
     return f"no file can be written for it ({reason})"
 
@@ -436,7 +436,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path, tables: Tables) -> No
             with suppress(FileExistsError):
                 os.link(temporary, path)
         except (OSError, sqlite3.Error) as error:
-            log.debug("catalogue_not_copied", path=str(source), reason=str(error))
+            log.debug("database_not_copied", path=str(source), reason=str(error))
         else:
             return
         finally:
@@ -608,7 +608,7 @@ def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:
 def _set_aside(path: Path, reason: str) -> None:
     """Renames a file so that a new one can be made; the old one stays for inspection."""
     aside = path.with_name(f"{path.name}.aside")
-    log.warning("catalogue_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
+    log.warning("database_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
     for each in _files_of(path)[1:]:
         each.unlink(missing_ok=True)
     path.rename(aside)

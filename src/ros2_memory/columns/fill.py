@@ -10,6 +10,7 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.store import LONG_NS, BagKey
@@ -111,6 +112,8 @@ class Filling:
             return False
         begun = time.perf_counter_ns()
         try:
+            if self._is_renewed(bag):
+                return True
             stored = self._store(bag, hashed=self._is_shared(bag, timeline))
         except BagError as error:
             self._refuse(bag, error.reason)
@@ -180,6 +183,16 @@ class Filling:
             self._refused |= dict.fromkeys(keys, now)
             log.info("oldest_columns_deleted", bags=len(keys))
         self.store.give_back()
+
+    def _is_renewed(self, bag: BagFile) -> bool:
+        """Keeps what is stored of a bag if a new `handover.json` beside it changes nothing in it.
+
+        Each rotation writes that of a recording with many bags again, and it concerns one or two of
+        these. All messages of the bag count now; if it was stored with as many, all did then.
+        """
+        if not bag.sidecar_ns or sure_handover(bag.recording).handover.rule(bag.path.name):
+            return False
+        return self.store.renew(self._key(bag), bag)
 
     def _store(self, bag: BagFile, *, hashed: bool) -> bool:
         is_hashed = partial(_is_hashed, everything=hashed)

@@ -8,11 +8,13 @@ file is written again. And the write-ahead log has everything that was written l
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.columns.blob import topics_in
 from ros2_memory.columns.database import is_busy
 from ros2_memory.columns.store import TABLES
 from ros2_memory.columns.writing import delete_bags
@@ -89,6 +91,7 @@ def _forget(base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str]) -> Non
         # Without those beside them another part of the same ten minutes may lack a bag.
         while beside := _beside_deleted(base):
             delete_bags(base, beside)
+        _delete_unused(base)
         base.execute("COMMIT")
     except BaseException:
         base.execute("ROLLBACK")
@@ -103,6 +106,19 @@ def _beside_deleted(base: sqlite3.Connection) -> list[str]:
         " WHERE other.value NOT IN (SELECT id FROM bag))"
     )
     return [path for (path,) in rows]
+
+
+def _delete_unused(base: sqlite3.Connection) -> None:
+    """Deletes what only deleted bags had: topics, definitions, and what their summaries say."""
+    splits = base.execute("SELECT tables FROM split")
+    in_splits = {topic for (blob,) in splits for topic in topics_in(blob)}
+    base.execute(
+        "DELETE FROM topic WHERE id NOT IN (SELECT topic FROM part)"
+        " AND id NOT IN (SELECT value FROM json_each(?))",
+        (json.dumps([*in_splits]),),
+    )
+    base.execute("DELETE FROM definition WHERE id NOT IN (SELECT definition FROM topic)")
+    base.execute("DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)")
 
 
 def _done(base: sqlite3.Connection, statement: str) -> bool:

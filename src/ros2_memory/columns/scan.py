@@ -211,23 +211,17 @@ class Scan:
         """Yields the sources that may have rows in a window."""
         topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
-            bags = {bag.file: bag for bag, *_ in timeline.extents(topic, reach)}
-            for bag in bags.values():
-                yield _Source(*bag.summary.span_of([topic]), None, bag)
+            plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
+            yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
-        for number in self._scanner.store.splits():
-            split = coverage.bag(number)
-            if (
-                split is not None
-                and split.summary.of(topic)
-                and reach.overlaps(split.start, split.end)
-            ):
-                yield _Source(*split.summary.span_of([topic]), None, split, number)
-        for bag in coverage.missing:
-            if reach.overlaps(bag.start, bag.end) and bag.summary.of(topic):
-                yield _Source(*bag.summary.span_of([topic]), None, bag)
+        splits = [(coverage.bag(number), number) for number in self._scanner.store.splits()]
+        for bag, number in [*splits, *((missing, -1) for missing in coverage.missing)]:
+            if bag is not None and bag.summary.of(topic):
+                first, last = bag.summary.span_of([topic])
+                if reach.overlaps(first, last):
+                    yield _Source(first, last, None, bag, number)
 
     def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:

@@ -85,8 +85,9 @@ CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQU
   hashed INTEGER NOT NULL, definitions TEXT NOT NULL, summary INTEGER NOT NULL,
   counts BLOB NOT NULL);
 CREATE TABLE summary (id INTEGER PRIMARY KEY, topics TEXT NOT NULL UNIQUE);
-CREATE TABLE topic (id INTEGER PRIMARY KEY, name TEXT NOT NULL, encoding TEXT NOT NULL,
-  latched INTEGER NOT NULL, definition INTEGER NOT NULL, layout TEXT NOT NULL,
+CREATE TABLE topic (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL,
+  encoding TEXT NOT NULL, latched INTEGER NOT NULL, definition INTEGER NOT NULL,
+  layout TEXT NOT NULL,
   UNIQUE (name, encoding, latched, definition, layout));
 CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TEXT NOT NULL,
   text BLOB NOT NULL, UNIQUE (type, encoding, text));
@@ -537,6 +538,30 @@ class ColumnStore(Database):
             connection.execute("INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries)))
 
         return self.write(write) and stored
+
+    def renew(self, key: BagKey, bag: BagFile) -> bool:
+        """Keeps what is stored of a bag whose sidecar is another one now; returns whether it did.
+
+        Only if it was stored with as many messages of each topic as it has now.
+        """
+        kept = False
+
+        def write(connection: sqlite3.Connection) -> None:
+            nonlocal kept
+            cursor = connection.execute(
+                "UPDATE bag SET sidecar_ns = ?1 WHERE sidecar_ns <> ?1 AND path = ?2 AND size = ?3"
+                " AND mtime_ns = ?4 AND counts = ?5"
+                " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
+                (
+                    key.sidecar_ns,
+                    *key[:3],
+                    bag.summary.packed,
+                    bag.summary.schema.to_json(),
+                ),
+            )
+            kept = cursor.rowcount > 0
+
+        return self.write(write) and kept
 
     def put_long(
         self,

@@ -32,8 +32,7 @@ _MOST_LOPSIDED: Final = 64
 """How often, on average, a point may be looked at before intervals are halved instead."""
 
 _BACKWARDS_WEIGHT: Final = 0.5**2
-_TIME_WEIGHT: Final = 0.1**2
-"""Weights, for squared deviations, of moving back along a segment, and of being early or late."""
+"""The weight, for squared deviations, of moving back along a segment."""
 
 _SHORTEST_SQUARED: Final = 1e-300
 """Chords whose squared length is not greater are points."""
@@ -171,8 +170,10 @@ def simplified(
     points: NDArray[np.float64],
     clock: Numbers,
     kept: NDArray[np.intp],
+    *,
     tolerance_m: float,
     at_most: int,
+    of_time: float = 0.1,
 ) -> tuple[NDArray[np.intp], float]:
     """Draws a path with few of its points (Ramer, Douglas and Peucker), in space and time.
 
@@ -182,7 +183,7 @@ def simplified(
     keeps some more points than needed.
 
     The deviation of a point is at least half the distance that it lies back along its segment from
-    an earlier point, so that turning points are kept; and a tenth of its distance from where the
+    an earlier point, so that turning points are kept; and a share of its distance from where the
     segment has the robot at that time, so that stops are kept (the synchronised distance of
     Meratnia and de By, Spatiotemporal Compression Techniques for Moving Point Objects, EDBT 2004).
 
@@ -193,6 +194,7 @@ def simplified(
             are among them.
         tolerance_m: see above.
         at_most: so many points draw the path, unless `kept` are more.
+        of_time: that share.
 
     Returns:
         The indices of the kept points, ascending, and the largest deviation (m) of another one.
@@ -204,7 +206,7 @@ def simplified(
         starts, ends = starts[inner], ends[inner]
         if not starts.size:
             break
-        most, where = _farthest_of_each(columns, clock, starts, ends)
+        most, where = _farthest_of_each(columns, clock, starts, ends, of_time)
         splits = most > tolerance_m * tolerance_m
         error = max(error, float(most[~splits].max(initial=0.0)))
         starts, ends, where = starts[splits], ends[splits], where[splits]
@@ -212,7 +214,9 @@ def simplified(
             where = (starts + ends) // 2
         found.append(where)
         if sum(map(len, found)) > at_most:
-            return _worst_first(columns, clock, kept, tolerance_m, at_most)
+            return _worst_first(
+                columns, clock, kept, tolerance_m=tolerance_m, at_most=at_most, of_time=of_time
+            )
         starts, ends = np.append(starts, where), np.append(where, ends)
         order = np.argsort(starts)
         starts, ends = starts[order], ends[order]
@@ -223,8 +227,10 @@ def _worst_first(
     columns: NDArray[np.float64],
     clock: Numbers,
     kept: NDArray[np.intp],
+    *,
     tolerance_m: float,
     at_most: int,
+    of_time: float,
 ) -> tuple[NDArray[np.intp], float]:
     """Does what `simplified` does, the worst interval first: of a few points these are the best."""
     found = kept.tolist()
@@ -234,7 +240,7 @@ def _worst_first(
         inner = ends - starts > 1
         starts, ends = starts[inner], ends[inner]
         if starts.size:
-            most, where = _farthest_of_each(columns, clock, starts, ends)
+            most, where = _farthest_of_each(columns, clock, starts, ends, of_time)
             intervals = (-most).tolist(), where.tolist(), starts.tolist(), ends.tolist()
             for item in zip(*intervals, strict=True):
                 heapq.heappush(worst, item)
@@ -257,6 +263,7 @@ def _farthest_of_each(
     clock: Numbers,
     starts: NDArray[np.intp],
     ends: NDArray[np.intp],
+    of_time: float,
 ) -> tuple[Numbers, NDArray[np.intp]]:
     """Finds the point of each interval with the largest deviation from the segment of its ends.
 
@@ -283,7 +290,7 @@ def _farthest_of_each(
     lasted = clock[ends] - clock[starts]
     rate = np.divide(1.0, lasted, out=np.zeros(len(lasted)), where=lasted > 0)[of]
     on_time = (clock[at] - clock[starts][of]) * rate
-    late = ((here - on_time * chord) ** 2).sum(axis=0) * _TIME_WEIGHT
+    late = ((here - on_time * chord) ** 2).sum(axis=0) * of_time**2
     np.maximum(off, np.where(rate > 0, late, 0.0), out=off)
     most = np.maximum.reduceat(off, begins)
     farthest = np.flatnonzero(off == most[of])

@@ -62,6 +62,11 @@ class Extreme(NamedTuple):
         """Whether the number and its first message are known."""
         return self.low == self.high and self.first == self.last
 
+    @property
+    def middle(self) -> float:
+        """The number, off by no more than its column is."""
+        return (self.low + self.high) / 2
+
 
 class Part(NamedTuple):
     """The numbers of a field in some messages of one piece.
@@ -283,7 +288,8 @@ class PieceNumbers:
                     "out of time before bags were read for the exact least and greatest numbers: "
                     f"those of {self._fields[field]} may be off in their last digits"
                 )
-            self._settled[key] = found or extreme._replace(low=extreme.high, last=extreme.first)
+            number, first = extreme.middle, extreme.first
+            self._settled[key] = found or Extreme(number, number, first, first)
         return self._settled[key]
 
     def _read_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:

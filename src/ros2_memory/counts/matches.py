@@ -226,7 +226,7 @@ def _without_gaps(
     for begin, end in gaps:
         if end < start or begin >= stop:
             continue
-        if begin > start:
+        if begin > start or (begin == start and begun):  # it may toggle in the last message
             parts.append((start, begin, begun))
         start, begun = end, False
     return [*parts, (start, stop, begun)] if start < stop or not parts else parts

@@ -113,6 +113,8 @@ def _cell(found: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | Non
     if least is None or greatest is None:
         return None
     mean = _mean(math.fsum(part.total for part in parts), sum(part.size for part in parts))
+    # The extremes are exact; what columns add up to is not.
+    mean = min(max(mean, least[0]), greatest[0]) + 0.0
     return _Cell(mean, (least[0] + 0.0, least[1]), (greatest[0] + 0.0, greatest[1]))
 
 

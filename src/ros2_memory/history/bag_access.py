@@ -17,7 +17,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MIN_NS, Deadline
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline
 from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
@@ -180,7 +180,7 @@ class BagAccess:
             try:
                 return self.memory.reader.log_times(bag.path, topic, _indexed_part(bag, window))
             except BagError as error:
-                self._note_unreadable(bag, error)
+                self._note_unreadable(bag, error, window)
                 return ()
 
     def channels(self, bag: BagFile) -> Sequence[Channel]:
@@ -189,7 +189,7 @@ class BagAccess:
         try:
             return self.memory.reader.channels(bag.path)
         except BagError as error:
-            self._note_unreadable(bag, error)
+            self._note_unreadable(bag, error, TimeWindow.everything())
             return ()
 
     def decode(self, found: StoredMessage) -> object | None:
@@ -199,13 +199,14 @@ class BagAccess:
         except UndecodableError:
             return None
 
-    def _note_unreadable(self, bag: BagFile, error: BagError, since: Ns = MIN_NS) -> None:
-        """Notes that a bag, or a part of it that reaches past `since`, is not in the answer."""
-        if not isinstance(error, BagContradictionError):
-            self.notes.complete = False
-        until = bag.end if error.lost is None else error.lost[1]
-        if until < since:
+    def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:
+        """Notes that a bag, or a part of it, is not in the answer; unless it is of no such time."""
+        is_whole = isinstance(error, BagContradictionError)
+        first, until = (bag.start, bag.end) if is_whole or error.lost is None else error.lost
+        if not window.overlaps(first, until):
             return
+        if not is_whole:
+            self.notes.complete = False
         name = short_name(bag.path)
         if isinstance(error, BagVanishedError):
             self.notes.add(Note(_DELETED, name, until=until))
@@ -247,7 +248,7 @@ class BagAccess:
                     yield StoredMessage(bag, record)
                     begin = clock()
             except BagError as error:
-                self._note_unreadable(bag, error, since)
+                self._note_unreadable(bag, error, TimeWindow(since, MAX_NS))
                 if error.lost is None:
                     return
                 # Only part of the bag is lost: the reader continues after it.
@@ -258,15 +259,24 @@ class BagAccess:
                 spent = 0
 
     def tables(
-        self, bag: BagFile, topic: str, *, hashed: bool, columns: bool = True
+        self,
+        bag: BagFile,
+        topic: str,
+        window: TimeWindow,
+        *,
+        hashed: bool = False,
+        columns: bool = True,
+        around: bool = False,
     ) -> Iterator[Table]:
-        """Yields one bag's messages of a topic as tables; a note reports what cannot be read.
+        """Yields one bag's messages of a topic in a window as tables; a note reports what is lost.
 
+        With `around` all messages of the bag are yielded, and notes are still on the window alone:
+        what lies around it is read to recognise duplicates only, or not, if these are known.
         With `hashed` they have the hashes of all payloads, else those of latched channels alone.
         Without `columns` they have times, and rows for messages that cannot be decoded, too.
         """
         self.check_deadline()
-        part = _indexed_part(bag, TimeWindow.everything())
+        part = _indexed_part(bag, TimeWindow.everything() if around else window)
         groups = decoded(
             self.memory.reader,
             bag.path,
@@ -280,7 +290,7 @@ class BagAccess:
                 with self.call.stages.timed("read"):
                     tables = next(groups, None)
             except BagError as error:
-                self._note_unreadable(bag, error)
+                self._note_unreadable(bag, error, window)
                 if error.lost is None:
                     return
                 continue
@@ -300,7 +310,7 @@ class BagAccess:
                 record = self.memory.reader.newest(bag.path, topic, _indexed_part(bag, window))
                 return None if record is None else StoredMessage(bag, record)
             except BagVanishedError as error:
-                self._note_unreadable(bag, error)
+                self._note_unreadable(bag, error, window)
                 return None
             except BagError:
                 pass

@@ -13,7 +13,7 @@ from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.units import Rows
@@ -101,20 +101,11 @@ class CandidateRows:
 
     def _of_topic(self, topic: str) -> Iterator[tuple[Ns, IntArray]]:
         """Yields for each table of a topic its last log time, and when messages may match."""
-        window = TimeWindow(MIN_NS, self._until)
 
         def reached(last: Ns) -> None:
             self._left[topic] = min(last + 1, self._until)
 
-        for rows in scan(
-            self._view,
-            topic,
-            window,
-            newest_first=True,
-            may_match=self._may_match,
-            may_be_empty=True,
-            reached=reached,
-        ):
+        for rows in _tables(self._view, topic, self._until, self._may_match, reached):
             yield rows.last, self._candidates(rows)
         self._left[topic] = MIN_NS
 
@@ -135,6 +126,25 @@ class CandidateRows:
             may = may[rows.index]
         self.ruled_out |= not may.all()
         return rows.times[may]
+
+
+def _tables(
+    view: View,
+    topic: str,
+    until: Ns,
+    may_match: Callable[[PartZones], bool | Mask],
+    reached: Callable[[Ns], None] = lambda _: None,
+) -> Iterator[Rows]:
+    """Returns the tables of a topic before a moment that zones do not rule out, newest first."""
+    return scan(
+        view,
+        topic,
+        TimeWindow(MIN_NS, until),
+        newest_first=True,
+        may_match=may_match,
+        may_be_empty=True,
+        reached=reached,
+    )
 
 
 def _together(group: Sequence[tuple[Ns, str]]) -> Candidate:
@@ -173,15 +183,7 @@ class CandidateTables:
             yield Candidate(TimeWindow(start, stop), tuple(sorted(topics)))
 
     def _of_topic(self, topic: str) -> Iterator[tuple[Ns, Ns, str]]:
-        window = TimeWindow(MIN_NS, self._until)
-        for rows in scan(
-            self._view,
-            topic,
-            window,
-            newest_first=True,
-            may_match=self._may_match,
-            may_be_empty=True,
-        ):
+        for rows in _tables(self._view, topic, self._until, self._may_match):
             yield min(rows.last, self._until - 1), rows.first, topic
 
     def _may_match(self, parts: PartZones) -> bool | Mask:

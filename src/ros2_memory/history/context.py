@@ -6,7 +6,7 @@ import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import State
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
+    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
@@ -104,6 +105,16 @@ class SnapshotSource(Protocol):
         """Returns the bags that the directory's recorder did not make; None if not known."""
 
 
+T = TypeVar("T", bound="Sized")
+
+
+class Shipped(Protocol):
+    """Fragments of whole bags, as a lake has them."""
+
+    def __call__(self, bag: BagFile, kind: Kind[T]) -> T | None:
+        """Returns the fragment of a bag; None if the lake has none."""
+
+
 @dataclass(frozen=True, slots=True)
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
@@ -112,7 +123,8 @@ class Memory:
     digests of the bags, for what does not scan yet. Every answer is the same with them and without.
     `stated` is
     set for a lake, which stores what messages state instead of the messages: it returns that, or
-    None for a message that can be decoded. The poses of a lake are thinned.
+    None for a message that can be decoded. The poses of a lake are thinned; `shipped` has what was
+    measured of all poses of a bag before.
     """
 
     index: SnapshotSource
@@ -123,6 +135,7 @@ class Memory:
     recall: DigestCache | None = None
     columns: Scanner | None = None
     stated: Callable[[Record], State | None] | None = None
+    shipped: Shipped | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.

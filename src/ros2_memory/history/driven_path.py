@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.frames import static_at, static_changes
 from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, SLICE_NS, Way, path_slice
+from ros2_memory.analysis.poses import NO_POSES
 from ros2_memory.columns.motion import PATHS
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
@@ -32,7 +33,7 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, slices_back
+from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, poses_of_bag, slices_back
 from ros2_memory.history.transforms import (
     edges,
     graph_of,
@@ -66,12 +67,16 @@ _STEP_NS: Final[Ns] = NS_PER_S // 20
 
 @dataclass(frozen=True, slots=True)
 class DrivenPath:
-    """A path, its frames in order of appearance, and the times of its first and last message."""
+    """A path, its frames in order of appearance, and the times of its first and last message.
+
+    From `since` (log time, ns) on, where older bags were not read.
+    """
 
     trajectory: Trajectory
     frames: tuple[str, ...]
     first: Ns
     last: Ns
+    since: Ns | None = None
 
 
 class FoundWay(NamedTuple):
@@ -98,7 +103,7 @@ def driven_path(
     note_known_since(view, since)
     if way is None:
         return None
-    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last)
+    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last, since)
 
 
 def note_known_since(view: View, since: Ns | None) -> None:
@@ -143,8 +148,7 @@ def _slices_in(
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        blocks = blocks_back(view, topic, window, failures, reached)
-        for start, made in slices_of_path(view, blocks):
+        for start, made in _path_back(view, topic, window, failures, reached):
             since = start
             if made.poses or made.invalid:
                 found.append(made)
@@ -155,6 +159,29 @@ def _slices_in(
             raise
         return found[::-1], since
     return found[::-1], None
+
+
+def _path_back(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    failures: list[UndecodableError],
+    reached: Callable[[Ns], None],
+) -> Iterator[tuple[Ns, PathSlice]]:
+    """Yields the path in a window, piece by piece, the newest first; see `slices_of_path`."""
+    shipped = view.memory.shipped
+    if shipped is None:
+        blocks = blocks_back(view, topic, window, failures, reached)
+        yield from slices_of_path(view, blocks)
+        return
+    for first, last, bag in reversed(view.stream.overlapping_bags([topic], window)):
+        reached(last)
+        is_whole = window.contains(first) and window.contains(last)
+        made = shipped(bag, PATHS) if is_whole else None
+        if made is None:
+            poses = (poses_of_bag(view, bag, topic) or NO_POSES).between(window.start, window.stop)
+            made = path_slice(poses, view.memory.limits.max_plausible_speed_mps)
+        yield first, made
 
 
 def slices_of_path(view: View, blocks: Iterable[PoseRows]) -> Iterator[tuple[Ns, PathSlice]]:

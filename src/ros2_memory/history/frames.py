@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, sorted_edges, static_at
 from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.transforms import edges_in
-from ros2_memory.history.scan import messages_of, scan, tables_of
+from ros2_memory.history.scan import decoded_rows, messages_of, scan
 from ros2_memory.history.transforms import decoded_transforms, sessions_of, static_transforms
 
 if TYPE_CHECKING:
@@ -53,9 +53,7 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
     edges = edges_in(rows.table, rows.times, rows.index)
     if edges is not None:
         return edges
-    decoded = [
-        edges_in(table, table.log_times[index], index) for table, index in tables_of(view, rows)
-    ]
+    decoded = [edges_in(each.table, each.times, each.index) for each in decoded_rows(view, rows)]
     known = [edges for edges in decoded if edges is not None]
     if decoded and len(known) == len(decoded):
         return sorted_edges(joined_edges(known))

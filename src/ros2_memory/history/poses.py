@@ -16,6 +16,7 @@ from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import decoded_rows, messages_of, scan
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.fragments import Fragments, Sized
-    from ros2_memory.core.model import BagFile, Pose, TimeWindow
+    from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
 
@@ -210,7 +211,7 @@ def poses_of_bag(view: View, bag: BagFile, topic: str) -> Poses | None:
     """Returns the poses of a topic in a bag; None without any, and where some message has none."""
     failures: list[UndecodableError] = []
     reader = PoseReader(view, failures)
-    tables = view.bags.tables(bag, topic, hashed=False)
+    tables = view.bags.tables(bag, topic, TimeWindow.everything())
     units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
     try:
         poses = joined_poses([reader.poses(Rows(unit, lambda: None)) for unit in units])

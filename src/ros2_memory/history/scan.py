@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
 
 
 def scan(
@@ -56,7 +55,9 @@ def scan(
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return () if stored else view.bags.tables(bag, topic, hashed=hashed, columns=columns)
+        if stored:
+            return ()
+        return view.bags.tables(bag, topic, window, hashed=hashed, columns=columns, around=True)
 
     def check(at: Ns) -> None:
         reached(at)
@@ -86,13 +87,14 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
+    window = TimeWindow.everything()
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, hashed=hashed, columns=False)
+        return view.bags.tables(bag, topic, window, hashed=hashed, columns=False, around=True)
 
     asked = Asked(
         topic,
-        TimeWindow.everything(),
+        window,
         view.snapshot.timeline,
         decode,
         shared=view.snapshot.timeline.shared_times,
@@ -106,7 +108,8 @@ def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
     """Yields some rows as their bags have them."""
     for bag, positions in rows.bag_rows():
         wanted = rows.times[positions]
-        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, hashed=False)):
+        window = TimeWindow(int(wanted.min()), int(wanted.max()) + 1)
+        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, window)):
             index = np.flatnonzero(np.isin(table.log_times, wanted))
             if table.channel.type == rows.table.channel.type and index.size:
                 unit = BagUnit(bag, table, nth)
@@ -124,17 +127,3 @@ def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
             if left[found.time] and found.record.channel.type == channel.type:
                 left[found.time] -= 1
                 yield found
-
-
-def tables_of(view: View, rows: Rows) -> Iterator[tuple[Table, IntArray]]:
-    """Yields some rows as tables with all columns, decoded from their bags.
-
-    Where the store holds no columns of them, being beyond its share. With each table come the
-    positions of the rows in it.
-    """
-    times, channel = rows.times, rows.table.channel
-    for bag, positions in rows.bag_rows():
-        wanted = times[positions]
-        for table in view.bags.tables(bag, channel.topic, hashed=False):
-            if table.channel.type == channel.type:
-                yield table, np.flatnonzero(np.isin(table.log_times, wanted))

@@ -52,7 +52,7 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.scan import messages_of, scan, tables_of
+from ros2_memory.history.scan import decoded_rows, messages_of, scan
 from ros2_memory.history.sessions import Sessions, components
 
 if TYPE_CHECKING:
@@ -386,7 +386,7 @@ def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
     pairs = pairs_in(rows.table, rows.index)
     if pairs is not None:
         return pairs
-    every = [pairs_in(table, index) for table, index in tables_of(view, rows)]
+    every = [pairs_in(each.table, each.index) for each in decoded_rows(view, rows)]
     known = [each for each in every if each is not None]
     if every and len(known) == len(every):
         return frozenset[Pair]().union(*known)

@@ -22,8 +22,10 @@ from ros2_memory.analysis.motion.standstills import (
 from ros2_memory.analysis.motion.trajectory import SLICE_NS
 from ros2_memory.columns.motion import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
     MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
@@ -37,7 +39,7 @@ from ros2_memory.history.driven_path import (
     slices_of_path,
 )
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.poses import pose_rows, slices_back
+from ros2_memory.history.poses import pose_rows, poses_of_bag, slices_back
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 from ros2_memory.insights.silences import unrecorded_length
@@ -48,7 +50,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Stands, Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.poses import PoseRows
@@ -106,7 +107,8 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
         path = driven_path(view, topic, window, 0)
-        standstills, drops = _standstills_in(view, topic, window)
+        since = window.start if path is None or path.since is None else path.since
+        standstills, drops = _standstills_in(view, topic, TimeWindow(since, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed=elapsed)
@@ -158,7 +160,16 @@ def _standstills_in(
 
 def _stands_in(view: View, topic: str, window: TimeWindow) -> list[Stands]:
     """Returns what shows where the robot stood in slices of a window, the newest first."""
-    return _stands(view, blocks_back(view, topic, window, []))
+    shipped = view.memory.shipped
+    if shipped is None:
+        return _stands(view, blocks_back(view, topic, window, []))
+    found: list[Stands] = []
+    for _, _, bag in reversed(view.stream.overlapping_bags([topic], window)):
+        poses = poses_of_bag(view, bag, topic) if (made := shipped(bag, STANDS)) is None else None
+        if made is None and poses is not None:
+            made = stands_of(poses, MIN_NS, MAX_NS, goes_on=True)
+        found += [] if made is None else [made]
+    return found
 
 
 def _stands(view: View, blocks: Iterable[PoseRows]) -> list[Stands]:

@@ -28,6 +28,7 @@ from ros2_memory.analysis.topic_events import (
 )
 from ros2_memory.catalogue.detector_sights import DetectorSights
 from ros2_memory.catalogue.digest import DIGEST_VERSION
+from ros2_memory.columns.motion import PATHS, STANDS
 from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -280,6 +281,11 @@ class _BagRows:
             found = events.get(topic, NO_EVENTS)
             if found is not NO_EVENTS:
                 add(topic, "events", encode_topic_events(found))
+        if self._poses is not None:
+            path = path_slice(self._poses, self._memory.limits.max_plausible_speed_mps)
+            stands = stands_of(self._poses, MIN_NS, MAX_NS, goes_on=True)
+            add(self._pose_topic, PATHS.name, PATHS.store(path).to_bytes())
+            add(self._pose_topic, STANDS.name, STANDS.store(stands).to_bytes())
         add("", "sights", self._sights())
 
     def _add_digest(self, topic: str, kind: str, packed: bytes | None) -> None:

@@ -29,13 +29,17 @@ _PAUSE_NS: Final = 60 * NS_PER_S
 _FEWEST: Final = 3
 """Fewer looks move nothing."""
 _LEAST_MM: Final = 150.0
+"""A step that is shorter is none, however sure it is."""
 _SIGMAS: Final = 5.0
 """So many standard errors are no chance, although a thing may be moved at any of many times."""
 _BIAS_MM: Final = 40.0
 """Standard deviation of the bias by side: half of the difference between opposite sides."""
 _LOOK_MM: Final = 50.0
+"""Usual standard deviation of one look, which the looks at a thing correct."""
 _VISIT_MM: Final = 40.0
+"""Usual standard deviation of what the looks of a visit share, which all visits correct."""
 _LEAST_VISIT_MM: Final = 20.0
+"""That of a thing is taken for no less: a few visits may agree by chance."""
 _USUAL: Final = 8
 """What is usual weighs as much as so many looks, or differences between visits."""
 
@@ -113,6 +117,10 @@ def _variance(differences: Floats, usual: float) -> float:
 
 
 _PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2, 0.0])
+"""What is known (1/mm²) before any look of the place, the bias by side in x and y, and the step.
+
+Of the place next to nothing, so that the equations have a solution; of the step nothing.
+"""
 
 
 def _squares(sums: Floats, visit: float) -> Floats:

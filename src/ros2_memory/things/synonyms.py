@@ -21,15 +21,19 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ros2_memory.analysis.sights import Ints, Sights
+    from ros2_memory.storage.base import Mask
     from ros2_memory.things.labels import Labels
 
 _FEWEST: Final = 3
+"""A label that took fewer turns is a mistake."""
 _BESIDE_SHARE: Final = 0.02
 """One message in fifty may have a thing twice."""
 _LEAST_SHARE: Final = 0.05
 """A label that is given more rarely is a mistake."""
 _SAME_MM: Final = 100.0
+"""Means of two labels in a visit that are no farther apart are of one place."""
 _SCATTERS: Final = 2.0
+"""So are those within as many root mean square distances of the looks, if that is more."""
 
 
 def with_synonyms(
@@ -60,8 +64,11 @@ def with_synonyms(
     return [known[key] for key in keys]
 
 
-def _are_beside(sights: Sights, one: Ints, other: Ints) -> bool:
-    """Whether messages have both of two labels at one place, more often than by mistake."""
+def _are_beside(sights: Sights, one: Mask, other: Mask) -> bool:
+    """Whether messages have both of two labels at one place, more often than by mistake.
+
+    Each is given as which labels of the sights are names of it.
+    """
     of = sights.spots[:, Spot.LABEL]
     beside = sights.beside
     both = one[of[beside[:, Beside.SPOT]]] & other[beside[:, Beside.LABEL]]
@@ -69,7 +76,7 @@ def _are_beside(sights: Sights, one: Ints, other: Ints) -> bool:
     return bool(beside[both, Beside.N].sum() > _BESIDE_SHARE * least)
 
 
-def _alternate(every: Ints, counts: Ints, group: Ints, of: Sequence[Ints]) -> bool:
+def _alternate(every: Ints, counts: Ints, group: Ints, of: Sequence[Mask]) -> bool:
     """Whether two labels take turns at some place, within the scatter of each other."""
     mine = np.flatnonzero((of[0] | of[1])[every[:, Spot.LABEL]] & (counts > 0))
     for epoch in np.unique(group[mine]).tolist():

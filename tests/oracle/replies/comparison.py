@@ -259,21 +259,12 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
     *(
         KnownWrong(
             world,
-            f"* {name}",
-            path,
+            "* compare",
+            "*/things/*/[xy]",
             "the place of a thing is the mean of all looks at it, not of its newest stay",
             only=_within(0.6),
         )
         for world in ("home_*", "robot_day_*")
-        for name in ("find_things", "compare", "/page/span")
-        for path in ("*/place/[xyz]", "*/spread_m", "*/things/*/[xy]", "*/was/[xy]", "*/is/[xy]")
-    ),
-    KnownWrong(
-        "*",
-        "tool compare",
-        "/things/*",
-        "`where` gives places outside of it and outside of both windows",
-        {"where": None},
     ),
     KnownWrong(
         "*",

@@ -180,9 +180,9 @@ def test_templates_that_are_remembered_change_no_digest(tmp_path: Path) -> None:
         return write_mcap(tmp_path / name, messages)
 
     paths = [bag("a.mcap", "odom", 1.0), bag("b.mcap", "moda", 2.0), bag("c.mcap", "odom", 3.0)]
-    remembering = Digester(McapReader(), extractor(), 10.0)
+    remembering = Digester(McapReader(), extractor())
     for path in paths:
-        alone = Digester(McapReader(), extractor(), 10.0)
+        alone = Digester(McapReader(), extractor())
         assert remembering.digest(path).topics == alone.digest(path).topics
 
 

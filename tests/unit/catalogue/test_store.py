@@ -271,7 +271,7 @@ def test_a_damaged_file_is_set_aside_and_made_anew(tmp_path: Path, content: byte
     with structlog.testing.capture_logs() as logs:
         catalogue = catalogue_in(tmp_path)
         assert catalogue.newest() == 0
-    assert [event["event"] for event in logs] == ["catalogue_set_aside"]
+    assert [event["event"] for event in logs] == ["database_set_aside"]
     assert path.with_name(f"{FILE}.aside").read_bytes() == content
     assert catalogue.put(KEY, DIGEST)
     assert holds(catalogue_in(tmp_path))
@@ -299,7 +299,7 @@ def test_a_file_of_a_newer_version_is_set_aside(tmp_path: Path) -> None:
     with structlog.testing.capture_logs() as logs:
         catalogue = catalogue_in(tmp_path)
         assert catalogue.newest() == 0
-    assert [event["event"] for event in logs] == ["catalogue_set_aside"]
+    assert [event["event"] for event in logs] == ["database_set_aside"]
     assert "version 99" in logs[0]["reason"]
     assert catalogue.path == path
     assert catalogue.put(KEY, DIGEST)
@@ -316,7 +316,7 @@ def test_a_locked_file_is_left_alone_and_memory_used(
         with structlog.testing.capture_logs() as logs:
             catalogue = catalogue_in(tmp_path)
             assert catalogue.newest() == 0
-        assert [event["event"] for event in logs] == ["catalogue_locked"]
+        assert [event["event"] for event in logs] == ["database_locked"]
         assert catalogue.path is None
         assert catalogue.put(KEY, DIGEST)
         assert holds(catalogue)

@@ -6,11 +6,13 @@ import os
 import random
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.layout import ERASING_FILE
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns import fill
 from ros2_memory.columns.decode import decoded, never
 from ros2_memory.columns.fill import StoreLimits
@@ -251,13 +253,13 @@ def test_in_a_cache_folder_the_oldest_bags_go_and_are_not_stored_again(tmp_path:
     assert again.fill() == 0
     assert World.of(bag_dir, file=cache, limits=limits).fill() == 0
     assert again.store.used_bytes() <= limits.max_bytes
-    for number in range(60, 80):
+    for number in range(60, 140):
         write_bag(bag_dir, number, rows=300)
         again.fill()
     assert again.store.used_bytes() <= limits.max_bytes
-    assert "rec/rec_79.mcap" in again.stored()
+    assert "rec/rec_139.mcap" in again.stored()
     assert min(before) not in again.stored()
-    assert check_all(again) == 80 * 301
+    assert check_all(again) == 140 * 301
 
 
 def test_beside_the_bags_the_store_has_no_limit_of_its_own(tmp_path: Path) -> None:
@@ -446,3 +448,38 @@ def test_numbers_that_are_rounded_to_one_come_back(tmp_path: Path) -> None:
     assert world.fill() == 1
     assert count(world, "zone", "codec GLOB '* flat 0'") == 1
     assert check_all(world) == 9
+
+
+def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(4)]
+    folder, cut = paths[0].parent, T0 + 3 * 60 * S + 2 * S
+    begun = Handover(next="later")
+    ended = replace(begun, counts_until=cut, end=Overlap(None, None, (paths[3].name,)))
+    compared = replace(ended, counts_elsewhere={paths[1].name: {"/odom": ("1 00000000",)}})
+    steps: list[tuple[Handover | None, list[int]]] = [
+        (None, [3, 2, 1, 0]),
+        (begun, []),
+        (ended, [3]),
+        (compared, [3, 1]),  # a rule concerns these
+        (Handover(), [3]),  # nothing was hidden of the other one
+    ]
+    names: list[str] = []
+
+    def counting(reader: BagReader, path: Path, **options: object) -> Iterator[list[Table]]:
+        names.append(path.name)
+        return decoded(reader, path, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(fill, "decoded", counting)
+    for number, (handover, stored) in enumerate(steps):
+        if handover is not None:
+            write_handover(folder, handover)
+            os.utime(folder / HANDOVER_FILE, ns=(T0, T0 + number * S))
+        names.clear()
+        world = World.of(tmp_path)
+        world.fill(merge=False)
+        assert names == [paths[nth].name for nth in stored]
+        assert len(world.stored()) == 4
+        assert check_all(world) > 0
+        world.store.close()

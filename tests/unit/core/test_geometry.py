@@ -242,7 +242,8 @@ def drawn(
     """Of a path of one point at least; without seconds, time does not count."""
     points = np.array(path, np.float64).reshape(-1, 3)
     clock = np.zeros(len(path)) if seconds is None else np.array(seconds, np.float64)
-    kept, error_m = simplified(points, clock, np.unique([0, len(path) - 1]), tolerance_m, at_most)
+    ends = np.unique([0, len(path) - 1])
+    kept, error_m = simplified(points, clock, ends, tolerance_m=tolerance_m, at_most=at_most)
     return kept.tolist(), error_m
 
 

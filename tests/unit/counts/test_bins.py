@@ -233,6 +233,16 @@ def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> N
         assert off.usual is None
 
 
+def test_a_boolean_that_toggles_in_the_last_message_before_a_gap_counts(tmp_path: Path) -> None:
+    for begin in (0, 20_000):
+        messages = [boolean(BEGIN + (begin + at) * S, at == 9) for at in range(10)]
+        write_mcap(tmp_path / "rec" / f"rec_{begin}.mcap", messages)
+    memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
+    for each in (memory, recalling(memory, tmp_path)):
+        docked = count_matches(each, Call(), "/bumper", "equals", True, by="day")
+        assert (whole(docked, "count"), whole(docked, "seconds")) == (2, 0)
+
+
 def test_bags_without_a_digest_are_read_for_seconds_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -22,7 +23,8 @@ from ros2_memory.counts.numbers import count_range
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
-from tests.support.bags import Msg, battery, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, battery, odom, write_mcap
+from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
@@ -142,6 +144,38 @@ class Limited(Deadline):
 
     def expired(self) -> bool:
         return next(self.looks, True)  # type: ignore[attr-defined]
+
+
+def test_a_mean_lies_between_the_least_and_the_greatest_number(tmp_path: Path) -> None:
+    position = 1.221303095  # a column says 1.2213
+    write(tmp_path, [odom(BEGIN + n * S, position * n, 0.0) for n in range(3)])
+    memory = storing(memory_of(tmp_path, limits=LATEST), tmp_path, Random(1))
+    window = TimeRange(BEGIN / S + 1, BEGIN / S + 1)
+    answer = count_range(memory, Call(), "/odom", window, "day", fields=["position.x"])
+    ends = [cells(answer, f"position.x.{name}") for name in ("min", "mean", "max")]
+    assert ends == [[position] * 2] * 3
+
+
+def test_what_is_damaged_since_it_was_stored_is_told_as_its_column_says(tmp_path: Path) -> None:
+    positions = [Random(n).uniform(-9, 9) for n in range(60)]
+    poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", poses, McapLayout(chunk_size=400))
+    os.utime(path, ns=(BEGIN, BEGIN))
+    memory = storing(memory_of(tmp_path, limits=LATEST), tmp_path, Random(1))
+    lost, others = 20, {0, 40}  # a flipped bit, which no date shows
+    spoil_chunk(path, lost)
+    os.utime(path, ns=(BEGIN, BEGIN))
+    for second in {lost, *others}:
+        window = TimeRange(BEGIN / S + second, BEGIN / S + second)
+        call = Call()
+        answer = count_range(memory, call, "/odom", window, "day", fields=["position.x"])
+        ends = [cells(answer, f"position.x.{name}")[-1] for name in ("min", "mean", "max")]
+        assert ends == pytest.approx([positions[second]] * 3, abs=1e-4)
+        assert len({*ends}) == 1
+        is_noted = any("could not be read whole" in note for note in answer.notes)
+        assert is_noted is (second == lost)
+        if second != lost:
+            assert ends == [positions[second]] * 3
 
 
 def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched(

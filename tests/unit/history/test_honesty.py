@@ -9,8 +9,19 @@ import pytest
 
 from ros2_memory import queries
 from ros2_memory.history.context import Call, QuerySettings
-from tests.support.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.clocks import FixedClock
+from tests.support.column_worlds import World
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, recalling
 
@@ -220,6 +231,31 @@ def test_a_chunk_that_is_lost_of_a_closed_bag_is_reported_in_windows_that_touch_
     assert any(note.startswith("rec/rec_1.mcap could not be read whole: ") for note in told)
     recalled = recalling(memory, tmp_path)
     assert told == notes_of(asked(recalled, tmp_path, "get_topic_in_range", **window))
+
+
+@pytest.mark.parametrize("last", [9, 30], ids=["other topics go on", "the topic goes on"])
+def test_a_chunk_that_is_lost_is_not_reported_in_windows_behind_it_whatever_is_stored(
+    last: int, tmp_path: Path
+) -> None:
+    poses = [odom(T0 + n * S, n / 10, 0.0) for n in range(last)]
+    others = [text(T0 + n * S, "cup") for n in range(31)]
+    damaged = write_mcap(tmp_path / "a" / "a_0.mcap", [*poses, *others], McapLayout(chunk_size=400))
+    spoil_chunk(damaged, 0)
+    # The other recording may have copies of what the damaged one has.
+    copies = [text(T0 + 5 * S, "mug"), *(odom(T0 + n * S, 0.1, 0.0) for n in range(28, 40))]
+    write_mcap(tmp_path / "b" / "b_0.mcap", copies)
+    for path in tmp_path.rglob("*.mcap"):
+        os.utime(path, ns=(T0, T0))
+    world = World.of(tmp_path, clock=FixedClock(T0 + HOUR))
+    assert world.fill() == 1
+    for start, is_lost in ((29, False), (5, False), (0, True)):
+        asking = {"topic": "/odom", "fields": ["position.x"], "by": "day", "end": at(50)}
+        stored, plain = (
+            asked(memory, tmp_path, "get_topic_in_range", start=at(start), **asking)
+            for memory in (world.memory, world.unstored().memory)
+        )
+        assert stored == plain
+        assert any("could not be read whole" in note for note in notes_of(plain)) is is_lost
 
 
 def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from itertools import pairwise
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 import httpx2
@@ -49,7 +50,7 @@ from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_mcap
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, recalling, stored_columns
 from tests.unit.test_positions import fix
 
 if TYPE_CHECKING:
@@ -237,6 +238,19 @@ def test_numbers_come_in_bins_with_their_bounds(memory: Memory) -> None:
     [close] = shown(memory, f"start={BEGIN_S}&end={BEGIN_S + 9}&signal={signal}")["signals"]
     assert close["mean"] == [1.0] * len(close["t"])
     assert len(close["t"]) >= 80
+
+
+def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
+    draw = Random(7)
+    positions = [draw.uniform(-9, 9) for _ in range(60)]
+    poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    plain = memory_of(tmp_path)
+    for asked_of in (plain, replace(plain, columns=stored_columns(plain, tmp_path))):
+        signal = "/odom:pose.pose.position.x"
+        [found] = shown(asked_of, f"last=1000&signal={signal}")["signals"]
+        assert all(low <= mean <= high for low, mean, high in zip(*bounds(found), strict=True))
+        assert found["mean"] == pytest.approx(positions, abs=1e-4)
 
 
 def bounds(signal: dict[str, Any]) -> tuple[list[float], list[float], list[float]]:

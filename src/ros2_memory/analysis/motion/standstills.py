@@ -184,24 +184,25 @@ class Stands(NamedTuple):
         return 1000 + 96 * len(self.blocks) + 200 * len(self.drops)
 
 
-def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
+def stands_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Stands:
     """Returns what shows where the robot stood; see `blocks_of`."""
     inside = poses.between(start, stop)
     places = inside.times[are_places(inside.positions)]
     return Stands(
-        blocks_of(poses, start, stop),
+        blocks_of(poses, start, stop, goes_on=goes_on),
         tuple(each for each in speed_drops(poses) if start <= each.time < stop),
         int(places[-1]) if places.size else MIN_NS,
     )
 
 
-def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
+def blocks_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Blocks:
     """Returns the blocks of a stretch of time; chains that are surely too short have none.
 
     Args:
         poses: at least those of the stretch and `BESIDE_NS` beside it.
         start: log time (ns) where the stretch begins; blocks begin there.
         stop: where it ends, and blocks end.
+        goes_on: whether the robot may have stood before the first pose and after the last.
     """
     valid = are_places(poses.positions)
     if not valid.any():
@@ -217,6 +218,8 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     # Of one that goes on beyond the stretch it is not known here.
     is_long = slots.lasts[edges[1]] - slots.firsts[edges[0]] >= SHORTEST_NS
     is_long |= (slots.firsts[firsts] < start) | (slots.lasts[lasts] >= stop)
+    if goes_on:
+        is_long |= (edges[0] == 0) | (edges[1] == len(slots) - 1)
     starts = np.full(len(slots), MIN_NS)
     ends = np.full(len(slots), MIN_NS)
     among = np.zeros(len(slots), np.bool_)
@@ -226,6 +229,9 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
             starts[first] = slots.begin_of(first)
         if start <= slots.firsts[last] < stop:
             ends[last] = slots.end_of(last)
+    if goes_on:
+        starts[starts == slots.times[0]] = MIN_NS
+        ends[ends == slots.times[-1]] = MIN_NS
     among &= (slots.firsts >= start) & (slots.firsts < stop)
     return _blocks(slots, np.flatnonzero(among), np.cumsum(is_first), starts, ends)
 
@@ -365,6 +371,8 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     if not len(blocks):
         return ()
     begins_chain = blocks.starts != MIN_NS
+    # Parts of a history that each go on may have a silence between them.
+    begins_chain[1:] |= blocks.firsts[1:] - blocks.lasts[:-1] > SILENCE_NS
     begins_chain[0] = True
     chain = np.cumsum(begins_chain)
     still = blocks.are_still()

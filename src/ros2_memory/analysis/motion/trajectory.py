@@ -41,6 +41,8 @@ MAX_WAYPOINTS: Final = 50
 
 _MOST_VERTICES: Final = 400
 """Vertices of the path that is kept of a slice, but for the ends of jumps."""
+_OF_TIME: Final = 0.5
+"""So the metres driven up to a time are known to half the tolerance of what is kept of a slice."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
@@ -234,7 +236,12 @@ def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_
             ends = np.unique(np.concatenate(([0, len(known) - 1], parted - 1, parted)))
             seconds = (known.times - known.times[0]) / NS_PER_S
             kept, error_m = simplified(
-                known.positions, seconds, ends, tolerance_m / 4, _MOST_VERTICES
+                known.positions,
+                seconds,
+                ends,
+                tolerance_m=tolerance_m / 4,
+                at_most=_MOST_VERTICES,
+                of_time=_OF_TIME,
             )
         line = Line(
             known.times[kept],
@@ -371,7 +378,7 @@ def drawn(
     ends = np.unique(np.concatenate(([0, len(line) - 1], parted - 1, parted)))
     seconds = (line.times - line.times[0]) / NS_PER_S
     left_m = max(tolerance_m - error_m, tolerance_m / 4)
-    kept, off_m = simplified(line.places, seconds, ends, left_m, at_most)
+    kept, off_m = simplified(line.places, seconds, ends, tolerance_m=left_m, at_most=at_most)
     chosen = line.rows(kept)
     parts = (chosen.jumps & np.isin(kept, [0, *parted])).tolist()
     columns = chosen.times.tolist(), chosen.places.tolist(), chosen.headings.tolist(), parts

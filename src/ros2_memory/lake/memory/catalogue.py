@@ -13,6 +13,7 @@ from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.map_digest import NO_STATICS
 from ros2_memory.catalogue.store import Catalogue
 from ros2_memory.catalogue.topic_digest import EdgeDigest
+from ros2_memory.columns.fragments import Fragment
 from ros2_memory.lake.event_codec import decode_topic_events
 from ros2_memory.lake.partitions import locations
 
@@ -22,13 +23,16 @@ if TYPE_CHECKING:
     from datetime import date
 
     from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import BagKey
+    from ros2_memory.core.model import BagFile
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeIndex
     from ros2_memory.lake.partitions import Days
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
+S = TypeVar("S", bound="Sized")
 
 _PART_BYTES: Final = 1 << 20
 """Days are read together, of so many bytes in all: a home robot's day, or weeks of a rare one."""
@@ -86,6 +90,12 @@ class LakeCatalogue(Catalogue):
     def find(self, keys: Sequence[BagKey]) -> list[int | None]:
         """Returns the numbers of the bags, which all have an entry."""
         return [key.sidecar_ns for key in keys]
+
+    def fragment(self, bag: BagFile, kind: Kind[S]) -> S | None:
+        """Returns what was measured of the poses of a bag when it was shipped; None if unknown."""
+        number = self._index.number(bag)
+        packed = self._packed(kind.name, self._index.pose_topic, [number]).get(number)
+        return None if packed is None else kind.load(Fragment.from_bytes(packed))
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic; of digests of another version nothing is known."""

@@ -100,6 +100,7 @@ class LakeRobot:
             own,
             recall,
             stated=stated_in,
+            shipped=catalogue.fragment,
         )
 
     @property

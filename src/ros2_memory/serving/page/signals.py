@@ -101,7 +101,14 @@ def _numbers(view: View, topic: str, field: str, window: TimeWindow, width: Ns) 
     numbers = PieceNumbers(view, topic, (field,), edges)
     numbers.collect(window)
     parts = [
-        _Part(part.first, part.last, part.size, part.total, part.least.high, -part.greatest.high)
+        _Part(
+            part.first,
+            part.last,
+            part.size,
+            part.total,
+            part.least.middle,
+            -part.greatest.middle,
+        )
         for piece in range(len(edges) + 1)
         for part in sorted(numbers.parts(0, piece))
     ]
@@ -118,6 +125,8 @@ def _binned(parts: Sequence[_Part], width: Ns) -> list[tuple[float | None, ...]]
     lows = np.minimum.reduceat(np.array([each.low for each in parts]), starts)
     highs = np.maximum.reduceat(np.array([each.high for each in parts]), starts)
     means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts)
+    # Of a whole part the least and the greatest number are exact, and the sum is of rounded ones.
+    means = np.clip(means, lows, highs)
     times = np.add.reduceat(middles / NS_PER_S * sizes, starts) / np.add.reduceat(sizes, starts)
     columns = (lows, means, highs)
     return [

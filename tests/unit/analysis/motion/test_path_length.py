@@ -539,7 +539,7 @@ def test_no_way_back_is_dropped_that_is_longer_than_twice_the_stated_limit(
 ) -> None:
     path = np.array([(x, 0.0, 0.0) for x in xs])
     clock, ends = np.arange(len(xs), dtype=np.float64), np.array([0, len(xs) - 1])
-    kept, error_m = simplified(path, clock, ends, 0.05, at_most)
+    kept, error_m = simplified(path, clock, ends, tolerance_m=0.05, at_most=at_most)
     assert len(kept) <= at_most
     for begin, end in pairwise(kept.tolist()):
         rising = 1.0 if xs[end] >= xs[begin] else -1.0
