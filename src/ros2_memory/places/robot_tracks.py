@@ -20,6 +20,7 @@ from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
     TrackPart,
     joined_track,
+    jumps,
     thinned,
     track_part,
 )
@@ -33,7 +34,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Parts, Steps, parts_inside
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Deadline, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows
@@ -60,9 +61,6 @@ _NOT_PLACED: Final = Reason(
     "recording",
     many="have no transforms that place their poses: they are left out",
 )
-_FASTEST_MPS: Final = 5.0
-_JUMP_NS: Final[Ns] = 2 * NS_PER_S
-"""A step that is faster, and not longer than this, is a jump."""
 _READING_S: Final = 10.0
 """How long a call places poses that it does not remember, before its answer is partial."""
 
@@ -499,12 +497,12 @@ def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
     return [kept, *others]
 
 
-def _without_jumps(parts: Parts, jumps: Mask) -> Parts:
+def _without_jumps(parts: Parts, every: Mask) -> Parts:
     """Returns parts of steps, of those that are jumps their ends alone, or both where all is in.
 
     Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
     """
-    jumped = jumps[parts.step]
+    jumped = every[parts.step]
     begins, ends = parts.start <= 0, parts.stop >= 1
     start = np.where(jumped & ~begins, 1.0, parts.start)
     stop = np.where(jumped & ~ends, 0.0, parts.stop)
@@ -527,10 +525,9 @@ def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
     parts = parts_inside(region, steps)
     lasted = track.times[after] - track.times
-    far = np.hypot(steps.to_x - steps.x, steps.to_y - steps.y) * 1e9 > _FASTEST_MPS * lasted
-    jumps = far & (lasted > 0) & (lasted <= _JUMP_NS)
-    if jumps[parts.step].any():
-        parts = _without_jumps(parts, jumps)
+    jumped = jumps(track)
+    if jumped[parts.step].any():
+        parts = _without_jumps(parts, jumped)
     if not len(parts.step):
         return []
     lasted = lasted[parts.step]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.motion.robot_track import jumps
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -83,11 +84,14 @@ def farthest_apart(
 
 
 def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
-    """Returns the steps of a track inside a window; a piece of one vertex is one of no length."""
+    """Returns the steps of a track inside a window; a piece of one vertex is one of no length.
+
+    Nobody was between the ends of a jump.
+    """
     count = len(track.times)
-    ends = np.append(track.begins[1:], [True])[:count]
+    ends = np.append(track.begins[1:], [True])[:count] | jumps(track)
     after = np.where(ends, np.arange(count), np.arange(count) + 1)
-    alone = ends & track.begins
+    alone = ends & np.append([True], ends[:-1])[:count]
     real = (~ends | alone) & (track.times < window.stop) & (track.times[after] >= window.start)
     first, last = np.flatnonzero(real), after[real]
     start = np.maximum(track.times[first], window.start)

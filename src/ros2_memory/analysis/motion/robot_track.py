@@ -35,6 +35,9 @@ STRETCH_NS: Final[Ns] = 10 * NS_PER_S
 _SLOT_NS: Final[Ns] = NS_PER_S // 5
 """Of the poses in a slot of the clock the first and the last count: nothing bends a way between."""
 
+_FASTEST_MPS: Final = 5.0
+_JUMP_NS: Final[Ns] = 2 * NS_PER_S
+"""A step that is faster, and not longer than this, is a jump."""
 _MAX_M: Final = 1e6
 _PER_M: Final = 10_000
 """Vertices are rounded to 0.1 mm, as the store has poses."""
@@ -202,6 +205,14 @@ def _vertices(part: TrackPart, keeps: Mask) -> NDArray[np.intp]:
         is_bent[splits] = False
         waiting = waiting[is_bent]
     return np.flatnonzero(kept)
+
+
+def jumps(track: RobotTrack) -> Mask:
+    """Returns after which vertices the robot jumped to the next one: nobody drives as fast."""
+    lasted = np.diff(track.times)
+    far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > _FASTEST_MPS * lasted
+    jumped = far & (lasted > 0) & (lasted <= _JUMP_NS) & ~track.begins[1:]
+    return np.append(jumped, [False])[: len(track.times)]
 
 
 def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
