@@ -6,7 +6,6 @@ start again between the two.
 
 from __future__ import annotations
 
-from statistics import median
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -16,6 +15,8 @@ from ros2_memory.analysis.motion.robot_track import jumps
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
+
+    from numpy.typing import NDArray
 
     from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.analysis.motion.robot_track import RobotTrack
@@ -177,23 +178,26 @@ def placed_standstills(
 
     Standstills outside the track are left out.
     """
-    if not len(track.times):
+    ends = np.array([*spans], np.int64).reshape(-1, 2)
+    if not len(track.times) or not len(ends):
         return
+    at = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)
+    known = _is_known(track, at)
+    some = known.any(axis=1)
+    ends, at, known = ends[some], at[some], known[some]
     since = track.times[0]
     times = (track.times - since).astype(np.float64)
-    for start, stop in spans:
-        at = np.linspace(start, stop, _SAMPLES_OF_STAND).astype(np.int64)
-        at = at[_is_known(track, at)]
-        if not len(at):
-            continue
-        x, y = (
-            median(np.interp(at - since, times, column).tolist()) for column in (track.x, track.y)
-        )
-        if region is None or region.contains(x, y):
-            yield PlacedStandstill(x, y, start, stop - start)
+    x, y = (
+        np.nanmedian(np.where(known, np.interp(at - since, times, axis), np.nan), axis=1)
+        for axis in (track.x, track.y)
+    )
+    rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)
+    for here, there, start, stop in rows:
+        if region is None or region.contains(here, there):
+            yield PlacedStandstill(here, there, start, stop - start)
 
 
-def _is_known(track: RobotTrack, at: Times) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _is_known(track: RobotTrack, at: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Returns whether a track covers some times."""
     last = np.searchsorted(track.times, at, side="right") - 1
     following = np.minimum(last + 1, len(track.times) - 1)
@@ -211,13 +215,16 @@ def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
     every = [(0, each) for each in this] + [(1, each) for each in other]
     every.sort(key=lambda each: (-each[1].duration, each[1]))
     middles: list[PlacedStandstill] = []
+    places = np.empty((len(every), 2))
     sums: list[list[Ns]] = []
     since: list[list[Ns | None]] = []
     for side, stand in every:
-        away = [(each.x - stand.x) ** 2 + (each.y - stand.y) ** 2 for each in middles]
-        nth = min(range(len(away)), key=away.__getitem__, default=None)
-        if nth is None or away[nth] > SAME_STAND_M**2:
+        apart = places[: len(middles)] - (stand.x, stand.y)
+        away = (apart * apart).sum(axis=1)
+        nth = int(away.argmin()) if middles else 0
+        if not middles or away[nth] > SAME_STAND_M**2:
             nth = len(middles)
+            places[nth] = stand.x, stand.y
             middles.append(stand)
             sums.append([0, 0])
             since.append([None, None])

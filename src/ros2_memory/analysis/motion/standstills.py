@@ -379,7 +379,8 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     moves = _creeping(blocks, chain, still) | ~still
     found: list[Standstill] = []
     not_before, newest = MIN_NS, 0
-    for begin, stop in _runs(~moves, chain):
+    runs = _runs(~moves, chain)
+    for begin, stop, box in zip(*runs, _boxes(blocks, *runs), strict=True):
         if chain[begin] != newest:
             # The ends of chains are followed into each other's slots.
             newest, not_before = chain[begin], found[-1].end if found else MIN_NS
@@ -388,22 +389,38 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
             start = int(blocks.starts[begin])
         if blocks.ends[stop - 1] != MIN_NS:
             end = int(blocks.ends[stop - 1])
-        found += _in_run(blocks, begin, stop, max(start, not_before), end)
+        start = max(start, not_before)
+        if end - start < SHORTEST_NS:
+            continue
+        if box.diagonal <= LARGEST_M:
+            found.append(Standstill(start, end, box))
+        else:
+            found += _in_run(blocks, begin, stop, start, end)
     return tuple(found)
 
 
-def _runs(marks: Marks, chain: Ints) -> Iterator[tuple[int, int]]:
-    """Yields the half-open ranges in one chain in which marks are set."""
+def _boxes(blocks: Blocks, begins: Sequence[int], stops: Sequence[int]) -> Iterator[Box3]:
+    """Yields the boxes around some half-open ranges of blocks, which follow each other."""
+    if not begins:
+        return
+    edges = np.stack([begins, stops], axis=1).reshape(-1)
+    # One row more, since the last range may end where the blocks do.
+    lows = np.minimum.reduceat(np.append(blocks.lows, blocks.lows[-1:], axis=0), edges)[::2]
+    highs = np.maximum.reduceat(np.append(blocks.highs, blocks.highs[-1:], axis=0), edges)[::2]
+    for (a, b, c), (d, e, f) in zip(lows.tolist(), highs.tolist(), strict=True):
+        yield Box3((a, b, c), (d, e, f))
+
+
+def _runs(marks: Marks, chain: Ints) -> tuple[list[int], list[int]]:
+    """Returns where the ranges in one chain in which marks are set begin, and where they stop."""
     is_new = np.r_[True, (np.diff(chain) != 0) | ~marks[:-1]]
     is_over = np.r_[(np.diff(chain) != 0) | ~marks[1:], True]
     begins, stops = np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
-    return zip(begins.tolist(), stops.tolist(), strict=True)
+    return begins.tolist(), stops.tolist()
 
 
 def _in_run(blocks: Blocks, begin: int, stop: int, start: Ns, end: Ns) -> Iterator[Standstill]:
-    """Yields the standstill of consecutive still blocks; several where it drifts away."""
-    if end - start < SHORTEST_NS:
-        return
+    """Yields the standstills of consecutive still blocks, of a robot that drifts away."""
     while begin < stop:
         some = _BLOCKS_AT_ONCE
         while True:
