@@ -323,16 +323,16 @@ class Backfill:
 
 
 def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
-    """Makes and stores what follows from the parts of some times."""
-    if memory.columns is None or not windows:
+    """Makes what follows from the parts of some times; stores it, and what questions made of it."""
+    if memory.columns is None:
         return
-    view = View(memory, Call())
     for window in windows:
         try:
-            slice_drive(view, window)
+            slice_drive(View(memory, Call()), window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         memory.columns.write_fragments()
+    memory.columns.write_fragments()
 
 
 async def keep_backfilled(
