@@ -263,6 +263,12 @@ class Backfill:
             if self.filling is not None:
                 self.filling.store.look_after(thorough=thorough)
 
+    def write_again(self) -> None:
+        """Finds out whether the disk works again, where nothing waits to be written."""
+        self.catalogue.write_again()
+        if self.filling is not None:
+            self.filling.store.write_again()
+
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
 
@@ -406,6 +412,8 @@ class Filler:
             # Bags that the helper could not digest are tried here, and refused if they fail.
             waiting = await _in_thread(find)
             unstored = await _in_thread(backfill.not_stored)
+        if not waiting and not unstored:
+            await _in_thread(backfill.write_again)
         for bag in unstored[:BACKLOG]:
             await _in_thread(partial(backfill.store, bag))
         await _in_thread(backfill.merge)
