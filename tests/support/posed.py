@@ -16,7 +16,7 @@ from ros2_memory.analysis.motion.standstills import (
     stands_of,
     standstills_of,
 )
-from ros2_memory.analysis.motion.trajectory import SLICE_NS, Way, path_slice
+from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, joined_slices, path_slice
 from ros2_memory.analysis.poses import Frames, Poses
 
 if TYPE_CHECKING:
@@ -44,14 +44,14 @@ def posed(
     )
 
 
-def way_of(poses: Poses, fastest_mps: float, cuts: Sequence[int] | None = None) -> Way:
+def way_of(poses: Poses, fastest_mps: float, cuts: Sequence[int] | None = None) -> PathSlice:
     """The path of poses, measured in slices of the clock, or in parts cut at some poses."""
     if cuts is None:
         numbers = poses.times // SLICE_NS
         cuts = (np.flatnonzero(np.diff(numbers)) + 1).tolist()
     parts = pairwise(sorted({0, *cuts, len(poses)}))
     slices = [path_slice(poses.rows(np.arange(*part)), fastest_mps) for part in parts]
-    return Way.of(slices or [path_slice(poses, fastest_mps)], fastest_mps)
+    return joined_slices(slices or [path_slice(poses, fastest_mps)], fastest_mps)
 
 
 def stood_in(

@@ -186,6 +186,7 @@ class Database:
                         opened.connection.execute("COMMIT")
             # Rows of a damaged file can hold anything, so decoding them can raise any of these.
             except (sqlite3.Error, ValueError, TypeError, LookupError, MemoryError) as error:
+                self.failures += 1
                 self._failed(error)
                 return unknown
 
@@ -216,6 +217,14 @@ class Database:
                     return True
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
+
+    def write_again(self) -> None:
+        """Finds out whether the disk works again, if it failed and nothing waits to be written.
+
+        Another program may have written what waited.
+        """
+        if self.is_failing:
+            self.write(lambda _: None)
 
     def compact(self) -> None:
         """Rewrites the file without its gaps, which are about a tenth of it after many entries.
@@ -324,7 +333,6 @@ class Database:
         if not is_transient(error):
             self._lose(f"it is damaged: {error}", aside=True)
             return
-        self.failures += 1
         trouble = f"cannot be used: {error}"
         if trouble != self.trouble:
             path = None if self._opened is None else self._opened.path

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 """Fragments are read from the store a day of the clock at a time."""
-_MOST_WAITING: Final = 4_096
+_MOST_WAITING: Final = 1_024
 """Fragments that wait to be stored; of more the oldest are made again."""
 
 log = get_logger(__name__)

@@ -28,7 +28,7 @@ class GoneError(QueryTimeoutError):
     """Rows were deleted from the store while they were read."""
 
     def __init__(self) -> None:
-        super().__init__("bags were deleted while they were read: ask again")
+        super().__init__("stored columns were deleted while they were read: ask again")
 
 
 class Unit(ABC):

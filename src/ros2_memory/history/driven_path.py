@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.frames import static_at, static_changes
 from ros2_memory.analysis.motion.odometry import is_place
-from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, SLICE_NS, Way, path_slice
+from ros2_memory.analysis.motion.trajectory import (
+    MAX_WAYPOINTS,
+    SLICE_NS,
+    joined_slices,
+    path_slice,
+)
 from ros2_memory.analysis.poses import NO_POSES
 from ros2_memory.columns.motion import PATHS
 from ros2_memory.columns.units import GoneError
@@ -82,7 +87,7 @@ class DrivenPath:
 class FoundWay(NamedTuple):
     """The path of a window; from `since` (log time, ns) on, where older bags were not read."""
 
-    way: Way | None
+    way: PathSlice | None
     since: Ns | None = None
 
 
@@ -129,7 +134,7 @@ def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
         view.notes.complete = False
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add(f"poses left out, since they cannot be decoded: {why}")
-    return FoundWay(Way.of(found, fastest) if found else None, since)
+    return FoundWay(joined_slices(found, fastest) if found else None, since)
 
 
 def _slices_in(

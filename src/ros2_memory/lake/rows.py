@@ -17,7 +17,7 @@ from ros2_memory.analysis.frames import static_at
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
-from ros2_memory.analysis.motion.trajectory import Way, path_slice
+from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.analysis.state_changes import has_levels
 from ros2_memory.analysis.topic_events import (
@@ -218,7 +218,7 @@ class _BagRows:
         driven = None
         if self._poses is not None:
             fastest = self._memory.limits.max_plausible_speed_mps
-            driven = Way.of([path_slice(self._poses, fastest)], fastest).trajectory(0)
+            driven = path_slice(self._poses, fastest).trajectory(0)
         self._rows["bags"].append(
             (
                 bag.recording.name,

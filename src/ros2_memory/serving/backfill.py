@@ -207,6 +207,12 @@ class Backfill:
             if self.filling is not None:
                 self.filling.store.look_after(thorough=thorough)
 
+    def write_again(self) -> None:
+        """Finds out whether the disk works again, where nothing waits to be written."""
+        self.catalogue.write_again()
+        if self.filling is not None:
+            self.filling.store.write_again()
+
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
 
@@ -267,18 +273,19 @@ class Backfill:
 
 
 def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
-    """Makes and stores what follows from the parts of some times."""
-    if memory.columns is None or not windows:
+    """Makes what follows from the parts of some times; stores it, and what questions made of it."""
+    if memory.columns is None:
         return
-    view = View(memory, Call())
     for window in windows:
         try:
+            view = View(memory, Call())
             slice_drive(view, window)
             make_tracks(view, window)
             Watching(view).make(window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         memory.columns.write_fragments()
+    memory.columns.write_fragments()
 
 
 async def keep_backfilled(
@@ -352,6 +359,8 @@ class Filler:
             # Bags that the helper could not digest are tried here, and refused if they fail.
             waiting = await _in_thread(find)
             unstored = await _in_thread(backfill.not_stored)
+        if not waiting and not unstored:
+            await _in_thread(backfill.write_again)
         for bag in unstored[:BACKLOG]:
             await _in_thread(partial(backfill.store, bag))
         await _in_thread(backfill.merge)

@@ -7,7 +7,7 @@ import os
 import random
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 import pytest
@@ -232,6 +232,12 @@ def test_where_the_folder_cannot_be_written_the_next_one_is_used_or_memory(tmp_p
     assert len(in_memory.stored()) == 4
 
 
+def full_disk(_: sqlite3.Connection) -> NoReturn:
+    error = sqlite3.OperationalError("database or disk is full")
+    error.sqlite_errorcode = sqlite3.SQLITE_FULL
+    raise error
+
+
 def test_a_full_disk_loses_nothing_and_is_filled_when_there_is_room(tmp_path: Path) -> None:
     draw = random.Random(3)
     write_bags(tmp_path, 2)
@@ -252,6 +258,18 @@ def test_a_full_disk_loses_nothing_and_is_filled_when_there_is_room(tmp_path: Pa
     world.fill()
     assert len(world.stored()) == 40
     assert check_all(world) == 2 * 24 + 38 * 300
+
+
+def test_a_disk_has_room_again_also_where_nothing_is_left_to_store(tmp_path: Path) -> None:
+    write_bags(tmp_path, 2)
+    world = World.of(tmp_path)
+    assert not world.store.write(full_disk)
+    assert world.store.trouble == "cannot be used: database or disk is full"
+    assert World.of(tmp_path).fill() == 2
+    assert world.fill() == 0
+    world.store.write_again()
+    assert not world.store.is_failing
+    assert world.store.trouble is None
 
 
 def test_a_file_that_another_program_has_locked_costs_no_answer(tmp_path: Path) -> None:
@@ -281,6 +299,23 @@ def test_what_could_not_be_read_once_is_read_the_next_time(
         times(world, "/odom")
     monkeypatch.setattr(world.store, "packed", read)
     assert times(world, "/odom") == times(world.unstored(), "/odom")
+
+
+def test_a_write_that_fails_meanwhile_costs_no_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bags(tmp_path)
+    World.of(tmp_path).fill()
+    world = World.of(tmp_path)
+    read = world.store.packed
+
+    def read_while_a_write_fails(topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
+        assert not world.store.write(full_disk)
+        return read(topic, path, parts)
+
+    monkeypatch.setattr(world.store, "packed", read_while_a_write_fails)
+    assert times(world, "/odom") == times(world.unstored(), "/odom")
+    assert world.store.is_failing
 
 
 def test_a_part_that_is_deleted_is_not_one_that_lacks_a_column(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 What is measured of poses depends on how many of them are measured together (see `path_length`). So
 a history is measured in slices of `SLICE_NS` of the clock, however it is cut into bags: a
-`PathSlice` is what is kept of one, and `Way.of` joins those of a window. The drawn path is
+`PathSlice` is what is stored of one, and `joined_slices` joins those of a window. The drawn path is
 simplified twice. The deviations add up and do no more, since a vertex that the second drops is
 beside the same kept segment as its neighbours: so to at most the tolerance, unless a limit on the
 count of vertices widens it. Where the robot jumped, nothing is drawn.
@@ -40,9 +40,9 @@ MAX_WAYPOINTS: Final = 50
 """Vertices of the path that is returned, unless more or fewer are asked for."""
 
 _MOST_VERTICES: Final = 400
-"""Vertices of the path that is kept of a slice, but for the ends of jumps."""
+"""Vertices that a slice stores of its path, but for the ends of jumps."""
 _OF_TIME: Final = 0.5
-"""So the metres driven up to a time are known to half the tolerance of what is kept of a slice."""
+"""So the metres that a slice has driven up to a time are right within 2.5 cm."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
 _NOISY_SHARE: Final = 0.02
@@ -192,7 +192,7 @@ class PathSlice:
         step_mps: see `odometry.Motion`.
         twist: the highest speed (m/s) that a message states; None where none states one.
         frames: the frames of all poses, in order of appearance.
-        line: the drawn path from the first valid pose to the last.
+        line: the drawn path from the first valid pose to the last; its metres are what was driven.
         error_m: no valid pose is farther than this from it.
         few: the poses, where they are so few that those beside them decide how they are measured.
     """
@@ -207,12 +207,41 @@ class PathSlice:
     frames: tuple[str, ...]
     line: Line
     error_m: float
-    few: Poses | None
+    few: Poses | None = None
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
         return _BYTES + 49 * len(self.line)
+
+    def trajectory(
+        self, max_waypoints: int = MAX_WAYPOINTS, tolerance_m: float = TOLERANCE_M
+    ) -> Trajectory:
+        """Returns the measurements, and the path drawn with so many waypoints at most.
+
+        It is not drawn at all for 0; else with 2 at least, within `tolerance_m` (m) where these are
+        enough.
+        """
+        distance_m, duration_s = self.totals.distance_m, self.totals.duration_s
+        avg_speed = distance_m / duration_s if duration_s > 0 else 0.0
+        # Drivers without a twist leave it zero, which is wrong where the robot moved.
+        stated = self.twist if self.twist or not distance_m else None
+        step_mps = self.step_mps if self.poses <= SPEED_STEPS else 0.0
+        measured = self.totals.speed_mps or step_mps
+        waypoints: tuple[Waypoint, ...] = ()
+        error_m = 0.0
+        if max_waypoints and len(self.line):
+            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m, tolerance_m)
+        return Trajectory(
+            self.totals,
+            avg_speed,
+            max(measured, avg_speed) if stated is None else stated,
+            "positions" if stated is None else "twist",
+            waypoints,
+            error_m,
+            self.poses,
+            self.invalid,
+        )
 
 
 def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_M) -> PathSlice:
@@ -270,92 +299,34 @@ NO_LINE: Final = Line(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Way:
-    """The path of a window.
-
-    Attributes:
-        first: log time (ns) of the first pose, valid or not.
-        last: of the last one.
-        poses: how many valid poses.
-        invalid: how many others.
-        totals: what was driven.
-        frames: the frames of all poses, in order of appearance.
-        line: the drawn path; its metres add up to what was driven.
-        error_m: no valid pose is farther than this from it.
-        twist: the highest speed (m/s) that a message states; None where none states one.
-        step_mps: see `odometry.Motion`.
-    """
-
-    first: Ns
-    last: Ns
-    poses: int
-    invalid: int
-    totals: MotionTotals
-    frames: tuple[str, ...]
-    line: Line
-    error_m: float
-    twist: float | None
-    step_mps: float
-
-    @classmethod
-    def of(cls, slices: Sequence[PathSlice], fastest_mps: float) -> Way:
-        """Joins slices in order, of which there is one at least."""
-        slices = [*_together(slices, fastest_mps)]
-        motion = Motion(fastest_mps)
-        lines: list[Line] = []
-        for some in slices:
-            jumped = motion.join(some.totals)
-            # What joining adds to the slice's own length is driven up to its first vertex.
-            metres = some.line.metres + (motion.totals.distance_m - some.totals.distance_m)
-            jumps = some.line.jumps.copy()
-            jumps[:1] |= jumped
-            lines.append(replace(some.line, metres=metres, jumps=jumps))
-        line = joined_lines(lines)
-        # Where two places turn out to be one, joining takes some metres back.
-        metres = np.maximum.accumulate(np.minimum(line.metres, motion.totals.distance_m))
-        twists = [some.twist for some in slices if some.twist is not None]
-        return cls(
-            slices[0].first,
-            slices[-1].last,
-            sum(each.poses for each in slices),
-            sum(each.invalid for each in slices),
-            motion.totals,
-            tuple(dict.fromkeys(frame for each in slices for frame in each.frames)),
-            replace(line, metres=metres),
-            max(each.error_m for each in slices),
-            max(twists, default=None),
-            max(each.step_mps for each in slices),
-        )
-
-    def trajectory(
-        self, max_waypoints: int = MAX_WAYPOINTS, tolerance_m: float = TOLERANCE_M
-    ) -> Trajectory:
-        """Returns the measurements, and the path drawn with so many waypoints at most.
-
-        It is not drawn at all for 0; else with 2 at least, within `tolerance_m` (m) where these are
-        enough.
-        """
-        distance_m, duration_s = self.totals.distance_m, self.totals.duration_s
-        avg_speed = distance_m / duration_s if duration_s > 0 else 0.0
-        # Drivers without a twist leave it zero, which is wrong where the robot moved.
-        stated = self.twist if self.twist or not distance_m else None
-        step_mps = self.step_mps if self.poses <= SPEED_STEPS else 0.0
-        measured = self.totals.speed_mps or step_mps
-        waypoints: tuple[Waypoint, ...] = ()
-        error_m = 0.0
-        if max_waypoints and len(self.line):
-            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m, tolerance_m)
-        return Trajectory(
-            self.totals,
-            avg_speed,
-            max(measured, avg_speed) if stated is None else stated,
-            "positions" if stated is None else "twist",
-            waypoints,
-            error_m,
-            self.poses,
-            self.invalid,
-        )
+def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
+    """Joins slices in order, of which there is one at least; see `path_slice`."""
+    slices = [*_together(slices, fastest_mps)]
+    motion = Motion(fastest_mps)
+    lines: list[Line] = []
+    for some in slices:
+        jumped = motion.join(some.totals)
+        # What joining adds to the slice's own length is driven up to its first vertex.
+        metres = some.line.metres + (motion.totals.distance_m - some.totals.distance_m)
+        jumps = some.line.jumps.copy()
+        jumps[:1] |= jumped
+        lines.append(replace(some.line, metres=metres, jumps=jumps))
+    line = joined_lines(lines)
+    # Where two places turn out to be one, joining takes some metres back.
+    metres = np.maximum.accumulate(np.minimum(line.metres, motion.totals.distance_m))
+    twists = [some.twist for some in slices if some.twist is not None]
+    return PathSlice(
+        slices[0].first,
+        slices[-1].last,
+        sum(some.poses for some in slices),
+        sum(some.invalid for some in slices),
+        motion.totals,
+        max(some.step_mps for some in slices),
+        max(twists, default=None),
+        tuple(dict.fromkeys(frame for some in slices for frame in some.frames)),
+        replace(line, metres=metres),
+        max(some.error_m for some in slices),
+    )
 
 
 def drawn(
