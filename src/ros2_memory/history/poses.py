@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.fragments import Fragments, Sized
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.robots import Beside
     from ros2_memory.history.view import View
 
 
@@ -94,17 +95,18 @@ def pose_rows(
     stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
     among: Callable[[Path], bool] = lambda _: True,
+    beside: Sequence[Beside] = (),
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 
     Positions are rounded to 0.1 mm, as the store has them. Why messages cannot be decoded is added
     to `failures` as poses are read. `stored` and `reached` are as for `scan`; `among`: which
-    recordings count.
+    recordings count. Where recordings are `beside` each other, the poses are those of the first.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    reader = PoseReader(view, failures)
+    reader = PoseReader(view, failures, beside)
     together: list[Rows] = []
     for rows in scan(
         view, topic, window, newest_first=newest_first, stored=stored, reached=reached
@@ -231,11 +233,15 @@ class PoseReader:
     Args:
         view: of the memory.
         failures: why messages cannot be decoded is added to it.
+        beside: recordings that have poses at the same time; those of the other one do not count.
     """
 
-    def __init__(self, view: View, failures: list[UndecodableError]) -> None:
+    def __init__(
+        self, view: View, failures: list[UndecodableError], beside: Sequence[Beside] = ()
+    ) -> None:
         self._view = view
         self._failures = failures
+        self._beside = beside
         self._columns = PoseColumns(view.memory.extractor)
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
@@ -243,7 +249,8 @@ class PoseReader:
         span = min(each.first for each in rows), max(each.last for each in rows)
         known = [each.part for each in rows]
         numbers = tuple(part for part in known if part is not None)
-        parts = numbers if len(numbers) == len(known) else None
+        is_whole = len(numbers) == len(known) and not any(map(self._left_out, rows))
+        parts = numbers if is_whole else None
         ordered = sorted(rows, key=lambda each: (each.first, each.last, str(each.recording)))
         return PoseRows(span, partial(self._joined, ordered), parts, self._trouble)
 
@@ -251,7 +258,22 @@ class PoseReader:
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        return joined_poses([self.poses(each) for each in rows])
+        return joined_poses([self._counting(each) for each in rows])
+
+    def _counting(self, rows: Rows) -> Poses:
+        poses = self.poses(rows)
+        for span in self._left_out(rows):
+            outside = (poses.times < span.start) | (poses.times >= span.stop)
+            poses = poses.rows(np.flatnonzero(outside))
+        return poses
+
+    def _left_out(self, rows: Rows) -> list[TimeWindow]:
+        """Returns when poses of some rows do not count."""
+        return [
+            each.span
+            for each in self._beside
+            if each.other == rows.recording and each.span.overlaps(rows.first, rows.last)
+        ]
 
     def poses(self, rows: Rows) -> Poses:
         """Returns the poses of rows, in order of log time.

@@ -7,6 +7,7 @@ parent here and another one there.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from itertools import combinations, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -18,10 +19,12 @@ from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
+from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import copy_key
 from ros2_memory.history.merged_stream import bag_span_of
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import View
+from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
     Overlapping,
     overlapping_recordings,
@@ -110,15 +113,18 @@ class Contradiction(NamedTuple):
 def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     """Returns the recordings that overlap in time, with a topic on which they differ.
 
-    Overlaps are known from the index. A few messages are read once of each of the first pairs.
+    Overlaps are known from the index; those that a clock made, which was set back while one of the
+    recordings ran, show no second robot. A few messages are read once of each of the first pairs.
     """
     view = View(memory, call)  # notes on what is read here are of no answer
     known = _APART.setdefault(memory.index, {})
     found: list[Mixed] = []
     bags: Mapping[str, Sequence[BagFile]] | None = None
+    steps = _steps_back(view)
     for pair in overlapping_recordings(view.snapshot):
         key = (pair.first, pair.second)
-        if key not in known and len(found) < _MAX_PAIRS:
+        by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])
+        if key not in known and not by_clock and len(found) < _MAX_PAIRS:
             bags = bags or recordings_of(view.snapshot)
             try:
                 known[key] = _differing_topic(view, pair, bags)
@@ -248,13 +254,38 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     return parents
 
 
+class Beside(NamedTuple):
+    """Two recordings with messages of their own on a topic at the same time.
+
+    Attributes:
+        first: the one that holds the topic first.
+        other: the other one.
+        span: when both hold the topic.
+        by_clock: whether that is as where a clock was set back between two recordings: it is the
+            end of the first and the begin of the other, and less than half of each; or no longer
+            than the clock was set back while one of them ran.
+    """
+
+    first: Path
+    other: Path
+    span: TimeWindow
+    by_clock: bool
+
+
 def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     """Checks that a path by this topic is that of one robot: else it jumps between several.
+
+    A note says where recordings overlap as after a clock was set back, and of which the path is
+    there.
 
     Raises:
         NoDataError: recordings hold messages of their own on the topic at the same time.
     """
-    names = _recordings_apart(view, topic, window)
+    found = recordings_beside(view, topic, window)
+    names = _names([each for each in found if not each.by_clock])
+    # Transforms are of all recordings at once, so a path by them is not that of one there.
+    if topic in view.memory.limits.tf_topics or view.memory.shipped is not None:
+        names = _names(found)
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
@@ -262,11 +293,18 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
             "a time with one of them, or set data.recording to one",
         )
+    for first, other, span, _ in found:
+        start, stop = unix_text(span.start), unix_text(span.stop - 1)
+        view.notes.add(
+            f"{first.name} and {other.name} have different messages on {topic} from {start} to "
+            f"{stop}, as after a clock was set back, or from two robots: the path there is that "
+            f"of {first.name}"
+        )
 
 
 def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     """Notes the recordings that hold messages of their own on a topic at the same time."""
-    names = _recordings_apart(view, topic, window)
+    names = _names(recordings_beside(view, topic, window))
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
@@ -274,7 +312,11 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
         )
 
 
-def _recordings_apart(view: View, topic: str, window: TimeWindow) -> list[str]:
+def _names(found: Sequence[Beside]) -> list[str]:
+    return sorted({path.name for each in found for path in (each.first, each.other)})
+
+
+def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside]:
     """Returns the recordings that hold messages of their own on a topic at the same time.
 
     None for latched topics, which each recording receives again, or where the time for the answer
@@ -282,18 +324,23 @@ def _recordings_apart(view: View, topic: str, window: TimeWindow) -> list[str]:
     """
     if topic in view.snapshot.timeline.transient_local:
         return []
+    found: list[Beside] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
     try:
-        for pair, both in _overlapping_pairs(view, topic, window):
-            if not apart.issuperset(pair) and _differ(view, topic, pair, both):
-                apart.update(pair)
+        for each in _overlapping_pairs(view, topic, window):
+            pair = each.first, each.other
+            # Of several robots in a folder there may be thousands of pairs.
+            is_known = not each.by_clock and apart.issuperset(pair)
+            if not is_known and _differ(view, topic, pair, each.span.intersect(window)):
+                found.append(each)
+                apart.update(() if each.by_clock else pair)
     except QueryTimeoutError:
         return []
     finally:
         # The answer itself needed nothing of what was read here.
         view.notes.retract_before(MAX_NS, noted_before)
-    return sorted(each.name for each in apart)
+    return found
 
 
 def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> None:
@@ -311,19 +358,30 @@ def note_robots_near(view: View, found: StoredMessage) -> None:
             note_robots(view, topic, TimeWindow.around(found.time, _SLOW_NS))
 
 
-def _overlapping_pairs(
-    view: View, topic: str, window: TimeWindow
-) -> Iterator[tuple[tuple[Path, Path], TimeWindow]]:
-    """Yields pairs of recordings that hold a topic at the same time, and when."""
-    open_spans: list[tuple[Ns, Path]] = []
+def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[Beside]:
+    """Yields pairs of recordings that hold a topic at the same time in a window."""
+    open_spans: list[tuple[Ns, Ns, Path]] = []
+    steps = _steps_back(view)
     spans = [(*span, path) for path, span in view.snapshot.timeline.recordings(topic).items()]
     for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
-        open_spans = [each for each in open_spans if each[0] >= first]
-        for until, other in open_spans:
-            start, stop = max(first, window.start), min(last + 1, until + 1, window.stop)
-            if start < stop:
-                yield (path, other), TimeWindow(start, stop)
-        open_spans.append((last, path))
+        open_spans = [each for each in open_spans if each[1] >= first]
+        for since, until, other in open_spans:
+            span = TimeWindow(first, min(last, until) + 1)
+            if window.overlaps(span.start, span.stop - 1):
+                shortest = min(last - first, until - since)
+                is_edge = since < first and until < last and 2 * (until - first) < shortest
+                is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
+                yield Beside(other, path, span, is_edge or is_step)
+        open_spans.append((first, last, path))
+
+
+def _steps_back(view: View) -> Mapping[Path, Ns]:
+    """Returns how far the clock was set back at most while a recording ran; 0 for others."""
+    steps: dict[Path, Ns] = defaultdict(int)
+    for fault in view.snapshot.dating.faults:
+        if fault.kind is FaultyClock.SET_BACK:
+            steps[fault.bag.recording] = max(fault.by, steps[fault.bag.recording])
+    return steps
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:

@@ -15,7 +15,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
-from tests.support.memories import asked, memory_of
+from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -130,6 +130,53 @@ def test_metres_of_both_robots_are_not_counted(tmp_path: Path, by: str) -> None:
     )
     told = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 60, by=by)
     assert told["reason"] == "mixed"
+
+
+def driving(begin: int, stop: int, x: float) -> list[Msg]:
+    """Poses from a second to another, 0.5 m/s along x from a place."""
+    return [odom(T0 + n * NS_PER_S, x + (n - begin) / 2, 0.0) for n in range(begin, stop + 1)]
+
+
+@pytest.mark.parametrize("fills", [False, True])
+def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_recordings(
+    tmp_path: Path, *, fills: bool
+) -> None:
+    write_mcap(tmp_path / "run_0" / "run_0_0.mcap", driving(0, 120, 0.0))
+    # Where the first one ends, by a clock that is set back by 40 s.
+    write_mcap(tmp_path / "run_1" / "run_1_0.mcap", driving(81, 200, 60.5))
+    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    if fills:
+        memory = recalling(memory, tmp_path)
+    window = {"start": begin, "end": begin + 200}
+    told = asked(memory, tmp_path, "trajectory_summary", **window)
+    # Of 60 m and 59.5 m, without the 20 m of the 40 s that are twice: a gap is no way.
+    assert told["distance_m"] == pytest.approx(100.0, abs=0.6)
+    [note] = [each for each in told["notes"] if "run_0 and run_1" in each]
+    assert "as after a clock was set back, or from two robots" in note
+    assert note.endswith("the path there is that of run_0")
+    recapped = asked(memory, tmp_path, "recap", **window)
+    assert recapped["distance_m"] == pytest.approx(told["distance_m"], abs=0.02)
+    by_hour = asked(memory, tmp_path, "trajectory_summary", **window, by="hour")
+    [[*_, metres]] = by_hour["rows"]
+    assert metres == pytest.approx(told["distance_m"], abs=0.02)
+    alone = asked(memory, tmp_path, "trajectory_summary", start=begin + 130, end=begin + 200)
+    assert not [each for each in alone.get("notes", ()) if "run_0" in each]
+
+
+def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
+    tmp_path: Path,
+) -> None:
+    run = tmp_path / "run_1"
+    write_mcap(run / "run_1_0.mcap", driving(0, 100, 0.0))
+    write_mcap(run / "run_1_1.mcap", driving(40, 60, 50.5))
+    # What follows begins before the end of the first split by the same clock.
+    write_mcap(tmp_path / "run_2" / "run_2_0.mcap", driving(61, 200, 61.0))
+    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    assert differing(memory) == [(("run_1", "run_2"), None)]
+    assert warned(memory) == []
+    told = asked(memory, tmp_path, "trajectory_summary", start=begin + 95, end=begin + 200)
+    assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
+    assert any("run_1 and run_2 have different messages" in each for each in told["notes"])
 
 
 def test_two_recorders_of_one_robot_are_not(tmp_path: Path) -> None:
