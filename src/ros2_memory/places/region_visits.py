@@ -57,7 +57,7 @@ class RegionVisits(NamedTuple):
 
     @property
     def duration(self) -> Ns:
-        """How long they were in all."""
+        """How long they were in all, as the track has them."""
         return sum(self.elapsed.between(one.start, one.stop) for one, _ in self.all)
 
 
@@ -162,27 +162,33 @@ def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Regio
 def shown_visits(
     found: RegionVisits, limit: int, where: Where, newest: Ns | None
 ) -> tuple[tuple[Visit, ...], RegionVisits]:
-    """Returns the newest visits for the reply, and all.
+    """Returns the newest visits for the reply, and all without those that turned out to be none.
 
-    Those that are shown begin and end at poses; those without a pose turned out to be none.
     `newest` is the newest pose, if it is recent enough.
     """
     shown: list[Visit] = []
     every = [*found.all]
     while len(shown) < min(limit, len(every)):
-        by_track, track = every[len(shown)]
-        of_track = found._replace(track=track)
-        one = _by_poses(of_track, by_track, where.region)
-        if one is None:
+        visit = _visit_of(found, every[len(shown)], where, newest)
+        if visit is None:
             del every[len(shown)]
         else:
-            every[len(shown)] = one, track
-            shown.append(_visit_of(of_track, one, where, newest))
+            shown.append(visit)
     return tuple(shown), found._replace(all=every)
 
 
-def _visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:
-    """Returns a visit for the reply."""
+def _visit_of(
+    found: RegionVisits, coarse: tuple[Inside, RobotTrack], where: Where, newest: Ns | None
+) -> Visit | None:
+    """Returns a visit for the reply; None where it has no pose.
+
+    Its times are those of poses: of the first and the last one inside, and of the closest.
+    """
+    by_track, track = coarse
+    found = found._replace(track=track)
+    one = _by_poses(found, by_track, where.region)
+    if one is None:
+        return None
     there_still = newest is not None and one.stop >= newest
     distance_m, at = None, None
     if isinstance(where.region, Circle):
