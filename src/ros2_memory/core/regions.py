@@ -63,11 +63,13 @@ class Circle:
         b = px * dx + py * dy
         c = px * px + py * py - self.radius_m * self.radius_m
         moves = a > 0
-        root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+        with np.errstate(over="ignore", invalid="ignore"):  # a radius may be 1e308
+            within = b * b - a * c
+        root = np.sqrt(np.maximum(within, 0.0))
         size = np.where(moves, a, 1.0)
         start = np.where(moves, (-b - root) / size, 0.0)
         stop = np.where(moves, (-b + root) / size, 1.0)
-        meets = np.where(moves, b * b - a * c >= 0, c <= 0)
+        meets = np.where(moves, within >= 0, c <= 0)
         return np.where(meets, start, 2.0), np.where(meets, stop, -1.0)
 
 

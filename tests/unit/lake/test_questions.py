@@ -99,7 +99,11 @@ def test_a_lake_answers_as_the_memories_do(robots: Robots, words: str) -> None:
     tool, given = QUESTIONS[words]
     expected = reply(robots.mounted, tool, given)
     assert "error" not in expected
-    assert reply(robots.lake, tool, given) == expected
+    found = reply(robots.lake, tool, given)
+    for one, other in zip(expected.get("visits", ()), found.get("visits", ()), strict=True):
+        # A lake has the poses of the thinned track alone.
+        assert other.pop("closest_m") == pytest.approx(one.pop("closest_m"), abs=0.08)
+    assert found == expected
 
 
 def test_the_newest_match_of_each_robot_is_the_same(robots: Robots) -> None:
