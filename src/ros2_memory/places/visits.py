@@ -117,6 +117,7 @@ def visits(
         exits=known.exits,
         all_counted=known.is_all,
         where=place.name,
+        reaches_now=known.newest is not None,
         notes=view.notes.sentences(),
     )
 

@@ -301,7 +301,7 @@ class PlaceVisits:
     PLAIN("x").if_known,
     PLAIN("y").if_known,
     PLAIN("radius_m").if_known,
-    PLAIN("there_now").merged("who"),
+    PLAIN("there_now").if_known.merged("who"),
     OBJECTS("visits").along("departed"),
     TOTAL("total", "total", "all_counted").merged("added"),
     PLAIN("entries").if_known.merged("added"),
@@ -323,6 +323,7 @@ class Visits(AnswerWithNotes):
         entries: in how many of them the robot was seen to enter; None where that is not known.
         exits: likewise, to leave.
         places: of every named place, where none was asked for; then there are no visits.
+        reaches_now: whether the window reaches the newest pose.
     """
 
     frame_id: str
@@ -339,10 +340,13 @@ class Visits(AnswerWithNotes):
     all_counted: bool = True
     where: str | None = None
     places: tuple[PlaceVisits, ...] | None = None
+    reaches_now: bool = True
 
     @property
-    def there_now(self) -> bool:
-        """Whether the robot is still there."""
+    def there_now(self) -> bool | None:
+        """Whether the robot is still there; None where the window ends before that is known."""
+        if not self.reaches_now:
+            return None
         return any(visit.departed is None for visit in self.visits)
 
     @property

@@ -153,6 +153,18 @@ def test_a_robot_that_is_there_still_has_not_departed(
     assert "notes" not in shown
 
 
+@pytest.mark.parametrize("x", [10.0, 3.0])
+def test_a_time_that_ends_before_the_newest_pose_does_not_say_where_the_robot_is(
+    tmp_path: Path, x: float
+) -> None:
+    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    answer = visits(memory, Call(), x, 0.0, radius_m=1.0, end_s=BEGIN / S + 40)
+    shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    assert "there_now" not in shown
+    [visit] = shown["visits"]
+    assert visit.get("still_inside", False) is (x == 10.0)
+
+
 def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     """A year ago, or minutes: its newest pose is its last one there, and a note says so."""
     memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
