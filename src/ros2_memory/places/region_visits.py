@@ -23,7 +23,7 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.robot_tracks import RobotTracks, robot_inside
+from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
 from ros2_memory.results import PlaceVisits, Visit
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ _MOST_JOINED: Final = 50
 
 
 class RegionVisits(NamedTuple):
-    """All visits to a region in a window, newest first, and the track that they are of.
+    """All visits to a region that reach into a window, newest first, and the track they are of.
 
     `elapsed`: how much time passed between moments of the window. `is_all`: whether the track
     reaches back to its begin. `tracks`: has the poses themselves.
@@ -92,7 +92,7 @@ def make_tracks(view: View, window: TimeWindow) -> None:
 
 
 def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -> RegionVisits:
-    """Returns the visits to a region in a window.
+    """Returns the visits to a region that reach into a window, not cut at its ends.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
@@ -102,16 +102,15 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
     every = [
         (one, track)
         for track in (joined.track, *joined.others)
-        for one in _joined_visits(tracks, robot_inside(track, where.region, window), where.region)
+        for one in _joined_visits(tracks, times_inside(track, where.region), where.region)
+        if window.overlaps(one.start, one.stop)
     ]
     every.sort(key=lambda visit: visit[0], reverse=True)
     elapsed = elapsed_in(view, window)
-    ends = window.start, window.stop - 1
     every = [
         (one, track)
         for one, track in every
-        if (one.start not in ends and one.stop not in ends)
-        or _has_pose(tracks, one, track, where.region)
+        if one == (cut := one.within(window)) or _has_pose(tracks, cut, track, where.region)
     ]
     return RegionVisits(joined.track, every, elapsed, joined.since is None, tracks)
 
@@ -160,35 +159,33 @@ def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Regio
 
 
 def shown_visits(
-    found: RegionVisits, limit: int, where: Where, newest: Ns | None
+    found: RegionVisits, window: TimeWindow, limit: int, where: Where, newest: Ns | None
 ) -> tuple[tuple[Visit, ...], RegionVisits]:
-    """Returns the newest visits for the reply, and all without those that turned out to be none.
+    """Returns the newest visits in a window for the reply, and all, cut at the window's ends.
 
-    `newest` is the newest pose, if it is recent enough.
+    Not those that turned out to be none. `newest` is the newest pose, if it is recent enough.
     """
     shown: list[Visit] = []
-    every = [*found.all]
-    while len(shown) < min(limit, len(every)):
-        visit = _visit_of(found, every[len(shown)], where, newest)
-        if visit is None:
-            del every[len(shown)]
-        else:
-            shown.append(visit)
+    every: list[tuple[Inside, RobotTrack]] = []
+    for by_track, track in found.all:
+        if len(shown) == limit:
+            every.append((by_track.within(window), track))
+            continue
+        of_track = found._replace(track=track)
+        one = _by_poses(of_track, by_track, where.region)
+        if one is not None and window.overlaps(one.start, one.stop):
+            cut = one.within(window)
+            lasted = by_track.within(window)
+            every.append((lasted._replace(entered=cut.entered, left=cut.left), track))
+            shown.append(_visit_of(of_track, cut, where, newest))
     return tuple(shown), found._replace(all=every)
 
 
-def _visit_of(
-    found: RegionVisits, coarse: tuple[Inside, RobotTrack], where: Where, newest: Ns | None
-) -> Visit | None:
-    """Returns a visit for the reply; None where it has no pose.
+def _visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:
+    """Returns a visit for the reply.
 
     Its times are those of poses: of the first and the last one inside, and of the closest.
     """
-    by_track, track = coarse
-    found = found._replace(track=track)
-    one = _by_poses(found, by_track, where.region)
-    if one is None:
-        return None
     there_still = newest is not None and one.stop >= newest
     distance_m, at = None, None
     if isinstance(where.region, Circle):

@@ -76,6 +76,15 @@ class Inside(NamedTuple):
     entered: bool
     left: bool
 
+    def within(self, window: TimeWindow) -> Inside:
+        """Returns the part of it in a window that it reaches into."""
+        return Inside(
+            max(self.start, window.start),
+            min(self.stop, window.stop - 1),
+            entered=self.entered and self.start >= window.start,
+            left=self.left and self.stop < window.stop,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class JoinedTrack:
@@ -511,6 +520,15 @@ def _without_jumps(parts: Parts, every: Mask) -> Parts:
 
 
 def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:
+    """Returns when the robot was inside of a region in a window, in order; see `times_inside`."""
+    return [
+        each.within(window)
+        for each in times_inside(track, region)
+        if window.overlaps(each.start, each.stop)
+    ]
+
+
+def times_inside(track: RobotTrack, region: Region) -> list[Inside]:
     """Returns when the robot was inside of a region, in order, by its track.
 
     A robot that was outside for less than `FLICKER_NS` did not leave. What it did in a silence
@@ -549,17 +567,7 @@ def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[
         piece_stops[piece[last] - 1].tolist(),
         strict=True,
     )
-    inside = [
+    return [
         Inside(start, stop, entered=start > opened, left=stop < closed)
         for start, stop, opened, closed in rows
-    ]
-    return [
-        each._replace(
-            start=max(each.start, window.start),
-            stop=min(each.stop, window.stop - 1),
-            entered=each.entered and each.start >= window.start,
-            left=each.left and each.stop < window.stop,
-        )
-        for each in inside
-        if each.start < window.stop and each.stop >= window.start
     ]

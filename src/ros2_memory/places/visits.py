@@ -172,7 +172,7 @@ def _by_track(
     found = region_visits(view, frame_id, place, window)
     newest = _newest(view, topic, found.track, window)
     current = newest if _is_current(view, newest, now) else None
-    shown, found = shown_visits(found, limit, place, current)
+    shown, found = shown_visits(found, window, limit, place, current)
     entries, exits = sum(one.entered for one, _ in found.all), sum(one.left for one, _ in found.all)
     return _Known(
         shown, len(found.all), found.duration, newest, entries, exits, is_all=found.is_all
