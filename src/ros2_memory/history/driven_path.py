@@ -39,7 +39,7 @@ from ros2_memory.history.no_data import (
     with_notes,
 )
 from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, poses_of_bag, slices_back
-from ros2_memory.history.robots import recordings_beside
+from ros2_memory.history.robots import beside_path
 from ros2_memory.history.transforms import (
     edges,
     graph_of,
@@ -216,14 +216,14 @@ def blocks_back(
     """Yields the poses of the robot's path in a window, the newest first; see `pose_rows`.
 
     Of a topic of transforms they are those of the robot's body. Where two recordings have poses of
-    their own, they are those of the one that has them first.
+    their own, or one has a time twice, they are those that come first.
     """
     if topic in view.memory.limits.tf_topics:
         poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
         if len(poses):
             yield PoseRows((int(poses.times[0]), int(poses.times[-1])), lambda: poses)
         return
-    beside = recordings_beside(view, topic, window)
+    beside = beside_path(view, topic, window)
     yield from pose_rows(
         view, topic, window, failures, newest_first=True, reached=reached, beside=beside
     )

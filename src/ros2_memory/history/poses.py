@@ -258,19 +258,25 @@ class PoseReader:
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        return joined_poses([self._counting(each) for each in rows])
+        counting = [self._counting(each) for each in rows]
+        return joined_poses([self.poses(each) for each in counting if len(each)])
 
-    def _counting(self, rows: Rows) -> Poses:
-        poses = self.poses(rows)
-        for span in self._left_out(rows):
-            outside = (poses.times < span.start) | (poses.times >= span.stop)
-            poses = poses.rows(np.flatnonzero(outside))
-        return poses
+    def _counting(self, rows: Rows) -> Rows:
+        """Returns the rows that others do not have the time of."""
+        for beside in self._left_out(rows):
+            out = (rows.times >= beside.span.start) & (rows.times < beside.span.stop)
+            if beside.bags:
+                own = [where for bag, where in rows.bag_rows() if bag.file in beside.bags]
+                of = np.zeros(len(rows), np.bool_)
+                of[np.concatenate([np.empty(0, np.int64), *own])] = True
+                out &= of
+            rows = rows.some(np.flatnonzero(~out))
+        return rows
 
-    def _left_out(self, rows: Rows) -> list[TimeWindow]:
-        """Returns when poses of some rows do not count."""
+    def _left_out(self, rows: Rows) -> list[Beside]:
+        """Returns what has the time of some of these rows first."""
         return [
-            each.span
+            each
             for each in self._beside
             if each.other == rows.recording and each.span.overlaps(rows.first, rows.last)
         ]

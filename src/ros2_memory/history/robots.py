@@ -30,6 +30,7 @@ from ros2_memory.index.recordings import (
     overlapping_recordings,
     recordings_of,
 )
+from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -257,6 +258,8 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
 class Beside(NamedTuple):
     """Two recordings with messages of their own on a topic at the same time.
 
+    Or one, with itself, in which the clock was set back.
+
     Attributes:
         first: the one that holds the topic first.
         other: the other one.
@@ -270,6 +273,8 @@ class Beside(NamedTuple):
     other: Path
     span: TimeWindow
     by_clock: bool
+    bags: frozenset[str] = frozenset()
+    """Of the other one, the files of which messages are beside those of the first; none: all."""
 
 
 def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
@@ -293,12 +298,18 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
             "a time with one of them, or set data.recording to one",
         )
-    for first, other, span, _ in found:
-        start, stop = unix_text(span.start), unix_text(span.stop - 1)
+    for each in found:
+        start, stop = unix_text(each.span.start), unix_text(each.span.stop - 1)
         view.notes.add(
-            f"{first.name} and {other.name} have different messages on {topic} from {start} to "
-            f"{stop}, as after a clock was set back, or from two robots: the path there is that "
-            f"of {first.name}"
+            f"{each.first.name} and {each.other.name} have different messages on {topic} from "
+            f"{start} to {stop}, as after a clock was set back, or from two robots: the path there "
+            f"is that of {each.first.name}"
+        )
+    for each in _beside_themselves(view, window):
+        start, stop = unix_text(each.span.start), unix_text(each.span.stop - 1)
+        view.notes.add(
+            f"{each.first.name} has the time from {start} to {stop} twice, as the clock was set "
+            "back meanwhile: the path there is that from before"
         )
 
 
@@ -314,6 +325,11 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
 
 def _names(found: Sequence[Beside]) -> list[str]:
     return sorted({path.name for each in found for path in (each.first, each.other)})
+
+
+def beside_path(view: View, topic: str, window: TimeWindow) -> list[Beside]:
+    """Returns all that would make a path by a topic go to and fro between two times of a robot."""
+    return [*recordings_beside(view, topic, window), *_beside_themselves(view, window)]
 
 
 def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside]:
@@ -373,6 +389,24 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[B
                 is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
                 yield Beside(other, path, span, is_edge or is_step)
         open_spans.append((first, last, path))
+
+
+def _beside_themselves(view: View, window: TimeWindow) -> Iterator[Beside]:
+    """Yields recordings in which the clock was set back, with the bags from after that."""
+    for fault in view.snapshot.dating.faults:
+        after = split_of(fault.bag.file)
+        if fault.kind is not FaultyClock.SET_BACK or fault.before is None or after is None:
+            continue
+        series, number = after
+        twice = TimeWindow(fault.bag.start, fault.before.end + 1)
+        splits = [(split_of(bag.file), bag) for bag in view.snapshot.timeline.overlapping(twice)]
+        own = [(split[1], bag) for split, bag in splits if split is not None and split[0] == series]
+        begin = min((bag.start for nth, bag in own if nth < number), default=twice.stop)
+        span = TimeWindow(min(max(begin, twice.start), twice.stop), twice.stop)
+        bags = frozenset(bag.file for nth, bag in own if nth >= number)
+        if span.start < span.stop and window.overlaps(span.start, span.stop - 1) and bags:
+            recording = fault.bag.recording
+            yield Beside(recording, recording, span, by_clock=True, bags=bags)
 
 
 def _steps_back(view: View) -> Mapping[Path, Ns]:

@@ -177,6 +177,12 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     told = asked(memory, tmp_path, "trajectory_summary", start=begin + 95, end=begin + 200)
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
     assert any("run_1 and run_2 have different messages" in each for each in told["notes"])
+    # What lies in a time that the recording had before is left out, and nothing is a jump back.
+    for known in (memory, recalling(memory, tmp_path)):
+        whole = asked(known, tmp_path, "trajectory_summary", start=begin, end=begin + 200)
+        assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
+        assert any("run_1 has the time from" in each for each in whole["notes"])
+        assert len(whole["waypoints"]) == 4
 
 
 def test_two_recorders_of_one_robot_are_not(tmp_path: Path) -> None:

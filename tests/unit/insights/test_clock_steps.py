@@ -258,8 +258,9 @@ def test_a_step_back_is_named_and_changes_no_duration(tmp_path: Path) -> None:
     memory = recorded(tmp_path, shown=lambda t: t - 30.0 * (t >= 100))
     reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 160)
     assert reply["duration_s"] == 160.0
-    [note] = [each for each in reply["notes"] if "set back" in each]
+    [note, of_path] = [each for each in reply["notes"] if "set back" in each]
     assert note.startswith("the clock was set back by 29.9 s or more at ")
+    assert of_path.endswith("the path there is that from before")
 
 
 def test_trust_sums_up_the_steps_of_the_clock(tmp_path: Path) -> None:
