@@ -554,7 +554,7 @@ def build_digester(memory: Memory) -> Digester:
     """Returns what digests the bags of a memory."""
     from ros2_memory.catalogue.digest import Digester
 
-    return Digester(memory.reader, memory.extractor)
+    return Digester(memory.reader)
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:

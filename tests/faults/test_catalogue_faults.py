@@ -279,9 +279,9 @@ def test_what_could_not_be_asked_once_is_asked_again(tmp_path: Path) -> None:
     notes = recall.digests_for(run, as_of)
     assert notes.whole
     base._opened = replace(opened, connection=Busy(":memory:"))
-    assert notes.edges("/tf_static") == {}
+    assert notes.relatched("/tf_static") == {}
     base._opened = opened
-    assert len(notes.edges("/tf_static")) == 12
+    assert len(notes.relatched("/tf_static")) == 12
 
 
 async def test_bags_that_cannot_be_digested_have_the_helper_started_no_second_time(
@@ -289,7 +289,7 @@ async def test_bags_that_cannot_be_digested_have_the_helper_started_no_second_ti
 ) -> None:
     write_bags(tmp_path, BACKLOG + 1)
     memory, _ = served(tmp_path)
-    filler = Counted(memory, Refusing(memory.reader, memory.extractor), tmp_path)
+    filler = Counted(memory, Refusing(memory.reader), tmp_path)
     started = tmp_path / "started"
     helper = ["sh", "-c", f"echo once >> {started}"]
     async with anyio.create_task_group() as tasks:
@@ -313,7 +313,7 @@ def test_a_bag_that_could_not_be_digested_is_tried_again_later(tmp_path: Path) -
     memory, _ = served(tmp_path)
     clock = SettableClock(NOW.now())
     memory = replace(memory, clock=clock)
-    refusing = Backfill(memory, Refusing(memory.reader, memory.extractor), tmp_path)
+    refusing = Backfill(memory, Refusing(memory.reader), tmp_path)
     fill_up(refusing)
     assert refusing.progress() == Progress(2, 0, 2)
     clock.at += RETRY_NS

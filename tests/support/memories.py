@@ -102,7 +102,7 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     """The memory with a catalogue and a store of the first `part` of the closed bags."""
     catalogue = Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test"))
     recall = DigestCache(catalogue, bag_dir)
-    digester = Digester(memory.reader, memory.extractor)
+    digester = Digester(memory.reader)
     bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)
     for bag in bags[: round(part * len(bags))]:
         with suppress(BagError):  # one that is damaged inside stays without an entry

@@ -7,10 +7,9 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar
 
 from ros2_memory.analysis.payload_templates import json_template_for, template_for
 from ros2_memory.core.errors import UndecodableError
@@ -123,41 +122,6 @@ class BulkDecoder(Generic[T, P]):
         among = records if is_whole else [records[at] for at in matched]
         found.update(zip(matched, self._apply(template, decoded, among, rows), strict=True))
         return deque() if len(matched) == len(rest) else deque(at for at in rest if at not in found)
-
-
-class MotionSample(NamedTuple):
-    """The pose of one message and the speed that it states; None where it has none."""
-
-    pose: Pose | None
-    speed_mps: float | None
-
-
-MotionDecoder: TypeAlias = "BulkDecoder[MotionSample, PayloadTemplate]"
-
-
-def motion_decoder(reader: BagReader, extractor: SchemaExtractor) -> MotionDecoder:
-    """Returns a decoder of poses and speeds of one topic, equal to the extractor's one by one."""
-
-    def decode(record: Record) -> MotionSample:
-        return motion_sample(extractor, reader.decode(record), record.channel.type)
-
-    def template(record: Record, _: MotionSample) -> PayloadTemplate | None:
-        return template_for(reader, extractor, record)
-
-    return BulkDecoder(decode, template, _motion_samples)
-
-
-def motion_sample(extractor: SchemaExtractor, message: object, type_name: str) -> MotionSample:
-    """Returns the pose and speed of a decoded message."""
-    twist = extractor.twist(message, type_name)
-    speed_mps = None if twist is None else math.hypot(*twist.linear)
-    return MotionSample(extractor.pose(message, type_name), speed_mps)
-
-
-def _motion_samples(
-    template: PayloadTemplate, _: MotionSample, _records: Sequence[Record], rows: Bytes
-) -> Iterable[MotionSample]:
-    return map(MotionSample, template.poses(rows), template.speeds(rows))
 
 
 class JsonRow(NamedTuple):

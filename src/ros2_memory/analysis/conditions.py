@@ -264,16 +264,6 @@ class Condition:
         )
 
     @property
-    def is_on_texts_alone(self) -> bool:
-        """Whether a value matches if one of its texts does, and not otherwise."""
-        test = self.test
-        if self.field is not None or self.min_score > 0:
-            return False
-        if isinstance(test, Contains):
-            return test.is_on_texts
-        return isinstance(test, Equals) and test.is_on_texts
-
-    @property
     def place(self) -> NearPosition | None:
         """The test, if it is `near_position` without a field, where boxes alone decide."""
         return self.test if self.field is None and isinstance(self.test, NearPosition) else None

@@ -19,7 +19,7 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import positions
 from ros2_memory.core.model import Pose
-from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.messages.conversions import ANGLES, unit
 from ros2_memory.messages.detections import depends_on_numbers
 from ros2_memory.messages.json_template import Marks
@@ -27,7 +27,7 @@ from ros2_memory.messages.json_template import Marks
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue, Quaternion, StampedTransform, Vector3
+    from ros2_memory.core.model import JsonValue, Quaternion, Vector3
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.messages.json_template import JsonTemplate
     from ros2_memory.storage.base import BagReader, CdrLayout, Record, Schema
@@ -58,16 +58,6 @@ class PointOffsets(NamedTuple):
     z: int | None
 
 
-class TransformOffsets(NamedTuple):
-    """The frames of a transform, and the offsets of its numbers in the payload."""
-
-    parent: str
-    child: str
-    stamp: int
-    numbers: tuple[int, ...]
-    """Of x, y, z of the translation and of x, y, z, w of the rotation."""
-
-
 @dataclass(frozen=True, slots=True)
 class PayloadTemplate:
     """What is common to all payloads of a template, and where the numbers are.
@@ -85,9 +75,6 @@ class PayloadTemplate:
         position: of the pose that the message carries; None without one.
         orientation: the offset of that pose's quaternion (x, y, z, w in a row); None without one.
         frame_id: of that pose.
-        velocity: the linear velocity that it states; None without one.
-        pairs: the frames of all transforms, valid or not.
-        transforms: all of them, in order.
     """
 
     type_name: str
@@ -102,9 +89,6 @@ class PayloadTemplate:
     position: PointOffsets | None
     orientation: int | None
     frame_id: str
-    velocity: PointOffsets | None
-    pairs: frozenset[tuple[str, str]]
-    transforms: tuple[TransformOffsets, ...] = ()
 
     def matching(
         self, first: Record, records: Sequence[Record], among: Sequence[int]
@@ -137,12 +121,6 @@ class PayloadTemplate:
             Pose(point, rotation, self.frame_id)
             for point, rotation in zip(points, rotations, strict=True)
         )
-
-    def speeds(self, rows: Bytes) -> list[float | None]:
-        """Returns the linear speed (m/s) that each row states."""
-        if self.velocity is None:
-            return [None] * len(rows)
-        return [math.hypot(*each) for each in self.coordinates(rows, self.velocity)]
 
     def coordinates(self, rows: Bytes, point: PointOffsets) -> list[Vector3]:
         """Returns one point of each row; NaN for a coordinate that is missing."""
@@ -227,8 +205,6 @@ class _Marked:
         self.message = message = reader.decode(record._replace(payload=bytes(payload)))
         self.value = extractor.exact(message, type_name)
         self.pose = extractor.pose(message, type_name)
-        self.twist = extractor.twist(message, type_name)
-        self.transforms = extractor.transforms(message, record.log_time, static=False)
 
     def orientation(self) -> int | None:
         """Returns the offset of the pose's quaternion; None where it has no orientation."""
@@ -243,19 +219,6 @@ class _Marked:
             if unit((x, y, z, w)) == rotation:
                 return offset
         raise _NoTemplateError
-
-    def transform_offsets(self) -> tuple[TransformOffsets, ...]:
-        """Returns where the numbers of all transforms are."""
-        return tuple(map(self._transform_offsets, self.transforms))
-
-    def _transform_offsets(self, each: StampedTransform) -> TransformOffsets:
-        x, y, z = (self.offset_of.get(part, -1) for part in each.transform.translation)
-        turn = self._offset_of_rotation(each.transform.rotation)
-        stamp = self.time_of.get(unix_from_ns(each.stamp), -1)
-        if -1 in {x, y, z, stamp}:
-            raise _NoTemplateError
-        numbers = (x, y, z, *(turn + 8 * part for part in range(4)))
-        return TransformOffsets(each.parent, each.child, stamp, numbers)
 
     def offsets(self, point: Vector3) -> PointOffsets:
         """Returns the offsets of a point of the value."""
@@ -380,9 +343,6 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
     points, orientation = one.points(), one.orientation()
     if points != other.points() or orientation != other.orientation():
         raise _NoTemplateError
-    transforms = one.transform_offsets()
-    if transforms != other.transform_offsets():
-        raise _NoTemplateError
     return PayloadTemplate(
         type_name=type_name,
         fixed=_fixed(layout),
@@ -396,9 +356,6 @@ def _template(type_name: str, layout: CdrLayout, one: _Marked, other: _Marked) -
         position=None if one.pose is None else one.offsets(one.pose.position),
         orientation=orientation,
         frame_id="" if one.pose is None else one.pose.frame_id,
-        velocity=None if one.twist is None else one.offsets(one.twist.linear),
-        pairs=frozenset((each.parent, each.child) for each in one.transforms),
-        transforms=transforms,
     )
 
 

@@ -20,17 +20,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue.store import Catalogue
-    from ros2_memory.catalogue.topic_digest import EdgeDigest
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.segment import Segment
-    from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
 
-_MOST_MESSAGES: Final = 65_536
-"""24 MB: those of a week of 10 s splits that each repeat one, or of a log's nine hours."""
-_SEGMENT_COSTS: Final = 256
-"""A segment counts as so many messages besides its own."""
 _MAX_DERIVED: Final = 8192
 """What is computed of segments and stays in memory: a recap of a week of 10 s splits has 4,000."""
 _UNKNOWN_STATE: Final = -1
@@ -71,11 +65,7 @@ class SegmentDigests:
             for topic in segment.spans
             for bags in (segment.bags_with(topic),)
         }
-        self._edges: dict[str, dict[int, EdgeDigest]] = {}
-        self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._relatched: dict[str, dict[int, bool]] = {}
-        self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
-        self._held = 0
         self._derived: dict[str, object] = {}
 
     @property
@@ -93,22 +83,6 @@ class SegmentDigests:
         known = self.catalogue.words(topic, numbers)
         return {number: known.get(number) for number in numbers}
 
-    def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
-        """Returns the frame edges, for each entry that has them."""
-        return self._cached(
-            self._edges, topic, lambda: self.catalogue.edges(topic, self._entries_with(topic))
-        )
-
-    def pairs(self, topic: str) -> frozenset[tuple[str, str]] | None:
-        """Returns the frame pairs of all bags; None where those of some are not known."""
-        return self._cached(self._pairs, topic, lambda: self._all_pairs(topic))
-
-    def _all_pairs(self, topic: str) -> frozenset[tuple[str, str]] | None:
-        edges = self.edges(topic)
-        if not self.whole or len(edges) < len(self._entries_with(topic)):
-            return None
-        return frozenset(pair for edge in edges.values() for pair in edge.pairs)
-
     def relatched(self, topic: str) -> Mapping[int, bool]:
         """Returns, for each entry that has the topic, whether it may repeat another recording's."""
         return self._cached(
@@ -116,23 +90,6 @@ class SegmentDigests:
             topic,
             lambda: self.catalogue.relatched(topic, self._entries_with(topic)),
         )
-
-    def messages(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
-        """Returns all messages of the topic, for each entry that stores them.
-
-        They are many, so they are cached for the segments that were asked for last.
-        """
-        found = self._messages.get(topic)
-        if found is None:
-            found = self._cached(
-                self._messages,
-                topic,
-                lambda: self.catalogue.messages(topic, self._entries_with(topic)),
-            )
-            held = [*self._messages.values()]
-            self._held = sum(len(each) for by_entry in held for each in by_entry.values())
-        self._cache.touch(self, self._held)
-        return found
 
     def derived(self, name: str, compute: Callable[[], T]) -> T:
         """Returns a value computed once from the entries of this segment, by name.
@@ -162,11 +119,6 @@ class SegmentDigests:
             cache[topic] = value
         return value
 
-    def release_messages(self) -> None:
-        """Drops the cached messages."""
-        self._messages = {}
-        self._held = 0
-
     def release_derived(self, name: str) -> None:
         """Drops what was computed under a name."""
         self._derived.pop(name, None)
@@ -184,22 +136,12 @@ class DigestCache:
     Args:
         catalogue: what has the entries.
         bag_dir: the folder of the bags.
-        most_messages: so many stored messages stay in memory, and those of one segment at least.
     """
 
-    def __init__(
-        self,
-        catalogue: Catalogue,
-        bag_dir: Path,
-        *,
-        most_messages: int = _MOST_MESSAGES,
-    ) -> None:
+    def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
         self.catalogue = catalogue
         self.bag_dir = bag_dir
-        self._most_messages = most_messages
-        self._messages = 0
         self._lock = threading.Lock()
-        self._with_messages: OrderedDict[SegmentDigests, int] = OrderedDict()
         self._derived: OrderedDict[tuple[ref[SegmentDigests], str], None] = OrderedDict()
         self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
@@ -226,17 +168,6 @@ class DigestCache:
         with self._lock:
             known = self._segments.get(segment)
         return known if known is not None and known.is_complete else None
-
-    def touch(self, digests: SegmentDigests, messages: int) -> None:
-        """Marks a segment's messages as used; the least recently used ones are dropped."""
-        cost = messages + _SEGMENT_COSTS
-        with self._lock:
-            self._messages += cost - self._with_messages.pop(digests, 0)
-            self._with_messages[digests] = cost
-            while self._messages > self._most_messages and len(self._with_messages) > 1:
-                oldest, released = self._with_messages.popitem(last=False)
-                self._messages -= released
-                oldest.release_messages()
 
     def mark_derived(self, digests: SegmentDigests, name: str) -> None:
         """Marks what is computed from a segment as used; the least recently used is dropped."""

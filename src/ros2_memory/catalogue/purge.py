@@ -11,25 +11,16 @@ from __future__ import annotations
 import json
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ros2_memory.catalogue.packing import MAX_MODEL_BYTES, packed, unpacked
-from ros2_memory.catalogue.sql import NO_TOPIC, PACKED_IN, TABLES, delete_entries
-from ros2_memory.columns.database import ROW_ID_BITS
+from ros2_memory.catalogue.sql import COUNTS, TABLES, delete_entries
 from ros2_memory.columns.forget import PATIENCE_S, leftovers, rewrite
 from ros2_memory.core.errors import BagError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
-
-_KEYS: Final = {
-    "held": f"id >> {ROW_ID_BITS:d} = ?",
-    "tales": f"id >> {ROW_ID_BITS:d} = ?",
-    "maps": "? = 0",
-    "bags": "shape = ?",
-}
-"""Which rows of a table a model is for, by its topic; of counts that is their schema."""
 
 
 def purge(file: Path, bags: Sequence[str]) -> None:
@@ -68,7 +59,6 @@ def _purge(file: Path, bags: Sequence[str]) -> None:
             )
             delete_entries(base, [row[0] for row in rows.fetchall()])
             base.execute("DELETE FROM remembered")
-            base.execute("DELETE FROM payloads WHERE id NOT IN (SELECT payload FROM kept)")
             for topic, kind, model in base.execute("SELECT * FROM models").fetchall():
                 _renew_model(base, topic, kind, model)
             base.execute("COMMIT")
@@ -80,14 +70,12 @@ def _purge(file: Path, bags: Sequence[str]) -> None:
 
 def _renew_model(base: sqlite3.Connection, topic: int, kind: str, model: bytes) -> None:
     """Replaces a model that no remaining row equals, and compresses the rows against another."""
-    if topic == NO_TOPIC and kind not in PACKED_IN:  # of answers, which were deleted
+    if kind != COUNTS:  # of answers, which were deleted
         base.execute("DELETE FROM models WHERE topic = ? AND kind = ?", (topic, kind))
         return
-    table = PACKED_IN[kind]
-    key = "bag" if table == "maps" else "id"
+    # Of counts, whose topic is their schema.
     rows = base.execute(
-        f"SELECT {key}, {kind} FROM {table} WHERE {_KEYS[table]}"
-        f" AND length({kind}) > 0 ORDER BY {key}",
+        f"SELECT id, {kind} FROM bags WHERE shape = ? AND length({kind}) > 0 ORDER BY id",
         (topic,),
     )
     plain: list[tuple[int, bytes]] = []
@@ -102,6 +90,6 @@ def _renew_model(base: sqlite3.Connection, topic: int, kind: str, model: bytes) 
     new = plain[0][1][:MAX_MODEL_BYTES]
     base.execute("INSERT INTO models VALUES (?, ?, ?)", (topic, kind, new))
     base.executemany(
-        f"UPDATE {table} SET {kind} = ? WHERE {key} = ?",
+        f"UPDATE bags SET {kind} = ? WHERE id = ?",
         [(packed(said, new), number) for number, said in plain],
     )

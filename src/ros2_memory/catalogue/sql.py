@@ -6,7 +6,6 @@ raises what sqlite3 raises.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from typing import TYPE_CHECKING, Final
 
@@ -18,21 +17,15 @@ from ros2_memory.columns.database import ROW_ID_BITS, Tables
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
-    from ros2_memory.catalogue.digest import Digest
-    from ros2_memory.catalogue.topic_digest import TopicDigest
-    from ros2_memory.storage.base import Record
+    from ros2_memory.catalogue.digest import Digest, TopicDigest
 
 TABLES: Final = Tables(
-    version=14,
+    version=15,
     names=(
         "bags",
         "held",
-        "kept",
-        "payloads",
-        "channels",
-        "edges",
         "shapes",
         "models",
         "configs",
@@ -44,40 +37,25 @@ CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config INTEGER NOT NULL
 CREATE TABLE configs (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
 CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
-CREATE TABLE held (id INTEGER PRIMARY KEY, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER,
-  kept INTEGER, relatched INTEGER, undecodable TEXT);
+CREATE TABLE held (id INTEGER PRIMARY KEY, relatched INTEGER, undecodable TEXT);
 CREATE TABLE models (topic INTEGER NOT NULL, kind TEXT NOT NULL, bytes BLOB NOT NULL,
   PRIMARY KEY (topic, kind)) WITHOUT ROWID;
-CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
-CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
-  log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
-  payload INTEGER NOT NULL, PRIMARY KEY (topic, bag, nth)) WITHOUT ROWID;
-CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
-  encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
-  schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
 CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer BLOB NOT NULL)
   WITHOUT ROWID;
-CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
 """,
 )
 """In `held` the high bits of an id (see `ROW_ID_BITS`) are the topic's: its rows lie together."""
 
 NO_TOPIC: Final = 0
 """The topic of models that belong to no topic."""
-_TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 OF_CONFIGS: Final = f"config {_AMONG}"
 
 # Columns for `topic_rows`. Those of one word are packed, and the word is the kind of their model.
-EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 RELATCHED: Final = "relatched"
 COUNTS: Final = "counts"
 """Its models have the number of a shape as their topic."""
-PACKED_IN: Final = {
-    COUNTS: "bags",
-}
-"""The table in whose column of that name what is packed of a kind lies; answers lie elsewhere."""
 
 
 def entry_rows(
@@ -135,28 +113,6 @@ def packed_by_model(connection: sqlite3.Connection, topic: int, kind: str, plain
     return packed(plain, model)
 
 
-def message_rows(
-    connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
-) -> list[sqlite3.Row]:
-    """Returns row id, channel, log time, publish time and payload of stored messages, in order.
-
-    Payloads as of `payloads_of`: those that are alike are one object.
-    """
-    return connection.execute(
-        "SELECT bag, channel, log_time, publish_time, payload FROM kept"
-        f" WHERE topic = {_TOPIC} AND bag {_AMONG} ORDER BY bag, nth",
-        (topic, json.dumps(row_ids)),
-    ).fetchall()
-
-
-def payloads_of(connection: sqlite3.Connection, numbers: Collection[int]) -> dict[int, bytes]:
-    """Returns payloads by their number."""
-    rows = connection.execute(
-        f"SELECT id, bytes FROM payloads WHERE id {_AMONG}", (json.dumps([*numbers]),)
-    )
-    return dict(rows.fetchall())
-
-
 def any_is_gone(connection: sqlite3.Connection, row_ids: Sequence[int]) -> bool:
     """Returns whether an entry was deleted since it was read.
 
@@ -177,7 +133,6 @@ def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> No
             "DELETE FROM held WHERE id IN (SELECT value + ? FROM json_each(?))",
             (topic << ROW_ID_BITS, listed),
         )
-        connection.execute(f"DELETE FROM kept WHERE topic = ? AND bag {_AMONG}", (topic, listed))
     connection.execute(f"DELETE FROM bags WHERE id {_AMONG}", (listed,))
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
@@ -197,9 +152,6 @@ def renew_entry(connection: sqlite3.Connection, row_id: int, sidecar: int) -> No
     for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
         base = topic << ROW_ID_BITS
         connection.execute("UPDATE held SET id = ? + ? WHERE id = ? + ?", (base, new, base, row_id))
-        connection.execute(
-            "UPDATE kept SET bag = ? WHERE topic = ? AND bag = ?", (new, topic, row_id)
-        )
     connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
 
@@ -219,50 +171,17 @@ def insert_entry(
     for topic in digest.topics:
         number = _id_of(connection, "topics", "name", topic.topic)
         _insert_topic(connection, (number, bag), topic)
-        for nth, record in enumerate(topic.kept or ()):
-            _insert_record(connection, (bag, number, nth), record)
 
 
 def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:
     number, bag = key
-    edges = topic.edges
-    pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
     connection.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 7)})",
+        "INSERT INTO held VALUES (?, ?, ?)",
         (
             number << ROW_ID_BITS | bag,
-            pairs,
-            None if edges is None else edges.first_stamp,
-            None if edges is None else edges.last_stamp,
-            topic.kept is not None,
             topic.relatched,
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
         ),
-    )
-
-
-def _insert_record(
-    connection: sqlite3.Connection, key: tuple[int, int, int], record: Record
-) -> None:
-    """Inserts a message; equal channels and payloads of all bags are stored once."""
-    channel, schema = record.channel, record.channel.schema
-    described_schema = (schema.name, schema.encoding, schema.text)
-    described = (channel.topic, channel.encoding, channel.latched, *described_schema)
-    channel_hash = hashlib.sha256(repr(described).encode()).digest()
-    connection.execute(
-        "INSERT OR IGNORE INTO channels (hash, topic, encoding, latched, schema_name,"
-        " schema_encoding, schema_text) VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (channel_hash, *described),
-    )
-    payload_hash = hashlib.sha256(record.payload).digest()
-    connection.execute(
-        "INSERT OR IGNORE INTO payloads (hash, bytes) VALUES (?, ?)",
-        (payload_hash, record.payload),
-    )
-    connection.execute(
-        "INSERT INTO kept VALUES (?, ?, ?, ?, ?, (SELECT id FROM channels WHERE hash = ?),"
-        " (SELECT id FROM payloads WHERE hash = ?))",
-        (*key, record.log_time, record.publish_time, channel_hash, payload_hash),
     )
 
 

@@ -21,7 +21,6 @@ from ros2_memory.catalogue.digest_config import may_be_one
 from ros2_memory.catalogue.packing import unpacked
 from ros2_memory.catalogue.sql import (
     COUNTS,
-    EDGES,
     NO_TOPIC,
     OF_CONFIGS,
     RELATCHED,
@@ -32,19 +31,15 @@ from ros2_memory.catalogue.sql import (
     entry_rows,
     existing_rows,
     insert_entry,
-    message_rows,
     model_of,
     packed_by_model,
-    payloads_of,
     renew_entry,
     topic_rows,
 )
-from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.columns.database import Database
 from ros2_memory.columns.store import BagKey
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState
-from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
     import sqlite3
@@ -95,7 +90,6 @@ class Catalogue(Database):
     ) -> None:
         super().__init__(paths, TABLES, sources=sources, waits_for=waits_for, monotonic=monotonic)
         self._config = config
-        self._channels: dict[int, Channel] = {}
 
     def newest(self) -> int:
         """Returns the greatest number of any entry; it grows with each one that is added."""
@@ -192,19 +186,6 @@ class Catalogue(Database):
         del topic, numbers
         return {}
 
-    def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
-        """Returns the frame edges of the topic; not where they are not all known."""
-        pairs: dict[str, tuple[tuple[str, str], ...]] = {}
-
-        def decode(row: sqlite3.Row) -> EdgeDigest:
-            _, text, first, last = row
-            # Nearly all bags have the same edges: they share one tuple.
-            if text not in pairs:
-                pairs[text] = tuple((parent, child) for parent, child in json.loads(text))
-            return EdgeDigest(pairs[text], first, last)
-
-        return self._of_topic(topic, numbers, EDGES, decode)
-
     def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
         """Returns, by message type, why messages of the topic cannot be decoded; mostly nothing."""
         return self._of_topic(topic, numbers, UNDECODABLE, lambda row: dict(json.loads(row[1])))
@@ -228,36 +209,6 @@ class Catalogue(Database):
             return {offset + row[0]: decode(row) for row in rows if row[1] is not None}
 
         return self.read(ask, {})
-
-    def messages(self, topic: str, numbers: Sequence[int]) -> dict[int, tuple[Record, ...]]:
-        """Returns all messages of the topic in those of the entries that store them."""
-
-        def ask(connection: sqlite3.Connection) -> dict[int, tuple[Record, ...]]:
-            holders = topic_rows(connection, "kept", topic, self.row_ids(numbers))
-            found: dict[int, list[Record]] = {number: [] for number, kept in holders if kept}
-            rows = message_rows(connection, topic, [*found])
-            stored = payloads_of(connection, {row[4] for row in rows})
-            channels = {each: self._channel(connection, each) for each in {row[1] for row in rows}}
-            for number, channel, log_time, publish_time, payload in rows:
-                found[number].append(
-                    Record(channels[channel], log_time, publish_time, stored[payload])
-                )
-            return {self.offset + number: tuple(records) for number, records in found.items()}
-
-        return self.read(ask, {})
-
-    def _channel(self, connection: sqlite3.Connection, row_id: int) -> Channel:
-        """Returns one channel object for all of its records: decoders are cached by it."""
-        number = self.offset + row_id
-        if number not in self._channels:
-            topic, encoding, latched, name, schema_encoding, text = connection.execute(
-                "SELECT topic, encoding, latched, schema_name, schema_encoding, schema_text"
-                " FROM channels WHERE id = ?",
-                (row_id,),
-            ).fetchone()
-            schema = Schema(name, schema_encoding, text)
-            self._channels[number] = Channel(topic, encoding, schema, bool(latched))
-        return self._channels[number]
 
     def cached_answer(self, question: str, numbers: Sequence[int]) -> str | None:
         """Returns the answer that was computed from exactly these entries, if all still exist."""
@@ -374,14 +325,9 @@ class Catalogue(Database):
         return renewed if entries and self.write(write) else set()
 
     def forget(self, paths: Sequence[str]) -> None:
-        """Deletes the entries of these files, and payloads that no other entry shares."""
-
-        def write(connection: sqlite3.Connection) -> None:
-            self._delete_paths(connection, paths)
-            connection.execute("DELETE FROM payloads WHERE id NOT IN (SELECT payload FROM kept)")
-
+        """Deletes the entries of these files."""
         if paths:
-            self.write(write)
+            self.write(lambda connection: self._delete_paths(connection, paths))
 
     def forget_older_configurations(self) -> None:
         """Deletes entries that this configuration cannot use, except of the one that wrote last.

@@ -151,21 +151,6 @@ def distance(a: Vector3, b: Vector3) -> float:
     return math.dist(a, b)
 
 
-def off_segment(
-    point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
-) -> float:
-    """Returns the distance of a point in the plane from a segment; NaN if a coordinate is NaN."""
-    (px, py), (ax, ay) = point, start
-    dx, dy = end[0] - ax, end[1] - ay
-    squared = dx * dx + dy * dy
-    along = (px - ax) * dx + (py - ay) * dy
-    along = along / squared if squared > _SHORTEST_SQUARED else 0.0 * along
-    if math.isnan(along):
-        return math.nan
-    along = min(max(along, 0.0), 1.0)
-    return math.hypot(px - ax - along * dx, py - ay - along * dy)
-
-
 def simplified(
     points: NDArray[np.float64],
     clock: Numbers,

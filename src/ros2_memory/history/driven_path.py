@@ -9,7 +9,6 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.frames import static_at, static_changes
-from ros2_memory.analysis.motion.odometry import is_place
 from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     SLICE_NS,
@@ -51,16 +50,11 @@ from ros2_memory.history.transforms import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from ros2_memory.analysis.bulk_decode import MotionDecoder
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.analysis.transform_tree import FrameGraph
-    from ros2_memory.core.model import Vector3
-    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
 
-_MOST_AT_ONCE: Final = 1024
-"""Messages that are decoded together."""
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
@@ -261,23 +255,6 @@ def length_notes(path: Trajectory) -> Iterator[str]:
             f"odometry restarted {counted(len(totals.resets), 'time')}: "
             "the jumps back to its origin are left out of distance and speed"
         )
-
-
-def positions_of(
-    view: View, decoder: MotionDecoder, messages: Iterable[StoredMessage]
-) -> Iterator[tuple[StoredMessage, Vector3]]:
-    """Yields messages with the positions (m) of their poses; without those that are NaN or beyond.
-
-    A note reports which messages cannot be decoded. More and more messages are read ahead.
-    """
-    rest, ahead = iter(messages), 1
-    while some := [*islice(rest, ahead)]:
-        ahead = min(2 * ahead, _MOST_AT_ONCE)
-        for found, sample in zip(some, decoder.decode([each.record for each in some]), strict=True):
-            if isinstance(sample, UndecodableError):
-                note_left_out(view, sample)
-            elif sample.pose is not None and is_place(sample.pose.position):
-                yield found, sample.pose.position
 
 
 def note_left_out(view: View, error: UndecodableError) -> None:

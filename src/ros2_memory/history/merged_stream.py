@@ -15,7 +15,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
+from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
     BagSpan,
@@ -118,20 +118,6 @@ class MergedStream:
                     found = self.bags.newest_in(inside[0].bag, topic, window)
                     return None if found is None else next(self.bags.track_sources(iter((found,))))
         return self.first([topic], window, newest_first=True)
-
-    def duplicate_spans(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
-        """Returns where in a window two recordings may hold a topic's messages, widened."""
-        recordings = self._timeline.recordings(topic)
-        if len(recordings) < 2:
-            return []
-        # First by whole recordings, which are few; then by bags, where these overlap.
-        coarse = overlap_spans((*span, folder) for folder, span in recordings.items())
-        near = [
-            self.overlapping_bags([topic], TimeWindow(*span))
-            for span in coarse
-            if window.overlaps(span[0], span[1] - 1)
-        ]
-        return united(span for bags in near for span in bag_overlaps(bags))
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time."""

@@ -48,8 +48,6 @@ _LEAST_RATE: Final = 0.1
 _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
 _VIEW_SHARE: Final = 0.02
-_VIEW_MARGIN_DEG: Final = 2.0
-_VIEW_MARGIN_MM: Final = 100.0
 
 
 class Cells:

@@ -6,20 +6,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.columns.store import BagKey
-from ros2_memory.index import timeline
 from ros2_memory.index.segment import Segment
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
-    from ros2_memory.storage.base import Record
 
 T0 = 1_700_000_000 * 10**9
 
@@ -81,32 +77,3 @@ def test_digests_of_a_catalogue_that_was_lost_are_not_complete(tmp_path: Path) -
     recall.catalogue.newest()
     assert recall.complete_digests(run) is None
     assert not recall.digests_for(run, recall.catalogue.newest()).numbers
-
-
-def test_of_stored_messages_those_of_the_segments_asked_last_stay_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(timeline, "SEGMENT_BAGS", 1)
-    for n in range(3):
-        chatter = [text(T0 + n * 100 + each, f"{n} {each}") for each in range(5)]
-        layout = McapLayout(latched=frozenset({"/chatter"}))
-        write_mcap(tmp_path / "rec" / f"rec_{n}.mcap", chatter, layout)
-    memory = recalling(memory_of(tmp_path), tmp_path)
-    assert memory.recall is not None
-    catalogue = memory.recall.catalogue
-    recall = DigestCache(catalogue, tmp_path, most_messages=2 * (5 + 256))
-    segments = [*memory.index.snapshot().timeline.segments]
-    digests = [recall.digests_for(each, catalogue.newest()) for each in segments]
-    asked: list[int] = []
-    real = catalogue.messages
-
-    def messages(topic: str, numbers: Sequence[int]) -> Mapping[int, tuple[Record, ...]]:
-        asked.extend(numbers)
-        return real(topic, numbers)
-
-    monkeypatch.setattr(catalogue, "messages", messages)
-    for nth in (0, 1, 0, 2, 0, 1):
-        [records] = digests[nth].messages("/chatter").values()
-        assert [each.log_time for each in records] == [T0 + nth * 100 + each for each in range(5)]
-    first, second, third = ([*each.numbers.values()] for each in digests)
-    assert asked == [*first, *second, *third, *second]

@@ -20,11 +20,9 @@ from ros2_memory.columns.store import BagKey, relative
 from ros2_memory.core.model import BagFile, BagState
 from tests.support.bags import boolean, detections, odom, tf, transform
 from tests.support.fakes import FakeReader
-from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest
-    from ros2_memory.catalogue.topic_digest import TopicDigest
     from tests.support.bags import Msg
 
 S = 10**9
@@ -35,7 +33,7 @@ KEY = BagKey("rec/rec_0.mcap", 1234, T0, 0)
 def digest_of(*messages: Msg) -> Digest:
     reader = FakeReader()
     path = reader.add(Path("bag.mcap"), messages)
-    return Digester(reader, extractor()).digest(path)
+    return Digester(reader).digest(path)
 
 
 DIGEST = digest_of(
@@ -48,10 +46,6 @@ DIGEST = digest_of(
     detections(T0 + S, ["cup", "person"]),
     boolean(T0 + S, True),
 )
-
-
-def topic(digest: Digest, name: str) -> TopicDigest:
-    return next(each for each in digest.topics if each.topic == name)
 
 
 CONFIG = DigestConfig("config")
@@ -107,9 +101,8 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     file = BagFile(path, size, mtime_ns, BagState.CLOSED, *content, sidecar_ns, number)
     assert again.known_files(tmp_path) == {path: file}
     for held in DIGEST.topics:
-        assert again.edges(held.topic, [number]).get(number) == held.edges
-        assert again.messages(held.topic, [number]).get(number) == held.kept
-    assert topic(DIGEST, "/tf_static").kept is not None
+        assert again.relatched(held.topic, [number]) == {number: held.relatched}
+        assert again.undecodable(held.topic, [number]) == {number: dict(held.undecodable)}
 
 
 def test_digests_are_read_from_a_file_that_replaced_another(
@@ -125,8 +118,7 @@ def test_digests_are_read_from_a_file_that_replaced_another(
     [number] = catalogue.find([KEY])
     assert former is not None
     assert number is not None
-    kept = topic(DIGEST, "/tf_static").kept
-    assert catalogue.messages("/tf_static", [former, number]) == {number: kept}
+    assert catalogue.relatched("/tf_static", [former, number]) == {number: False}
 
 
 @pytest.mark.parametrize(
@@ -207,7 +199,7 @@ def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path
     assert after > before
     assert catalogue.newest() == after
     assert not holds(catalogue)
-    assert catalogue.messages("/tf_static", [before, after]) == {}
+    assert catalogue.relatched("/tf_static", [before, after]) == {}
 
 
 def test_compacting_gives_back_what_was_deleted(tmp_path: Path) -> None:
@@ -257,7 +249,7 @@ def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
     catalogue.forget([KEY.path])
     catalogue.close()
     with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
-        for table in ("bags", "held", "kept", "payloads"):
+        for table in ("bags", "held"):
             assert base.execute(f"SELECT count(*) FROM {table}").fetchone() == (0,)  # noqa: S608
 
 

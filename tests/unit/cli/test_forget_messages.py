@@ -275,7 +275,7 @@ def test_what_the_catalogue_says_of_the_others_stays(bag_dir: Path) -> None:
         bags = [each for each in memory.index.snapshot().bags if each.path.stem == "rec_a_2"]
         numbers = [each for each in catalogue.find([BagKey.of(b, bag_dir) for b in bags]) if each]
         assert numbers
-        found = [catalogue.edges(topic, numbers) for topic in (CAMERA, MIC, "/odom")]
+        found = [catalogue.relatched(topic, numbers) for topic in (CAMERA, MIC, "/odom")]
         known = catalogue.known_files(bag_dir)[bags[0].file].summary
         return [*found, known]
 

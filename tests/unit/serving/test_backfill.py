@@ -62,7 +62,7 @@ def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
 
 
 def backfill_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Backfill:
-    made = digester or Digester(memory.reader, memory.extractor)
+    made = digester or Digester(memory.reader)
     return Backfill(memory, made, bag_dir)
 
 
@@ -143,8 +143,8 @@ def content(catalogue: Catalogue, bag_dir: Path) -> dict[str, list[object]]:
                 each(topic, [number]).get(number)
                 for topic in sorted({each.topic for each in files[file].summary.topics})
                 for each in (
-                    catalogue.edges,
-                    catalogue.messages,
+                    catalogue.relatched,
+                    catalogue.undecodable,
                 )
             ),
         ]
@@ -173,7 +173,7 @@ def test_a_handover_has_only_those_bags_digested_again_that_it_changes(tmp_path:
             at = paths[0].stat().st_mtime + number
             os.utime(folder / HANDOVER_FILE, (at, at))
         memory = recalling(bags)
-        digester = Counting(memory.reader, memory.extractor)
+        digester = Counting(memory.reader)
         backfill = backfill_of(memory, bags, digester)
         assert fill_catalogue(backfill) == Progress(4, 0, 0)
         assert getattr(digester, "names", []) == [paths[each].name for each in digested]
@@ -203,7 +203,7 @@ class Failing(Digester):
 def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader, memory.extractor))
+    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader))
     [waiting] = backfill.waiting()
     assert not backfill.digest(waiting)
     assert memory.recall is not None
@@ -213,7 +213,7 @@ def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
 def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    backfill = backfill_of(memory, tmp_path, Failing(memory.reader, memory.extractor))
+    backfill = backfill_of(memory, tmp_path, Failing(memory.reader))
     assert fill_catalogue(backfill) == Progress(1, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 

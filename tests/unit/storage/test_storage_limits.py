@@ -362,4 +362,4 @@ class TestDigests:
         packed = zstandard.compress(text(0, "x" * 30 * MB).payload)
         path = bag(tmp_path, *STRINGS, *(message(1, n, packed) for n in range(4)))
         with pytest.raises(BagError, match="unpack to more"):
-            Digester(McapReader(), extractor()).digest(path)
+            Digester(McapReader()).digest(path)

@@ -11,7 +11,6 @@ from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.catalogue.digest_config import DigestConfig
 from ros2_memory.catalogue.store import Catalogue
-from ros2_memory.catalogue.topic_digest import EdgeDigest
 from ros2_memory.columns.fragments import Fragment
 from ros2_memory.lake.event_codec import decode_topic_events
 from ros2_memory.lake.partitions import locations
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeIndex
     from ros2_memory.lake.partitions import Days
-    from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
 S = TypeVar("S", bound="Sized")
@@ -47,23 +45,17 @@ _LABELS: Final = "SELECT DISTINCT bag_id, label FROM sightings WHERE topic = $to
 class LakeCatalogue(Catalogue):
     """Looks digests up in a lake, days at a time; what a lake has no digests of is not known.
 
-    Positions are placed in the map already, so there are no static transforms here.
-
     Args:
         lake: the lake.
         robot: its name there.
         index: its bags.
-        static_topics: those of static transforms.
     """
 
-    def __init__(
-        self, lake: Lake, robot: str, index: LakeIndex, static_topics: Sequence[str]
-    ) -> None:
+    def __init__(self, lake: Lake, robot: str, index: LakeIndex) -> None:
         super().__init__([], DigestConfig("lake"))
         self._lake = lake
         self._robot = robot
         self._index = index
-        self._static_topics = static_topics
         self._parts_lock = threading.Lock()
         self._parts: OrderedDict[tuple[object, ...], Mapping[str, object]] = OrderedDict()
 
@@ -122,15 +114,6 @@ class LakeCatalogue(Catalogue):
         """Returns that no message is of another recording: such were not shipped."""
         del topic
         return dict.fromkeys(numbers, False)
-
-    def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
-        """Returns that static transforms have no edges; those of others are not known."""
-        none = EdgeDigest((), None, None)
-        return dict.fromkeys(numbers, none) if topic in self._static_topics else {}
-
-    def messages(self, topic: str, numbers: Sequence[int]) -> dict[int, tuple[Record, ...]]:
-        """Returns that there are no static transforms; of other topics nothing is known."""
-        return dict.fromkeys(numbers, ()) if topic in self._static_topics else {}
 
     def _packed(self, kind: str, topic: str, numbers: Sequence[int]) -> dict[int, bytes]:
         found = self._digests(kind, topic, numbers)

@@ -89,7 +89,7 @@ class LakeRobot:
             tf_topics=limits.tf_topics,
             static_topics=limits.tf_static_topics,
         )
-        catalogue = LakeCatalogue(lake, name, self._index, limits.tf_static_topics)
+        catalogue = LakeCatalogue(lake, name, self._index)
         recall = DigestCache(catalogue, self._index.bag_dir)
         # Nothing is recorded here, and nothing deleted.
         own = replace(limits, kept=None, recording="", screened=False)
