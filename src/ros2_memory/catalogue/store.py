@@ -221,27 +221,6 @@ class Catalogue(Database):
 
         return self.read(ask, None)
 
-    def cached_answers(self, question: str) -> dict[tuple[int, ...], str]:
-        """Returns all answers to a question that are stored, by the numbers of the entries."""
-        begin = f"[{json.dumps(question)}, "
-
-        def ask(connection: sqlite3.Connection) -> dict[tuple[int, ...], str]:
-            offset = self.offset
-            model = model_of(connection, NO_TOPIC, _kind_of(question))
-            # Keys are ASCII, and a digit follows, which is less than a colon.
-            rows = connection.execute(
-                "SELECT question, answer FROM remembered WHERE question > ? AND question < ?",
-                (begin, f"{begin}:"),
-            )
-            return {
-                tuple(offset + number for number in json.loads(key)[1:]): unpacked(
-                    stored, model
-                ).decode("utf-8", "surrogatepass")
-                for key, stored in rows
-            }
-
-        return self.read(ask, {})
-
     def cache_answer(self, question: str, numbers: Sequence[int], answer: str) -> None:
         """Stores what was computed from these entries, until the oldest of them is deleted.
 

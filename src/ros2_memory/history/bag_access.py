@@ -22,7 +22,7 @@ from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.columns.table import Table
@@ -63,7 +63,6 @@ class BagAccess:
         self.notes = Notes()
         self._deadline = call.deadline
         self._as_of: int | None = None
-        self._answers: dict[str, Mapping[tuple[int, ...], str]] = {}
 
     def finish_within(self, budget_s: float) -> None:
         """Gives a call whose time is over some more, to say what it found."""
@@ -127,18 +126,6 @@ class BagAccess:
         if cache is None or numbers is None:
             return None
         return cache.cached_answer(question, numbers, parse)
-
-    def cached_answers(self, question: str) -> Mapping[tuple[int, ...], str]:
-        """Returns all answers to a question that were stored, by the bags' `entry_numbers`.
-
-        Looked up once in a call.
-        """
-        cache = self.memory.recall
-        if cache is None:
-            return {}
-        if question not in self._answers:
-            self._answers[question] = cache.catalogue.cached_answers(question)
-        return self._answers[question]
 
     def cache_answer(self, question: str, bags: Sequence[BagSpan], answer: str) -> None:
         """Stores what was computed from these bags, unless something could not be read."""
