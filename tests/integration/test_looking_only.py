@@ -20,7 +20,7 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.integration.test_retention_process import state
-from tests.integration.test_server_process import serving
+from tests.integration.test_server_process import Served, serving
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.forked_commands import forked_commands
 from tests.support.housekeepers import recorded_before
@@ -143,6 +143,11 @@ def catalogue(health: bytes) -> dict[str, object]:
     return shown
 
 
+def moved_to(served: Served) -> list[str]:
+    """Where databases were moved to: the catalogue and the columns, each when it is tried again."""
+    return [each["path"] for each in served.events() if each["event"] == "database_moved"]
+
+
 def entries(file: Path) -> int:
     with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
         return int(base.execute("SELECT count(*) FROM bags").fetchone()[0])
@@ -158,7 +163,7 @@ async def test_when_a_recorder_comes_the_catalogue_goes_beside_the_bags_with_all
         known = entries(cached)
         assert known > 0
         recorded_before(strangers)
-        until(lambda: "database_moved" in {each["event"] for each in served.events()})
+        until(lambda: str(beside) in moved_to(served))
         digested = [each for each in served.events() if each["event"] == "bag_digested"]
         assert entries(beside) == known == len(digested)
         async with Client(served.url("/mcp")) as client:
