@@ -9,7 +9,6 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
-from ros2_memory.columns.store import BagKey
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -183,19 +182,6 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     monkeypatch.setattr(shipping.engine, "select", selected)
     assert len(index.snapshot(older * NS_PER_S).bags) == 3
     assert set(found) == {bag.summary}
-
-
-def test_static_transforms_are_known_not_to_be_there(shipping: Shipping) -> None:
-    """So a question about places does not look for them in each bag."""
-    shipping.ship([START_S])
-    memory = shipping.robot().memory
-    [bag] = memory.index.refresh().bags
-    assert memory.recall is not None
-    edges = memory.recall.catalogue.edges
-    [number] = memory.recall.catalogue.find([BagKey.of(bag, memory.recall.bag_dir)])
-    assert number is not None
-    assert edges("/tf_static", [number])[number].pairs == ()
-    assert edges("/tf", [number]) == {}
 
 
 def test_bags_that_are_shipped_late_show_nothing_about_the_robots_clock(shipping: Shipping) -> None:

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from ros2_memory.analysis.bulk_decode import motion_decoder
+from ros2_memory.analysis.bulk_decode import BulkDecoder
+from ros2_memory.analysis.payload_templates import PayloadTemplate
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -221,7 +222,10 @@ class TestMessages:
         known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
         reader = McapReader()
         record = Record(known, 1, 1, b"\0\1\0\0" + bytes([255] * 20))
-        [error] = motion_decoder(reader, extractor()).decode([record])
+        decoder = BulkDecoder[object, PayloadTemplate](
+            reader.decode, lambda *_: None, lambda *_: ()
+        )
+        [error] = decoder.decode([record])
         assert isinstance(error, UndecodableError)
         assert error.__traceback__ is None
         assert error.__cause__ is None
