@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -100,7 +101,8 @@ class Zones:
 
     def reaches(self, limit: float, *, above: bool) -> Mask:
         """Returns in which parts some value may lie above a limit, or below it."""
-        at = as_float(limit)
+        # An integer that no float reaches is below infinity all the same.
+        at = min(max(as_float(limit), -sys.float_info.max), sys.float_info.max)
         return self.high > at if above else self.low < at
 
     def is_near(self, place: float, distance: float) -> Mask:

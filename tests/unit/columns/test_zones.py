@@ -47,6 +47,8 @@ def is_exact(*numbers: float) -> bool:
 
 @given(st.lists(zones(), min_size=1, max_size=8), LIMITS, st.text("ab[", max_size=2))
 @example([Zone(0, sys.float_info.max)], 1, "")
+@example([Zone(0, math.inf)], 10**400, "")
+@example([Zone(-math.inf, 0)], -(10**400), "")
 def test_zones_rule_out_what_the_zone_of_each_part_does(
     given_zones: list[Zone], limit: float, text: str
 ) -> None:
