@@ -186,14 +186,14 @@ def position(
         return by_transforms
     _require_kind(view, name, "position", "geodetic")
     found = _found_at(view, name, at, tolerance_s)
-    told = _position_in(view, found, at, now, frame_id)
-    if topic is None and told.geodetic is not None:
+    answer = _position_in(view, found, at, now, frame_id)
+    if topic is None and answer.geodetic is not None:
         # Visits and paths are by transforms then, so this is, too.
         with suppress(NoDataError):
             by_transforms = _position_of_body(view, at, now, frame_id)
             if by_transforms is not None:
-                return replace(by_transforms, geodetic=told.geodetic)
-    return told
+                return replace(by_transforms, geodetic=answer.geodetic)
+    return answer
 
 
 def _position_in(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Seen, no_sights, sights_of
+from ros2_memory.analysis.sights import TABLES, Seen, Sights, sights_of
 from ros2_memory.columns.sights import joined, packed
 from ros2_memory.columns.table import Texts
 
@@ -34,6 +34,11 @@ class Message(NamedTuple):
     time: Ns
     robot: tuple[float, float, float] | None
     things: Sequence[PlacedDetection]
+
+
+def no_sights() -> Sights:
+    """Returns the sights where no detector published."""
+    return Sights((), (), tuple(np.zeros((0, len(columns)), np.int64) for columns in TABLES))
 
 
 def sights_of_messages(messages: Sequence[Message]) -> Sights:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ros2_memory.analysis.transform_tree import AGREEMENT_NS, TF_CACHE_NS, FrameGraph, TfClock
 from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.geometry import IDENTITY, alike, normalised
+from ros2_memory.core.geometry import IDENTITY, alike, multiply, normalised
 from ros2_memory.core.model import StampedTransform, Transform
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, NS_PER_S, Ns
 
@@ -150,7 +150,7 @@ class Frames:
 
     Args:
         static: its static transforms in log-time order; each holds until the next one of its child.
-        moving: the moving ones of the times that are asked about, and of what they need around.
+        moving: the moving ones, in the times that are asked about and around these.
         target: the frame in which the others are looked up.
         clock: which time of the transforms counts; None: as `agreeing_clock` finds.
 
@@ -339,7 +339,7 @@ def _rows(edge: tuple[str, str], block: Edge) -> Iterable[StampedTransform]:
 
 
 def _with_held_ends(rows: Sequence[StampedTransform], clock: TfClock) -> list[StampedTransform]:
-    """Returns transforms, and those at the ends of what is known `HOLD_NS` farther out as well."""
+    """Returns transforms, those at each end and beside each gap repeated `HOLD_NS` beyond it."""
     by_child: dict[str, list[StampedTransform]] = defaultdict(list)
     for row in rows:
         by_child[row.child].append(row)
@@ -485,18 +485,6 @@ def _rotate(q: Rotations, v: Vectors) -> Vectors:
 
 def _add(a: Vectors, b: Vectors) -> Vectors:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def multiply(a: Rotations, b: Rotations) -> Rotations:
-    """Returns rotations `b` followed, about the fixed axes, by `a`."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
 
 
 def _compose(a: Poses, b: Poses) -> Poses:

@@ -219,11 +219,6 @@ class Sights:
         return self.tables[6]
 
 
-def no_sights() -> Sights:
-    """Returns the sights where no detector published."""
-    return Sights((), (), tuple(np.zeros((0, len(columns)), np.int64) for columns in TABLES))
-
-
 class _Detections(NamedTuple):
     """Detections in whole millimetres, ascending by message; what is not placed has zeros."""
 
@@ -510,6 +505,6 @@ def _bins(scores: Floats) -> Ints:
 
 
 def _rounded(times: Ints) -> Ints:
-    """Rounds up to 1 us: a message is at or before the time that is said of it."""
+    """Rounds log times (ns) up to 1 us: a message is never later than the time that is shown."""
     # The last microsecond is not whole: its end is no time.
     return np.minimum(-(-times // _NS_PER_US), MAX_NS // _NS_PER_US) * _NS_PER_US

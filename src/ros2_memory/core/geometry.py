@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 from itertools import count
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+N = TypeVar("N", float, "NDArray[np.float64]")
 
 IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
@@ -71,8 +72,11 @@ def yaw(q: Quaternion) -> float:
     return rpy(q)[2]
 
 
-def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Returns the rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b)."""
+def multiply(a: tuple[N, N, N, N], b: tuple[N, N, N, N]) -> tuple[N, N, N, N]:
+    """Returns the rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b).
+
+    Of numbers, or of arrays of them.
+    """
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (

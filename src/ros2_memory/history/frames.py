@@ -63,8 +63,8 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
 def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:
     """Returns the frames of a session in a window, looked up in a target frame.
 
-    They are the same however the history is cut: transforms are taken from so far around the window
-    that none farther away bears on it, and static ones hold from when they were received.
+    They are the same however the history is cut: moving transforms are read from so far around the
+    window that others change nothing in it, and static ones hold from when they were received.
 
     Raises:
         QueryTimeoutError: the call's time is over.

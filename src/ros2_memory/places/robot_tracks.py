@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Edge, Frames, joined_edges, multiply, static_at
+from ros2_memory.analysis.frames import Edge, Frames, joined_edges, static_at
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import (
     STRETCH_NS,
@@ -31,6 +31,7 @@ from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.tracks import TRACKS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Parts, Steps, parts_inside
 from ros2_memory.core.text import Reason
@@ -131,7 +132,7 @@ class RobotTracks:
             QueryTimeoutError: the call's time runs out before any result.
         """
         view = self._view
-        # Whole stretches, so that the window bears on no vertex; and what may reach into it.
+        # Whole stretches, so that no vertex depends on the window; and what may reach into it.
         begin = max(window.start - SILENCE_NS, MIN_NS) // STRETCH_NS * STRETCH_NS
         end = -(-min(window.stop + SILENCE_NS, MAX_NS) // STRETCH_NS) * STRETCH_NS
         around = TimeWindow(max(begin, MIN_NS), min(end, MAX_NS))
@@ -431,7 +432,7 @@ class _Moving:
         self._held: list[list[_Source]] = [[] for _ in topics]
 
     def around(self, first: Ns, last: Ns) -> list[_Source]:
-        """Returns the tables that bear on log times (inclusive), none later than asked before."""
+        """Returns the tables that overlap log times (inclusive), none later than asked before."""
         first, last = first - TF_CACHE_NS, last + TF_CACHE_NS
         found: list[_Source] = []
         for waiting, held in zip(self._waiting, self._held, strict=True):

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Frames, multiply
+from ros2_memory.analysis.frames import Frames
 from ros2_memory.analysis.motion.odometry import FARTHEST_M
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
 from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, fixes_of, sights_of
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.detections import DetectionRows, joined_detected
@@ -59,7 +60,7 @@ _COVARIANCE: Final = 36
 
 _OF_DETECTORS: Final = ("detection", "recognizedobject")
 AROUND_NS: Final[Ns] = 12 * NS_PER_S
-"""How far around a stretch poses and transforms bear on it."""
+"""How far around a stretch poses and transforms are read."""
 
 
 class SessionSights(NamedTuple):

@@ -16,13 +16,13 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
     fixes_of,
-    no_sights,
 )
 from ros2_memory.analysis.sights import sights_of as of_arrays
 from tests.support.sights import (
     Message,
     PlacedDetection,
     joined_of,
+    no_sights,
     seen_in,
     sights_of_messages,
 )

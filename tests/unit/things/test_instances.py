@@ -9,11 +9,18 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.sights import SLICE_NS, Sights, Spot, no_sights
+from ros2_memory.analysis.sights import SLICE_NS, Sights, Spot
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.instances import Estimate, estimate, most_at_once
 from ros2_memory.things.labels import Labels
-from tests.support.sights import Message, PlacedDetection, joined_of, sights_of_messages, whole
+from tests.support.sights import (
+    Message,
+    PlacedDetection,
+    joined_of,
+    no_sights,
+    sights_of_messages,
+    whole,
+)
 from tests.support.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
 
 if TYPE_CHECKING:

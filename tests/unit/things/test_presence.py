@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.sights import CELL_MM, Hit, Look, Sights, no_sights
+from ros2_memory.analysis.sights import CELL_MM, Hit, Look, Sights
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
@@ -15,6 +15,7 @@ from ros2_memory.things.presence import (
     evidence_at,
     stays_at,
 )
+from tests.support.sights import no_sights
 
 _looks = st.lists(
     st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(1, 16), st.integers(-6, 3)),
