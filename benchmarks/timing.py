@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 from benchmarks.worlds import STRANGERS
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
 from ros2_memory.bootstrap_fleet import build_fleet
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.logging_setup import configure_logging
 
@@ -143,7 +143,7 @@ def stored(place: Path) -> int:
 
 def made_known(memory: Memory, settings: Settings) -> None:
     """Has a memory know every bag, as `ros2-memory index` does, in this process."""
-    fill_catalogue(build_backfill(settings, memory))
+    fill_store(build_backfill(settings, memory))
 
 
 def asked(place: Path, question: Question) -> Asked:

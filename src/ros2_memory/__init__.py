@@ -27,7 +27,6 @@ Rooms, from the bottom up. A room imports only from rooms below it::
     triggers        rules that keep what was recorded around an event
     recorder        the recorder; recorder.process: the child; recorder.handover: rotation
     columns         closed bags decoded once, as columns in SQLite; scanned by questions
-    catalogue       SQLite digests of closed bags; derived, disposable
     results         what queries and insights return: each class declares the keys of its reply
     history         one call's view across many bags
     things          what detectors saw, as instances with places and a history

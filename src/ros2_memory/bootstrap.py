@@ -13,7 +13,6 @@ import hashlib
 import json
 import os
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -31,7 +30,8 @@ from ros2_memory.config import (
     load_rules,
 )
 from ros2_memory.core import directories
-from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.core.errors import BagError, ConfigError, InvalidArgumentsError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
 from ros2_memory.recorder.base import Recorder
@@ -43,9 +43,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.catalogue.digest import Digester
-    from ros2_memory.catalogue.digest_config import DigestConfig
-    from ros2_memory.columns.fill import Filling
+    from ros2_memory.columns.fill import Progress
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
     from ros2_memory.core.model import BagFile, JsonValue
@@ -57,7 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper
-    from ros2_memory.serving.backfill import Backfill, Progress
+    from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.triggers.exclusion import ExclusionRule
@@ -66,6 +64,8 @@ if TYPE_CHECKING:
     from ros2_memory.triggers.watch import Triggers
 
 _Port = TypeVar("_Port")
+
+log = get_logger(__name__)
 
 _NEW_OBJECTS = 50_000
 """After so many new objects the server looks for garbage among them."""
@@ -389,8 +389,6 @@ def build_memory(
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-    from ros2_memory.catalogue.lookup import DigestCache
-    from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.history.context import Memory
     from ros2_memory.index.scan import BAG_DIR_SETTING
@@ -400,18 +398,10 @@ def build_memory(
     shared = shared or shared_parts(settings)
     schemas, bag_dir = shared.schemas, settings.recording.bag_dir
     reader = BagDirReader(shared.reader, bag_dir)
-    catalogue = Catalogue(
-        partial(catalogue_paths, settings),
-        digest_config(settings, schemas),
-        # What a recorder's server found serves who only looks, too.
-        sources=() if settings.data.recording else (bag_dir / FOLDER / FILE,),
-        waits_for=bag_dir,
-    )
     columns = build_columns(settings, reader)
 
     def known_files() -> dict[str, BagFile]:
-        stored = {} if columns is None else columns.known_files(bag_dir)
-        return {**stored, **catalogue.known_files(bag_dir)}
+        return {} if columns is None else columns.known_files(bag_dir)
 
     index = IndexManager(
         bag_dir,
@@ -425,34 +415,9 @@ def build_memory(
         only=settings.data.recording,
         setting=setting or BAG_DIR_SETTING,
     )
-    recall = DigestCache(catalogue, bag_dir)
-    scanner = Scanner(columns, bag_dir, _hash_of(digest_config(settings, schemas).text(schemas)))
+    scanner = Scanner(columns, bag_dir, reading_of(settings, schemas))
     limits = query_settings_of(settings)
-    return Memory(index, reader, shared.extractor, clock, limits, recall, scanner)
-
-
-def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
-    """Returns the paths that the catalogue may have now, best first.
-
-    It is beside the bags only where the configured recorder has recorded. Nothing is written to a
-    folder of other programs' bags. Where one recording alone answers, its catalogue
-    is a file of its own beside that of all.
-    """
-    from ros2_memory.bag_dir.layout import has_recorded
-    from ros2_memory.catalogue.store import FILE, FOLDER
-
-    bag_dir, only = settings.recording.bag_dir, settings.data.recording
-    records = not isinstance(settings.recorder, NullRecorderNode) and has_recorded(bag_dir)
-    records = records and only is None
-    beside = (bag_dir / FOLDER / FILE,) if records else ()
-    given = os.environ.get("XDG_CACHE_HOME")
-    try:
-        cache = Path(given) if given else Path.home() / ".cache"
-    except RuntimeError:  # a user without a home
-        return beside
-    name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
-    file = FILE if only is None else f"{hashlib.sha256(only.encode()).hexdigest()[:16]}-{FILE}"
-    return (*beside, cache / PACKAGE / name / file) if cache.is_absolute() else beside
+    return Memory(index, reader, shared.extractor, clock, limits, scanner)
 
 
 def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
@@ -477,14 +442,40 @@ def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
 
 
 def column_paths(settings: Settings) -> tuple[Path, ...]:
-    """Returns the paths that the store of columns may have now, best first: beside the catalogues.
+    """Returns the paths that the store of columns may have now, best first.
 
-    Columns do not depend on the configuration, so one file serves all of a bag directory.
+    It is beside the bags only where the configured recorder has recorded. Nothing is written to a
+    folder of other programs' bags. Columns do not depend on the configuration, so one file serves
+    all of a bag directory.
     """
+    from ros2_memory.bag_dir.layout import OWN_FOLDER, has_recorded
     from ros2_memory.columns.store import FILE
 
-    of_all = replace(settings, data=replace(settings.data, recording=None))
-    return tuple(path.with_name(FILE) for path in catalogue_paths(of_all))
+    bag_dir = settings.recording.bag_dir
+    records = not isinstance(settings.recorder, NullRecorderNode) and has_recorded(bag_dir)
+    beside = (bag_dir / OWN_FOLDER / FILE,) if records else ()
+    given = os.environ.get("XDG_CACHE_HOME")
+    try:
+        cache = Path(given) if given else Path.home() / ".cache"
+    except RuntimeError:  # a user without a home
+        return beside
+    name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
+    return (*beside, cache / PACKAGE / name / FILE) if cache.is_absolute() else beside
+
+
+def delete_catalogues(settings: Settings) -> None:
+    """Deletes the catalogues that versions before the store of columns kept in its folders.
+
+    Raises:
+        BagError: one of them cannot be deleted.
+    """
+    from ros2_memory.columns.forget import delete_catalogue
+    from ros2_memory.columns.store import CATALOGUE
+
+    for path in column_paths(settings):
+        # One of all recordings, and one for each that answered alone.
+        for file in (path.with_name(CATALOGUE), *path.parent.glob(f"*-{CATALOGUE}")):
+            delete_catalogue(file)
 
 
 def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
@@ -496,31 +487,27 @@ def _definitions_of(settings: Settings) -> list[tuple[str, int, int]]:
     ]
 
 
-def digest_config(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> DigestConfig:
-    """Returns all that digests depend on besides the bags.
+def reading_of(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
+    """Returns what identifies how bags are read: settings, definitions, and this version.
 
-    That is settings, message definitions, and this program's version. `schemas` is the schema map
-    of these settings. The two readers of the package read a file alike, so that every preset
-    shares one catalogue.
+    `schemas` is the schema map of these settings. What follows from columns depends on it. The two
+    readers of the package read a file alike.
     """
-    from ros2_memory.catalogue.digest import DIGEST_VERSION
-    from ros2_memory.catalogue.digest_config import DigestConfig
-
     storage = settings.storage
-    base = (
-        package_version(),
-        DIGEST_VERSION,
-        None if storage.target in _READ_ALIKE else storage.target,
-        settings.reader.max_chunk_mb,
-        _definitions_of(settings),
-        settings.data.max_array_length,
-        settings.data.pose_topic,
-        settings.data.map_frame,
-        settings.data.tf_topics,
-        settings.data.tf_clock,
+    return _hash_of(
+        (
+            package_version(),
+            None if storage.target in _READ_ALIKE else storage.target,
+            settings.reader.max_chunk_mb,
+            _definitions_of(settings),
+            settings.data.max_array_length,
+            settings.data.pose_topic,
+            settings.data.map_frame,
+            settings.data.tf_topics,
+            settings.data.tf_clock,
+            {name: dict(fields) for name, fields in sorted(schemas.items())},
+        )
     )
-    entries = {name: _hash_of(dict(fields)) for name, fields in schemas.items()}
-    return DigestConfig(_hash_of(base), entries)
 
 
 def _hash_of(value: object) -> str:
@@ -528,33 +515,23 @@ def _hash_of(value: object) -> str:
 
 
 def build_backfill(settings: Settings, memory: Memory) -> Backfill:
-    """Returns what fills the catalogue of a memory, and its store of columns."""
+    """Returns what fills the store of columns of a memory, if it has one.
+
+    Deletes the catalogues of earlier versions, whose place the store takes.
+    """
+    from ros2_memory.columns.fill import Filling, StoreLimits
     from ros2_memory.serving.backfill import Backfill
 
-    return Backfill(
-        memory,
-        build_digester(memory),
-        settings.recording.bag_dir,
-        build_filling(settings, memory),
-    )
-
-
-def build_filling(settings: Settings, memory: Memory) -> Filling | None:
-    """Returns what fills the store of columns of a memory; None where it has none."""
-    from ros2_memory.columns.fill import Filling, StoreLimits
-
+    try:
+        delete_catalogues(settings)
+    except BagError as error:
+        log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
     scanner, store = memory.columns, settings.store
     if scanner is None or scanner.store is None:
-        return None
+        return Backfill(memory, None)
     limits = StoreLimits(store.max_share, round(store.max_gb * GB))
-    return Filling(scanner, memory.reader, settings.recording.bag_dir, memory.clock, limits)
-
-
-def build_digester(memory: Memory) -> Digester:
-    """Returns what digests the bags of a memory."""
-    from ros2_memory.catalogue.digest import Digester
-
-    return Digester(memory.reader)
+    bag_dir = settings.recording.bag_dir
+    return Backfill(memory, Filling(scanner, memory.reader, bag_dir, memory.clock, limits))
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:
@@ -655,12 +632,12 @@ def build_server(
     settings: Settings,
     memory: Memory,
     telemetry: Telemetry = SILENT,
-    catalogue: Callable[[], Progress] | None = None,
+    progress: Callable[[], Progress] | None = None,
     fleet: Fleet | None = None,
 ) -> EpisodicServer:
     """Returns the MCP server that answers from a memory, or from those of a fleet's robots.
 
-    `catalogue`: how far that is filled.
+    `progress`: how far the store of columns is filled.
     """
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.tools.instructions import instructions
@@ -676,7 +653,7 @@ def build_server(
         instructions=instructions(
             memory.limits, additions=server.tools == "all", several=fleet is not None
         ),
-        catalogue=catalogue,
+        progress=progress,
     )
 
 

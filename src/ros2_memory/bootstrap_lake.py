@@ -5,36 +5,27 @@ from __future__ import annotations
 
 import atexit
 import gc
-import json
 from contextlib import ExitStack
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import yaml
 
-from ros2_memory.bootstrap import (
-    build_backfill,
-    build_memory,
-    digest_config,
-    instantiated,
-)
+from ros2_memory.bootstrap import build_memory, instantiated, reading_of
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.config import RayNode
 from ros2_memory.core.errors import BagError, ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.bootstrap import SharedParts
     from ros2_memory.config import DuckdbNode, Settings
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.engines.base import LakeEngine
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import LakeLocation
-    from ros2_memory.serving.backfill import Backfill
 
 
 def require_extra() -> None:
@@ -156,8 +147,6 @@ def _robot(settings: Settings, name: str, shared: SharedParts) -> RobotBags:
 
     own = robot_settings(settings, name)
     memory = build_memory(own, shared, setting=ROBOTS_SETTING)
-    config = digest_config(own, shared.schemas)
-    entries = json.dumps([config.base, dict(config.entries)], sort_keys=True)
 
     def first_in(path: Path) -> Ns:
         summary = shared.reader.summarize(path)
@@ -165,20 +154,4 @@ def _robot(settings: Settings, name: str, shared: SharedParts) -> RobotBags:
             raise BagError(str(path), "it holds no message")
         return summary.start
 
-    return RobotBags(name, memory, _Digests(build_backfill(own, memory)), first_in, entries)
-
-
-class _Digests:
-    """Fills a memory's catalogue, as the query server does."""
-
-    def __init__(self, backfill: Backfill) -> None:
-        self._backfill = backfill
-
-    def waiting(self) -> Sequence[BagFile]:
-        """Returns the closed bags without a valid digest."""
-        self._backfill.look_after()
-        return self._backfill.renew(self._backfill.waiting())
-
-    def digest(self, bag: BagFile) -> bool:
-        """Digests a bag; False where it must wait, has changed, or is refused."""
-        return self._backfill.digest(bag)
+    return RobotBags(name, memory, first_in, reading_of(own, shared.schemas))

@@ -247,7 +247,7 @@ def _end_threads(code: int) -> int:
 
 
 def _helper(overrides: Sequence[str], *options: str) -> list[str]:
-    """Returns the command line of the program that digests a backlog."""
+    """Returns the command line of the program that stores a backlog."""
     program = [sys.executable, "-m", "ros2_memory.cli", "index"]
     return [*program, "--for-server", str(os.getpid()), *options, "--", *overrides]
 
@@ -259,7 +259,7 @@ async def _in_background(
     overrides: Sequence[str],
     warm_page: Callable[[], bool] | None,
 ) -> None:
-    """Keeps the index fresh and the catalogue full, until it is cancelled."""
+    """Keeps the index fresh and the store of columns full, until it is cancelled."""
     import anyio
 
     from ros2_memory.serving.backfill import keep_backfilled
@@ -275,7 +275,7 @@ async def _in_background(
 async def _fleet_in_background(
     fleet: Fleet, robots: Mapping[Robot, Backfill], every_s: float, overrides: Sequence[str]
 ) -> None:
-    """Keeps the indexes fresh and the catalogues full, until it is cancelled."""
+    """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
     import anyio
 
     from ros2_memory.serving.backfill import Filler, keep_all_backfilled

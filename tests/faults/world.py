@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_backfill, build_memory
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S
@@ -101,7 +101,7 @@ def served(bag_dir: Path) -> tuple[Memory, Backfill]:
 
 def fill_up(filler: Backfill) -> None:
     """Digests all that waits."""
-    fill_catalogue(filler)
+    fill_store(filler)
 
 
 def plainly(bag_dir: Path, *, count: int = 12) -> list[str]:

@@ -17,7 +17,7 @@ import structlog
 
 from ros2_memory import cli
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
@@ -266,7 +266,7 @@ def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) 
 
 def _digested(world: World, memory: Memory, verdict: Verdict) -> None:
     begun = time.process_time()
-    fill_catalogue(build_backfill(world.settings, memory))
+    fill_store(build_backfill(world.settings, memory))
     verdict.digest_s = time.process_time() - begun
     if verdict.digest_s > MOST_S:
         verdict.faults.append(f"slow: digesting took {verdict.digest_s:.1f} s")

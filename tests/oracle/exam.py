@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from tests.oracle.truth import SLACK_NS, History, Row, Topic, path_of, planar
 
@@ -95,7 +95,7 @@ class Server:
         )
         memory = build_memory(settings)
         if catalogue:
-            fill_catalogue(build_backfill(settings, memory))
+            fill_store(build_backfill(settings, memory))
         self._dispatcher = build_dispatcher(settings, memory)
 
     def ask(self, name: str, given: dict[str, Any]) -> Any:

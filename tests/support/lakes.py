@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Final
 
 from ros2_memory.bag_dir.layout import LIST_FILE
-from ros2_memory.bootstrap import build_digester
-from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
@@ -17,27 +15,13 @@ from ros2_memory.lake.files import Lake
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.warehouse import LakeLocation, location_of
-from ros2_memory.serving.backfill import Backfill
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 START_S: Final = 1_795_161_600
 LATER: Final = (START_S + 86_400) * NS_PER_S
-
-
-class FilledAtOnce:
-    """Digests of a test's memory, by the code of the server's backfill."""
-
-    def __init__(self, memory: Memory) -> None:
-        self._backfill = Backfill(memory, build_digester(memory), memory.index.bag_dir)
-
-    def waiting(self) -> Sequence[BagFile]:
-        return self._backfill.renew(self._backfill.waiting())
-
-    def digest(self, bag: BagFile) -> bool:
-        return self._backfill.digest(bag)
 
 
 def write_bag(
@@ -56,11 +40,9 @@ def write_bag(
 def robot_bags(name: str, bag_dir: Path, clock: Clock | None = None) -> RobotBags:
     """A robot whose bags are shipped."""
     bag_dir.mkdir(parents=True, exist_ok=True)
-    memory = recalling(memory_of(bag_dir, clock=clock), bag_dir)
+    memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
     reader = McapReader()
-    return RobotBags(
-        name, memory, FilledAtOnce(memory), lambda path: reader.summarize(path).start, "test"
-    )
+    return RobotBags(name, memory, lambda path: reader.summarize(path).start, "test")
 
 
 def location(folder: Path) -> LakeLocation:

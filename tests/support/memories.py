@@ -13,10 +13,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from ros2_memory.catalogue.digest import Digester
-from ros2_memory.catalogue.digest_config import DigestConfig
-from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
-from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE as COLUMNS
@@ -98,16 +94,9 @@ def shipped_extractor(max_array_length: int = 50) -> SchemaExtractor:
     return SchemaExtractor(shipped_schemas(), max_array_length)
 
 
-def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
-    """The memory with a catalogue and a store of the first `part` of the closed bags."""
-    catalogue = Catalogue([bag_dir / FOLDER / FILE], DigestConfig("test"))
-    recall = DigestCache(catalogue, bag_dir)
-    digester = Digester(memory.reader)
-    bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)
-    for bag in bags[: round(part * len(bags))]:
-        with suppress(BagError):  # one that is damaged inside stays without an entry
-            assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))
-    return replace(memory, recall=recall, columns=stored_columns(memory, bag_dir, part=part))
+def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
+    """The memory with a store of columns of the first `part` of the closed bags."""
+    return replace(memory, columns=stored_columns(memory, bag_dir, part=part))
 
 
 def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scanner:

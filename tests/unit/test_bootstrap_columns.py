@@ -11,7 +11,7 @@ from ros2_memory.bootstrap import (
     catalogue_paths,
     column_paths,
 )
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.columns.store import FILE
 from ros2_memory.config import load_settings
 from tests.support.bags import odom, write_mcap
@@ -70,7 +70,7 @@ def test_index_stores_the_columns_of_every_bag(
     memory = build_memory(settings)
     backfill = build_backfill(settings, memory)
     monkeypatch.setattr("ros2_memory.index.scan.YOUNG_NS", 0)
-    fill_catalogue(backfill)
+    fill_store(backfill)
     assert backfill.not_stored() == []
     assert memory.columns is not None
     assert memory.columns.store is not None

@@ -24,7 +24,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -128,7 +128,7 @@ CARRIERS = {
 
 def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
     memory = memory_of(bag_dir, limits=QuerySettings(**given.pop("limits", {})))
-    return asked(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool, **given)
+    return asked(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool, **given)
 
 
 def driven(topic: str) -> list[Msg]:
@@ -454,7 +454,7 @@ def test_once_the_usual_topic_of_poses_is_recorded_it_places_the_robot(tmp_path:
     driven = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(6)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", driven)
     near = {"x": 2.0, "y": 0.0, "radius_m": 1.2, "start": T0_S, "end": T0_S + 60}
-    recalls = recalling(memory_of(tmp_path), tmp_path)
+    recalls = with_store(memory_of(tmp_path), tmp_path)
     assert asked(recalls, tmp_path, "visits", **near)["total"] == 1
     write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + n * S, 2.0, 0.0) for n in range(20, 26)])
     [known] = asked(recalls, tmp_path, "visits", **near)["visits"]

@@ -132,7 +132,6 @@ def _examine(
         yield from check_clock(snapshot, now)
         yield from check_bags(settings, memory)
         yield from check_recordings(memory, snapshot)
-        yield from check_catalogue(memory)
         yield from check_columns(memory)
         recorder = settings.recorder
         if isinstance(recorder, NullRecorderNode):
@@ -163,7 +162,6 @@ def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
         *check_clock(snapshot, now),
         *check_bags(own, memory),
         *check_recordings(memory, snapshot),
-        *check_catalogue(memory),
         *check_columns(memory),
     ]
     for each in found:
@@ -385,17 +383,6 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
         yield _warning("bags", seen, do)
 
 
-def check_catalogue(memory: Memory) -> Iterator[Finding]:
-    """Checks that the catalogue stored what the checks before this one computed."""
-    catalogue = None if memory.recall is None else memory.recall.catalogue
-    if catalogue is None or not catalogue.refusals:
-        return
-    entries = counted(catalogue.refusals, "result")
-    seen = f"the catalogue did not store {entries} ({catalogue.refused_for}): no answer depends "
-    do = "answers are right, and slower; please report this as a defect, with the reason"
-    yield _warning("catalogue", f"{seen}on it", do)
-
-
 def check_columns(memory: Memory) -> Iterator[Finding]:
     """Checks that columns can be stored, and names topics that are beyond their share."""
     store = None if memory.columns is None else memory.columns.store
@@ -405,6 +392,10 @@ def check_columns(memory: Memory) -> Iterator[Finding]:
     if store.trouble is not None:
         do = "answers are right, and slower; free the disk, or let it be written"
         yield _warning("columns", f"the store of columns {store.trouble}", do)
+    if store.refusals:
+        bags = counted(store.refusals, "bag")
+        do = "answers are right, and slower; please report this as a defect, with the reason"
+        yield _warning("columns", f"{bags} could not be stored ({store.refused_for})", do)
     if dropped:
         since = iso_local(min(dropped.values()))
         seen = f"topics beyond store.max_share since {since}, whose bags are read: "

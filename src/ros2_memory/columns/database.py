@@ -152,11 +152,6 @@ class Database:
         """What is added to a row's id in the open database to give the number of its entry."""
         return self._databases << ROW_ID_BITS
 
-    def row_ids(self, numbers: Sequence[int]) -> Sequence[int]:
-        """Returns the row ids of these entries, without those of a database that was lost."""
-        offset = self.offset
-        return [number - offset for number in numbers if self.is_current(number)]
-
     def is_current(self, number: int) -> bool:
         """Returns whether an entry is of the open database, and of none that was lost."""
         return number >> ROW_ID_BITS == self._databases
@@ -226,20 +221,6 @@ class Database:
         if self.is_failing:
             self.write(lambda _: None)
 
-    def compact(self) -> None:
-        """Rewrites the file without its gaps, which are about a tenth of it after many entries.
-
-        Skipped if another program writes to it, or the disk has no space for a copy.
-        """
-        with self._lock:
-            opened = self._ready()
-            if opened is None or opened.path is None:
-                return
-            with suppress(sqlite3.Error):
-                opened.connection.execute("VACUUM")
-                # The copy went through the write-ahead log, which would keep that size.
-                opened.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-
     def give_back(self) -> None:
         """Returns unused pages to the disk where many are, a few at a time: nobody waits for long.
 
@@ -261,7 +242,7 @@ class Database:
     def look_after(self, *, thorough: bool = False) -> None:
         """Reopens the file where it was deleted, replaced, or could not be opened before.
 
-        Where a preferred path has become available since, the catalogue moves there with all of
+        Where a preferred path has become available since, the database moves there with all of
         its content. This may take a while, so no question should wait for it.
 
         Args:
@@ -305,7 +286,7 @@ class Database:
     def _move_to_preferred_path(self, before: OpenDatabase) -> None:
         """Opens the file at a path that is preferred to the present one, where one works now.
 
-        The content of a file is copied there first; that of memory is digested again.
+        The content of a file is copied there first; that of memory is made again.
         """
         self._tried_s = self._monotonic()
         paths = tuple(self._candidate_paths())
@@ -432,7 +413,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path, tables: Tables) -> No
             temporary.unlink(missing_ok=True)
             _refuse_links(source)
             # Without a log no program has it open; immutable: SQLite creates no file beside it.
-            mode = "mode=ro" if _files_of(source)[1].exists() else "mode=ro&immutable=1"
+            mode = "mode=ro" if files_of(source)[1].exists() else "mode=ro&immutable=1"
             address = f"{source.absolute().as_uri()}?{mode}"
             with (
                 closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
@@ -448,7 +429,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path, tables: Tables) -> No
         else:
             return
         finally:
-            for each in _files_of(temporary):
+            for each in files_of(temporary):
                 with suppress(OSError):
                     each.unlink(missing_ok=True)
 
@@ -459,7 +440,7 @@ def _refuse_links(path: Path) -> None:
     Raises:
         OSError: the file, its write-ahead log or its folder is a symbolic link.
     """
-    for each in (path.parent, *_files_of(path)):
+    for each in (path.parent, *files_of(path)):
         if each.is_symlink():
             raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
 
@@ -514,7 +495,7 @@ def _code(error: Exception) -> int:
     return code & 0xFF if isinstance(code, int) else 0
 
 
-def _files_of(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
     """Returns the file itself, its write-ahead log and the log's index."""
     return [path, *(path.with_name(path.name + suffix) for suffix in _SUFFIXES)]
 
@@ -522,7 +503,7 @@ def _files_of(path: Path) -> list[Path]:
 def _identities(path: Path) -> tuple[tuple[int, int] | None, ...]:
     """Returns device and inode of each of the database's files; None if there is none."""
     found: list[tuple[int, int] | None] = []
-    for each in _files_of(path):
+    for each in files_of(path):
         try:
             status = each.stat()
         except (FileNotFoundError, NotADirectoryError):
@@ -537,7 +518,7 @@ def _connect_and_check(path: Path, tables: Tables) -> sqlite3.Connection:
 
     Raises:
         OSError: it cannot be set aside, or another version of this program uses it: each setting
-            the other's file aside, they would digest all bags for ever.
+            the other's file aside, they would store all bags for ever.
         sqlite3.Error: it is busy, or cannot be opened or written.
     """
     for _ in range(2):
@@ -617,6 +598,6 @@ def _set_aside(path: Path, reason: str) -> None:
     """Renames a file so that a new one can be made; the old one stays for inspection."""
     aside = path.with_name(f"{path.name}.aside")
     log.warning("database_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
-    for each in _files_of(path)[1:]:
+    for each in files_of(path)[1:]:
         each.unlink(missing_ok=True)
     path.rename(aside)

@@ -61,8 +61,21 @@ class StoreLimits:
     max_bytes: int = 2 * 10**9
 
 
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How many closed bags there are, and how many of them are stored.
+
+    `waiting` are still to be stored. `refused` could not be: every question about them reads them.
+    """
+
+    closed: int
+    stored: int = 0
+    waiting: int = 0
+    refused: int = 0
+
+
 class Filling:
-    """Fills the store of one bag directory. For one thread.
+    """Fills the store of one bag directory. For one thread, but for `progress`.
 
     Args:
         scanner: of the store.
@@ -107,11 +120,23 @@ class Filling:
         found = [bag for bag in found if not self._is_refused(self._key(bag))]
         return self._fitting(sorted(found, key=in_time, reverse=True))
 
+    def progress(self, timeline: Timeline) -> Progress:
+        """Returns how much is stored. Any thread may ask."""
+        coverage = self._scanner.coverage(timeline)
+        missing = () if coverage is None else coverage.missing
+        closed = sum(bag.state is BagState.CLOSED for bag in timeline.bags)
+        return Progress(
+            closed,
+            closed - sum(bag.state is BagState.CLOSED for bag in missing),
+            len(self.waiting(timeline)),
+            sum(map(self._is_refused, [*self._refused])),
+        )
+
     def fill(self, bag: BagFile, timeline: Timeline) -> bool:
         """Stores one bag; returns False if it must wait, has changed meanwhile, or is refused."""
-        if not self._may_be_stored(bag):
+        if not self._is_settled(bag):
             return False
-        begun = time.perf_counter_ns()
+        begun, refusals = time.perf_counter_ns(), self.store.refusals
         try:
             if self._is_renewed(bag):
                 return True
@@ -126,6 +151,8 @@ class Filling:
         if stored:
             spent = ms_from_ns(time.perf_counter_ns() - begun)
             log.debug("bag_stored", path=str(bag.path), duration_ms=round(spent, 3))
+        elif self.store.refusals > refusals:
+            self._refuse(bag, self.store.refused_for or "")
         return stored
 
     def merge(self, timeline: Timeline) -> list[TimeWindow]:
@@ -215,7 +242,7 @@ class Filling:
         groups = decoded(self._reader, bag.path, hashed=is_hashed)
         first = next(groups, [])
         second = next(groups, None)
-        key, is_current = self._key(bag), partial(self._may_be_stored, bag)
+        key, is_current = self._key(bag), partial(self._is_settled, bag)
         if second is None and bag.end - bag.start <= LONG_NS:
             tables = self._whole(bag, first)
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
@@ -238,20 +265,8 @@ class Filling:
         everything = TimeWindow.everything()
         return [with_all_messages(self._reader, bag.path, table, everything) for table in tables]
 
-    def _may_be_stored(self, bag: BagFile) -> bool:
-        """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
-        try:
-            stat = os.lstat(bag.path)
-        except OSError:
-            return False
-        sidecar_ns = _mtime_ns(bag.path.with_name(HANDOVER_FILE))
-        now = self._clock.now()
-        return (
-            (stat.st_size, stat.st_mtime_ns, sidecar_ns) == (bag.size, bag.mtime_ns, bag.sidecar_ns)
-            and settled(stat.st_mtime_ns, now)
-            and settled(sidecar_ns, now)
-            and not (self._bag_dir / ERASING_FILE).exists()
-        )
+    def _is_settled(self, bag: BagFile) -> bool:
+        return is_settled(bag, self._bag_dir, self._clock.now())
 
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""
@@ -309,6 +324,21 @@ class Filling:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
+
+
+def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
+    """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
+    try:
+        stat = os.lstat(bag.path)
+    except OSError:
+        return False
+    sidecar_ns = _mtime_ns(bag.path.with_name(HANDOVER_FILE))
+    return (
+        (stat.st_size, stat.st_mtime_ns, sidecar_ns) == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+        and settled(stat.st_mtime_ns, now)
+        and settled(sidecar_ns, now)
+        and not (bag_dir / ERASING_FILE).exists()
+    )
 
 
 def _is_hashed(channel: Channel, *, everything: bool) -> bool:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.fragments import Kind, Sized
@@ -101,6 +102,7 @@ class Scanner:
     Attributes:
         events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
+        clock_steps: by suspected hole and the bags beside it, the steps of the clock in it.
         statics: by session and topics, the static transforms of a timeline.
         sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
         things: by settings, what was estimated of all bags of a timeline.
@@ -115,6 +117,7 @@ class Scanner:
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
+        self.clock_steps: ByteLru[tuple[ClockStep, ...]] = ByteLru(1 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
         self.sights: ByteLru[bytes] = ByteLru(16 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)

@@ -57,6 +57,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Definition, IntArray
 
 FILE: Final = "columns.sqlite"
+CATALOGUE: Final = "catalogue.sqlite"
+"""The file of digests that lay in its place in versions before it."""
 LONG_NS: Final[Ns] = 2 * PART_NS
 """A bag that lasts longer becomes parts at once."""
 

@@ -137,8 +137,7 @@ class BagFile(NamedTuple):
 
     `file` is its path as a string, to save memory: the index keeps 60,000. `start` and `end` are
     the log times of its first and last message, both inclusive. `sidecar_ns` is the mtime of
-    `handover.json` beside it, which decides which of its messages count, or 0. `entry` is the
-    number of the catalogue's entry that this was read from, or 0.
+    `handover.json` beside it, which decides which of its messages count, or 0.
     """
 
     file: str
@@ -149,7 +148,6 @@ class BagFile(NamedTuple):
     start: Ns
     end: Ns
     sidecar_ns: Ns = 0
-    entry: int = 0
 
     @property
     def path(self) -> Path:

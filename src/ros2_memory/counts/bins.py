@@ -203,7 +203,7 @@ class BinnedWindow:
         self.view.notes.complete = False
         self.view.notes.add(
             f"only what is after {unix_text(since)} is counted: "
-            f"{self.view.bags.backfill_progress() or 'out of time; '}"
+            f"{self.view.bags.filling_progress() or 'out of time; '}"
             "ask about a shorter window"
         )
 

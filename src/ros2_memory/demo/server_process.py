@@ -90,7 +90,7 @@ def running_server(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Yields a server that answers, and ends it after the block; says what it waits for.
 
-    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
+    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its columns
     into a folder that is removed at the end: no one else uses it. The rooms of the flat are written
     to `places.yaml` in the bag directory.
 

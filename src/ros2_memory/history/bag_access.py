@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
-from ros2_memory.catalogue.lookup import bags_without_entry
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -22,18 +21,13 @@ from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import BagSpan
-    from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Channel, Record
-
-T = TypeVar("T")
 
 _DEADLINE_CHECK_INTERVAL: Final = 256
 """Messages between two looks at the deadline."""
@@ -62,7 +56,6 @@ class BagAccess:
             self.snapshot = memory.index.snapshot(reach)
         self.notes = Notes()
         self._deadline = call.deadline
-        self._as_of: int | None = None
 
     def finish_within(self, budget_s: float) -> None:
         """Gives a call whose time is over some more, to say what it found."""
@@ -77,67 +70,28 @@ class BagAccess:
         if self._deadline.expired():
             budget_s = self.call.deadline.budget_s
             raise QueryTimeoutError(
-                f"the question needs more than {budget_s:g} s; {self.backfill_progress()}"
+                f"the question needs more than {budget_s:g} s; {self.filling_progress()}"
                 "ask about a shorter window or a single topic"
             )
 
-    def backfill_progress(self) -> str:
-        """Returns how many bags the catalogue has, as part of a sentence on lack of time.
+    def filling_progress(self) -> str:
+        """Returns how many bags are stored as columns, as part of a sentence on lack of time.
 
-        Bags without an entry are read for every question, which takes long where there are many.
-        Empty where more than 99 % of the bags have one: then the catalogue is not the cause.
+        Others are read for every question, which takes long where there are many. Empty where that
+        is less than 1 % of them: then it is not the cause.
         """
-        cache = self.memory.recall
-        closed = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)
-        if cache is None or not closed:
+        columns = self.memory.columns
+        coverage = None if columns is None else columns.coverage(self.snapshot.timeline)
+        if coverage is None:
             return ""
-        missing = len(bags_without_entry(self.snapshot.timeline.segments, cache))
-        if missing * 100 <= closed:
+        bags = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)
+        missing = sum(bag.state is BagState.CLOSED for bag in coverage.missing)
+        if missing * 100 <= bags:
             return ""
         return (
-            f"the catalogue, which makes such questions quick, has {closed - missing} of {closed} "
-            "bags so far: wait for it, or "
+            f"the store of columns, which makes such questions quick, has {bags - missing} of "
+            f"{bags} bags so far: wait for it, or "
         )
-
-    def digests_of(self, segment: Segment) -> SegmentDigests | None:
-        """Returns what the catalogue has of a segment of the snapshot; None without a catalogue."""
-        cache = self.memory.recall
-        if cache is None:
-            return None
-        settled = cache.complete_digests(segment)
-        if settled is not None:
-            return settled
-        if self._as_of is None:
-            # One state of the catalogue for the whole call, asked for only where it may have grown.
-            self._as_of = cache.catalogue.newest()
-        return cache.digests_for(segment, self._as_of)
-
-    def entry(self, bag: BagFile) -> tuple[SegmentDigests, int] | None:
-        """Returns the digests that include a bag, and its number in them; None without an entry."""
-        digests = self.digests_of(self.snapshot.timeline.segment_of(bag))
-        number = None if digests is None else digests.numbers.get(bag.file)
-        return None if digests is None or number is None else (digests, number)
-
-    def cached_answer(
-        self, question: str, bags: Sequence[BagSpan], parse: Callable[[str], T]
-    ) -> T | None:
-        """Returns what was computed from these bags before; None where the catalogue has none."""
-        cache, numbers = self.memory.recall, self.entry_numbers(bags)
-        if cache is None or numbers is None:
-            return None
-        return cache.cached_answer(question, numbers, parse)
-
-    def cache_answer(self, question: str, bags: Sequence[BagSpan], answer: str) -> None:
-        """Stores what was computed from these bags, unless something could not be read."""
-        cache, numbers = self.memory.recall, self.entry_numbers(bags)
-        if cache is not None and numbers is not None and self.notes.complete:
-            cache.catalogue.cache_answer(question, numbers, answer)
-
-    def entry_numbers(self, bags: Sequence[BagSpan]) -> list[int] | None:
-        """Returns the numbers of the bags' entries; None where one has none."""
-        entries = [self.entry(each.bag) for each in bags]
-        numbers = [entry[1] for entry in entries if entry is not None]
-        return numbers if len(numbers) == len(entries) else None
 
     def track_sources(self, messages: Iterator[StoredMessage]) -> Iterator[StoredMessage]:
         """Yields the messages, and records what kind of bags they are from.

@@ -174,17 +174,8 @@ def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Grou
         else:
             groups.append([each])
         latest[recording] = each.last if before is None else max(before, each.last)
-    relatched = stream.relatched_bags(topic, bags)
-    return [
-        Group(
-            stream,
-            topic,
-            window,
-            group,
-            may_be_relatched=any(each.bag.file in relatched for each in group),
-        )
-        for group in groups
-    ]
+    repeats = stream.may_be_relatched([topic])
+    return [Group(stream, topic, window, group, may_be_relatched=repeats) for group in groups]
 
 
 def _belongs(first: Ns, recording: Path, latest: Mapping[Path, Ns]) -> bool:

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.topic_events import State
+    from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
@@ -109,22 +108,27 @@ T = TypeVar("T", bound="Sized")
 
 
 class Shipped(Protocol):
-    """Fragments of whole bags, as a lake has them."""
+    """What a lake has of whole bags."""
 
-    def __call__(self, bag: BagFile, kind: Kind[T]) -> T | None:
-        """Returns the fragment of a bag; None if the lake has none."""
+    def fragment(self, bag: BagFile, kind: Kind[T]) -> T | None:
+        """Returns what follows from a bag; None if the lake has it not."""
+
+    def events(self, bag: BagFile, topic: str) -> TopicEvents | None:
+        """Returns the events on a topic in a bag, `NO_EVENTS` for none; None if not known."""
+
+    def words(self, bag: BagFile, topic: str) -> str | None:
+        """Returns the words in texts of a topic in a bag; None if not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
-    `columns` scans topics, from its store where that has the bags; a lake has none. `recall` holds
-    digests of the bags, for what does not scan yet. Every answer is the same with them and without.
-    `stated` is
-    set for a lake, which stores what messages state instead of the messages: it returns that, or
-    None for a message that can be decoded. The poses of a lake are thinned, and its rows have no
-    transforms that place what was seen; `shipped` has what followed from all of a bag before.
+    `columns` scans topics, from its store where that has the bags; every answer is the same without
+    the store. A lake has no `columns`. `stated` is set for a lake, which stores what messages state
+    instead of the messages: it returns that, or None for a message that can be decoded. The poses
+    of a lake are thinned, and its rows have no transforms that place what was seen; `shipped` has
+    what followed from all of a bag before.
     """
 
     index: SnapshotSource
@@ -132,7 +136,6 @@ class Memory:
     extractor: SchemaExtractor
     clock: Clock
     limits: QuerySettings
-    recall: DigestCache | None = None
     columns: Scanner | None = None
     stated: Callable[[Record], State | None] | None = None
     shipped: Shipped | None = None
@@ -147,8 +150,7 @@ class Memory:
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
         """Returns what recordings' metadata.yaml lists and is not there."""
-        store = None if self.recall is None else self.recall.catalogue
-        return absent_splits(snapshot, self.index.bag_dir, store)
+        return absent_splits(snapshot, self.index.bag_dir)
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.
@@ -202,7 +204,7 @@ class Stages:
 
 
 READING_S: Final = 4.0
-"""How long a call reads bags without a digest, before its answer is partial."""
+"""How long a call reads bags that are not stored, before its answer is partial."""
 
 
 @dataclass(slots=True)
@@ -360,8 +362,8 @@ class Notes:
             # A sentence on the bag's summary may report the same already.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
-        # In which order bags are found damaged depends on what the catalogue knows: sorted, the
-        # sentences are the same with and without it.
+        # In which order bags are found damaged depends on what is stored: sorted, the sentences
+        # are the same whatever is.
         shared = iter(sorted(kind.sentence(files) for kind, files in by_kind.items()))
         return tuple(
             each if isinstance(each, str) else next(shared)
@@ -389,7 +391,7 @@ class Notes:
         """Removes the notes on what lies before a moment, except those to `keep`.
 
         For a question that did not need it: how far back is read besides what is asked for depends
-        on what the catalogue knows, and the reply must not.
+        on what is stored, and the reply must not.
         """
         self._notes = {
             key: note for key, note in self._notes.items() if note.until >= moment or key in keep

@@ -60,7 +60,7 @@ _MOST_TRIED: Final = 1000
 _BODIES: Final = ("base_footprint", "base_link")
 _NO_POSES: Final = "no topic has the robot's poses"
 _MOST_BAGS_OF_BODY: Final = 128
-"""Bags of which transforms are read for a path, as no digest has them."""
+"""Bags of which transforms are read for a path."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
 
@@ -177,7 +177,7 @@ def _path_back(
     for first, last, bag in reversed(view.stream.overlapping_bags([topic], window)):
         reached(last)
         is_whole = window.contains(first) and window.contains(last)
-        made = shipped(bag, PATHS) if is_whole else None
+        made = shipped.fragment(bag, PATHS) if is_whole else None
         if made is None:
             poses = (poses_of_bag(view, bag, topic) or NO_POSES).between(window.start, window.stop)
             made = path_slice(poses, view.memory.limits.max_plausible_speed_mps)
@@ -363,8 +363,8 @@ def poses_of_body(
 ) -> list[tuple[Ns, Pose]]:
     """Returns the poses of the robot's body by transforms, in order; none without such a body.
 
-    In the map or the root of its frames, or in `frame_id`. At most twenty a second, as digests hold
-    none of them: all are looked up for each question.
+    In the map or the root of its frames, or in `frame_id`. At most twenty a second: all are looked
+    up for each question.
 
     Raises:
         InvalidArgumentsError: there are too many bags for that.

@@ -163,19 +163,6 @@ class MergedStream:
             for topic in topics
         )
 
-    def relatched_bags(self, topic: str, among: Iterable[BagSpan]) -> set[str]:
-        """Returns the files of the bags that may repeat a message of another recording.
-
-        Bags without a catalogue entry are among them.
-        """
-        found: set[str] = set()
-        if self.may_be_relatched([topic]):
-            for _, _, bag in among:
-                entry = self.bags.entry(bag)
-                if entry is None or entry[0].relatched(topic).get(entry[1], True):
-                    found.add(bag.file)
-        return found
-
     def find_first_copy(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
         topic, window = found.record.channel.topic, _since_published(found)

@@ -1,8 +1,8 @@
 """Search backwards in time for the last message that meets a condition.
 
-The catalogue's digests rule out bags that cannot contain a match. A match that counts is in a bag
-that is not ruled out, so only the time of such bags is searched. Inside of it everything that can
-decide which messages count is read, as without a catalogue: the answer is the same.
+Zones and words of columns rule out what cannot match, and so do a lake's words of whole bags. Only
+the time of what is left is searched; inside of it everything that can decide which messages count
+is read.
 """
 
 from __future__ import annotations
@@ -42,11 +42,10 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, unknown_name_hint
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
@@ -248,7 +247,7 @@ def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
     back_to, budget_s = unix_text(searched_to), view.call.deadline.budget_s
     return QueryTimeoutError(
         f"no match back to {back_to}, and {budget_s:g} s are over; "
-        f"{view.bags.backfill_progress()}to continue from there, ask again with before={back_to}",
+        f"{view.bags.filling_progress()}to continue from there, ask again with before={back_to}",
         searched_back_to=searched_to,
     )
 
@@ -308,8 +307,6 @@ class ReverseSearch:
             for part in candidates.windows():
                 for found in self._messages(part):
                     if self.matches(found):
-                        # What lies before the match was read for nothing, or not: that depends on
-                        # what the catalogue knows, so the reply must not.
                         self._view.notes.retract_before(found.time, noted_before)
                         self._view.stream.find_first_copy(found)
                         self.note_undecodable()
@@ -498,6 +495,7 @@ class CandidateBags:
         self._topics = topics
         self.condition = condition
         self._until = until
+        self._known: dict[str, bool] = {}
         self.ruled_out = False
 
     def windows(self) -> Iterator[SearchWindow]:
@@ -538,34 +536,22 @@ class CandidateBags:
                 yield heapq.heappop(waiting)[2]
 
     def _in_segment(self, segment: Segment, topic: str) -> Iterator[_Candidate]:
-        digests = self._view.bags.digests_of(segment)
-        known = {} if digests is None else digests.numbers
-        possible: Collection[int] = ()
-        if digests is not None and known:
-            possible = possible_entries(digests, topic, self.condition)
-            if digests.whole and not possible:
-                self.ruled_out = True
-                return
+        shipped = self._view.memory.shipped
         for bag, first, last in segment.extents(topic):
             if first >= self._until:
                 continue
-            number = known.get(bag.file)
-            if number is None or number in possible:
+            words = None if shipped is None else shipped.words(bag, topic)
+            if words is None or self._may_match(words):
                 yield _Candidate(first, last, topic, bag)
             else:
                 self.ruled_out = True
 
-
-def possible_entries(digests: SegmentDigests, topic: str, condition: Condition) -> Collection[int]:
-    """Returns the numbers of the entries that can contain a match."""
-
-    def possible() -> set[int]:
-        words = digests.words(topic)
-        return {
-            number for number, known in words.items() if known is None or condition.may_match(known)
-        }
-
-    return digests.derived(f"possible {topic} {condition!r}", possible)
+    def _may_match(self, words: str) -> bool:
+        """Whether texts of these words may match; most bags have the same few words."""
+        known = self._known.get(words)
+        if known is None:
+            known = self._known[words] = self.condition.may_match(words)
+        return known
 
 
 def _search_window(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:

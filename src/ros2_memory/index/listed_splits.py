@@ -6,12 +6,11 @@ since, or never copied, leave no other trace.
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
@@ -24,14 +23,11 @@ from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.index.scan import settled
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from ros2_memory.index.snapshot import Snapshot
 
 _MAX_CACHED_FOLDERS: Final = 65_536
-_FEW: Final = 32
-"""One of so many recordings is read faster than what was found of all of them is stored."""
-_STORED: Final = "listed 1"
 _MISSING: Final = "metadata.yaml lists it, but it is missing"
 
 
@@ -49,16 +45,6 @@ class Absent(NamedTuple):
     files: tuple[str, ...] = ()
     messages: int = 0
     unreadable: bool = False
-
-
-class Store(Protocol):
-    """Stores texts by name for later processes; what it has stored it may lose at any time."""
-
-    def text(self, name: str) -> str | None:
-        """Returns the text that was stored under a name, if any."""
-
-    def store_text(self, name: str, text: str) -> None:
-        """Stores a text under a name."""
 
 
 _Stamp: TypeAlias = "tuple[int, int, int]"
@@ -87,14 +73,12 @@ _KNOWN: Final[dict[tuple[Path, str], tuple[_Stamp, _Listed]]] = {}
 """By bag directory and folder: how it was, and what it held then."""
 
 
-def absent_splits(snapshot: Snapshot, bag_dir: Path, store: Store | None = None) -> list[Absent]:
+def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
     """Returns what is missing of the recordings of a snapshot.
 
     A recorder of ours deletes splits of its recordings, whose metadata.yaml still lists them. Those
     that it noted are not missing, nor are those before the first split that is left: versions
     before the notes deleted the oldest.
-
-    `store` has what earlier processes found in folders that have not changed since.
     """
     if not snapshot.metadata_folders:
         return []
@@ -106,7 +90,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, store: Store | None = None)
             bags[name] += tally.bags
             messages[name] += tally.messages
     absent, deleted = [], read_deleted(bag_dir)
-    for path, listed_there in _listed(snapshot, bag_dir, store):
+    for path, listed_there in _listed(snapshot, bag_dir):
         if listed_there is None or listed_there.bags is None:
             absent.append(Absent(path, unreadable=True))
             continue
@@ -176,30 +160,20 @@ def _compare(
     return Absent(path, tuple(name for name, _ in missing), lost)
 
 
-def _listed(
-    snapshot: Snapshot, bag_dir: Path, store: Store | None
-) -> Iterator[tuple[str, _Listed | None]]:
+def _listed(snapshot: Snapshot, bag_dir: Path) -> Iterator[tuple[str, _Listed | None]]:
     """Yields the folders with a metadata.yaml that is not being written, and what that lists.
 
     None where the folder or the file cannot be read.
     """
-    prefix, now = f"{bag_dir}/", snapshot.scanned_at
-    stored: Mapping[str, tuple[_Stamp, _Listed]] | None = None
-    kept: dict[str, tuple[_Stamp, _Listed]] = {}
-    read = 0
+    now = snapshot.scanned_at
     for path in snapshot.metadata_folders:
-        name = path.removeprefix(prefix)
         try:
             stamp = _stamp(path)
             if not settled(stamp[0], now):
                 continue
             known = _KNOWN.get((bag_dir, path))
             if known is None or known[0] != stamp:
-                stored = _stored(store) if stored is None else stored
-                known = stored.get(name)
-            if known is None or known[0] != stamp:
                 known = stamp, _read(bag_dir, path)
-                read += 1
         except FileNotFoundError:
             continue
         except (OSError, ValueError):
@@ -207,37 +181,16 @@ def _listed(
             continue
         # A folder that changed just now may change again within the same mtime.
         if settled(stamp[2], now):
-            _KNOWN[bag_dir, path] = kept[name] = known
+            _KNOWN[bag_dir, path] = known
         yield path, known[1]
     if len(_KNOWN) > _MAX_CACHED_FOLDERS:
         _KNOWN.clear()
-    if store is not None and read * _FEW > len(kept) > 0:
-        store.store_text(_STORED, json.dumps(kept))
 
 
 def _stamp(folder: str) -> _Stamp:
     # As texts: a path for each folder takes longer than to look at it.
     status = os.lstat(f"{folder}/{METADATA_FILE}")
     return status.st_mtime_ns, status.st_size, os.stat(folder).st_mtime_ns  # noqa: PTH116
-
-
-def _stored(store: Store | None) -> dict[str, tuple[_Stamp, _Listed]]:
-    """Returns what is stored of folders, by name; nothing where a damaged file holds other text."""
-    found: dict[str, tuple[_Stamp, _Listed]] = {}
-    text = None if store is None else store.text(_STORED)
-    try:
-        for name, (stamp, stored) in json.loads(text or "{}").items():
-            written, size, changed = map(int, stamp)
-            *missing, bags, messages, is_total = stored
-            first, later = (tuple((str(file), int(n)) for file, n in each) for each in missing)
-            numbers = (
-                None if bags is None else int(bags),
-                None if messages is None else int(messages),
-            )
-            found[name] = (written, size, changed), _Listed(first, later, *numbers, bool(is_total))
-    except (ValueError, TypeError, AttributeError):
-        return {}
-    return found
 
 
 def _read(bag_dir: Path, folder: str) -> _Listed:

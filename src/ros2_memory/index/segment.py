@@ -257,14 +257,6 @@ class Segment:
         none = np.empty(0, np.int64)
         return (none, none) if column is None else (column.firsts, column.lasts)
 
-    def bags_with(self, topic: str) -> tuple[BagFile, ...]:
-        """Returns the bags that hold the topic, in order; `bags` itself where all do."""
-        if all(topic in schema.positions for schema in self._schemas):
-            return self.bags
-        column = _columns(self).of(topic)
-        rows = [] if column is None else column.bags.tolist()
-        return tuple(self.bags[row] for row in dict.fromkeys(rows))
-
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
         """By topic, the types of its messages."""

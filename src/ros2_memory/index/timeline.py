@@ -105,10 +105,6 @@ class Timeline:
         end = bisect_left(self._firsts, window.stop, key=lambda first: first[0])
         return self.segments[begin:end]
 
-    def segment_of(self, bag: BagFile) -> Segment:
-        """Returns the segment of a bag of this timeline."""
-        return self.segments[self._position(bag)]
-
     def is_settled(self, segment: Segment) -> bool:
         """Returns whether a segment stays as it is while bags are added and the oldest deleted."""
         if segment is self.segments[-1]:

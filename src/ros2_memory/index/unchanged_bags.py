@@ -1,4 +1,4 @@
-"""Closed bags that do not change any more, or not since the catalogue stored them: most of a week.
+"""Closed bags that do not change any more, or not since their columns were stored: most of a week.
 
 Of each the index keeps the bag and its inode, and nothing else. Should its file change, it is
 reactivated: the notes on it are made as if it had been read, and it is classified again.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import replace
 from heapq import nlargest
@@ -28,7 +27,7 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import resolve_pose_topic, seconds
@@ -56,6 +55,8 @@ _MOST_HOLES: Final = 8
 _MOST_STAMPED: Final = 8
 """Topics of which header stamps are looked at."""
 _STAMP: Final = "header.stamp"
+_STEPS_BYTES: Final = 1_000
+"""About how much memory takes what a hole is."""
 
 
 def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep, ...]:
@@ -158,22 +159,23 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
 
 
 def _steps_in(view: View, topic: str | None, suspect: SuspectedHole) -> Sequence[ClockStep]:
-    """Returns the steps in a suspected hole, by its bags or by what the catalogue has of them."""
+    """Returns the steps in a suspected hole, which is looked at once if its bags are closed."""
     around = TimeWindow(suspect.first, suspect.last + 1).widened(BESIDE_NS)
     topics = [] if topic is None else [topic]
     topics += [] if suspect.bag is None else _busiest(suspect.bag)
-    bags = view.stream.overlapping_bags(topics, around)
-    question = json.dumps(["clock steps by stamps", topic, suspect.first, suspect.last])
-    steps = view.bags.cached_answer(question, bags, _decode)
-    if steps is None:
-        with view.notes.isolated():
-            steps = tuple(_read_steps(view, topic, suspect))
-            view.bags.cache_answer(question, bags, json.dumps(steps))
+    bags = [span.bag for span in view.stream.overlapping_bags(topics, around)]
+    states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
+    key = (topic, suspect.first, suspect.last, *states)
+    scanner = view.memory.columns
+    kept = None if scanner is None else scanner.clock_steps.get(key)
+    if kept is not None:
+        return kept
+    with view.notes.isolated():
+        steps = tuple(_read_steps(view, topic, suspect))
+        is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
+    if scanner is not None and is_final:
+        scanner.clock_steps.put(key, steps, _STEPS_BYTES)
     return steps
-
-
-def _decode(answer: str) -> tuple[ClockStep, ...]:
-    return tuple(ClockStep(at, by) for at, by in json.loads(answer))
 
 
 def _read_steps(view: View, topic: str | None, suspect: SuspectedHole) -> Iterator[ClockStep]:

@@ -1,7 +1,7 @@
 """What differs between two windows: things, way, standstills, time in places, errors, silences.
 
 Two numbers differ where they are apart by more than a tenth of the larger, and by more than what
-noise and the digests' rounding may make of equal ones (`_LEAST`).
+noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 """
 
 from __future__ import annotations

@@ -165,7 +165,8 @@ def _stands_in(view: View, topic: str, window: TimeWindow) -> list[Stands]:
         return _stands(view, blocks_back(view, topic, window, []))
     found: list[Stands] = []
     for _, _, bag in reversed(view.stream.overlapping_bags([topic], window)):
-        poses = poses_of_bag(view, bag, topic) if (made := shipped(bag, STANDS)) is None else None
+        made = shipped.fragment(bag, STANDS)
+        poses = poses_of_bag(view, bag, topic) if made is None else None
         if made is None and poses is not None:
             made = stands_of(poses, MIN_NS, MAX_NS, goes_on=True)
         found += [] if made is None else [made]

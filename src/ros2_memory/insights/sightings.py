@@ -282,7 +282,6 @@ def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings)
     for topic in found.open_topics():
         found.end(topic)
     if found.enough:
-        # Without the catalogue one message more would be read here: the reply is to be the same.
         _stop(search, found)
     else:
         # What lies outside of a scope is not read, and may well be decodable.
@@ -419,12 +418,9 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     if gap.empty:
         return False
     held = view.stream.overlapping_bags([topic], gap)
-    relatched = view.stream.relatched_bags(topic, held)
-    if len({each.bag.recording for each in held}) == 1 and any(
-        gap.contains(each.first) or gap.contains(each.last)
-        for each in held
-        if each.bag.file not in relatched
-    ):
+    is_alone = len({each.bag.recording for each in held}) == 1
+    counts = is_alone and not view.stream.may_be_relatched([topic])
+    if counts and any(gap.contains(each.first) or gap.contains(each.last) for each in held):
         return True
     return bool(held) and view.stream.first([topic], gap) is not None
 

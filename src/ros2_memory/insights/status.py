@@ -305,10 +305,6 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     bag = view.snapshot.timeline.first_with(topic, type_name)
-    entry = view.bags.entry(bag)
-    known = None if entry is None else entry[0].undecodable(topic, entry[1])
-    if known is not None:
-        return known.get(type_name)
     reasons = [
         view.memory.reader.undecodable(channel)
         for channel in view.bags.channels(bag)

@@ -190,14 +190,10 @@ def _of_bags(view: View, topic: str, window: TimeWindow) -> Iterator[TopicEvents
 
 def _held(view: View, topic: str, group: Group) -> TopicEvents | None:
     """Returns the events that a lake holds of a bag that lies in the window as a whole."""
-    if not group.is_whole or len(group.bags) > 1:
+    shipped = view.memory.shipped
+    if shipped is None or not group.is_whole or len(group.bags) > 1:
         return None
-    entry = view.bags.entry(group.bags[0].bag)
-    if entry is None:
-        return None
-    digests, number = entry
-    found = digests.catalogue.topic_events(topic, [number])
-    events = found.get(number)
+    events = shipped.events(group.bags[0].bag, topic)
     return TopicEvents(group.first, group.last) if events is NO_EVENTS else events
 
 

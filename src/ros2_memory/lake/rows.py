@@ -1,7 +1,7 @@
-"""The rows of one closed bag, from its digests as the query server has them.
+"""The rows of one closed bag.
 
-Only detections and the messages of chosen topics are read from the bag itself. The bag is the one
-that the memory sees: messages that count in another recording are left out, as in answers.
+The bag is the one that the memory sees: messages that count in another recording are left out, as
+in answers.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from ros2_memory.analysis.topic_events import (
     has_events,
     state_of,
 )
-from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.columns.motion import PATHS, STANDS
-from ros2_memory.columns.store import BagKey, relative
+from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
@@ -40,7 +39,7 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
 from ros2_memory.lake.event_codec import encode_topic_events
 from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, EmptyRuns, StateRuns, is_stated
-from ros2_memory.lake.tables import TABLES, microseconds, topic_key
+from ros2_memory.lake.tables import ROWS_VERSION, TABLES, microseconds, topic_key
 from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
@@ -53,15 +52,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.analysis.sights import Sights
-    from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
     from ros2_memory.storage.base import Record
 
-ROWS_VERSION: Final = 5
-"""Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 _BLOCK: Final = 1 << 20
 _NO_SCORE: Final = -1
 _MM: Final = 1000.0
@@ -114,42 +110,31 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def made_of(memory: Memory, bag: BagFile, config: str, messages: Sequence[str] = ()) -> str | None:
-    """Returns what the rows of a bag depend on besides its bytes; None while it has no digest.
+def made_of(memory: Memory, bag: BagFile, config: str, messages: Sequence[str] = ()) -> str:
+    """Returns what the rows of a bag depend on besides its bytes.
 
     That is which of its messages count, the static transforms in force, the settings (`config`)
-    and versions of the digest, and the topics whose `messages` are shipped.
+    and the topics whose `messages` are shipped.
     """
-    if _entry(memory, bag)[1] is None:
-        return None
     counted = [
         (each.topic, each.type, each.count, each.first, each.last) for each in bag.summary.topics
     ]
     view = View(memory, Call())
     among = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, among), bag.end))
-    parts = json.dumps([ROWS_VERSION, DIGEST_VERSION, config, statics, sorted(messages), counted])
+    parts = json.dumps([ROWS_VERSION, config, statics, sorted(messages), counted])
     return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def rows_of(
     memory: Memory, content: BagContent, messages: Sequence[str] = ()
 ) -> dict[str, list[Row]]:
-    """Returns the rows of a bag that has a digest, by table; `messages` are topics to ship whole.
+    """Returns the rows of a bag, by table; `messages` are topics to ship whole.
 
     Raises:
-        BagError: the bag cannot be read.
-        ValueError: it has no digest.
+        BagError: the bag, or a part of it, cannot be read.
     """
     return _BagRows(memory, content).rows(messages)
-
-
-def _entry(memory: Memory, bag: BagFile) -> tuple[Catalogue, int | None]:
-    """Returns the catalogue of a memory, and the number of a bag's entry there."""
-    if memory.recall is None:
-        raise ValueError("a memory without a catalogue has no digests")
-    catalogue = memory.recall.catalogue
-    return catalogue, catalogue.find([BagKey.of(bag, memory.recall.bag_dir)])[0]
 
 
 class _BagRows:
@@ -159,10 +144,6 @@ class _BagRows:
         self._memory = memory
         self._content = content
         self._bag = content.bag
-        self._catalogue, number = _entry(memory, content.bag)
-        if number is None:
-            raise ValueError(f"{content.bag.file} has no digest")
-        self._number = number
         self._pose_topic = memory.limits.pose_topic
         self._poses = poses_of_bag(View(memory, Call()), content.bag, self._pose_topic)
         self._types: dict[str, list[str]] = {}
@@ -273,7 +254,7 @@ class _BagRows:
                     each.topic,
                     topic_key(each.topic),
                     "topic",
-                    str(DIGEST_VERSION),
+                    str(ROWS_VERSION),
                     each.type,
                     each.count,
                     each.first,
@@ -298,7 +279,7 @@ class _BagRows:
         first = min((each.first for each in summaries), default=self._bag.start)
         last = max((each.last for each in summaries), default=self._bag.end)
         count = sum(each.count for each in summaries)
-        version = str(DIGEST_VERSION)
+        version = str(ROWS_VERSION)
         self._rows["digests"].append(
             (topic, topic_key(topic), kind, version, None, count, first, last, packed)
         )
@@ -370,7 +351,7 @@ class _BagRows:
         in_map: tuple[str, RobotTrack] | None,
     ) -> None:
         """Reads the detections of the bag, what messages state, and those of the chosen topics."""
-        # What the digest of a topic rules out is not read.
+        # What the events of a topic rule out is not decoded.
         seen = {
             topic
             for topic, found in events.items()
@@ -384,13 +365,15 @@ class _BagRows:
             if topic not in whole and is_stated(found)
         }
         empty = {topic: EmptyRuns() for topic in seen}
-        topics = tuple(sorted({*seen, *whole, *states}))
-        if not topics:
-            return
+        topics = {*seen, *whole, *states}
         robot = _RobotAt(in_map)
         numbers: dict[str, int] = {}
-        for record in self._memory.reader.records(self._bag.path, topics, TimeWindow.everything()):
+        # Of all topics: a bag with damage anywhere is not shipped as if it were whole.
+        every, window = tuple(self._types), TimeWindow.everything()
+        for record in self._memory.reader.records(self._bag.path, every, window):
             topic = record.channel.topic
+            if topic not in topics:
+                continue
             nth = numbers[topic] = numbers.get(topic, -1) + 1
             if topic in whole:
                 self._rows["messages"].append(self._message(record, nth))

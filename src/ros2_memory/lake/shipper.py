@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import pyarrow as pa
 
@@ -27,6 +27,7 @@ from ros2_memory.bag_dir.state_files import (
     read_forgettings,
     read_receipts,
 )
+from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
@@ -73,16 +74,6 @@ _KNOWN: Final = (
 )
 
 
-class Digests(Protocol):
-    """What fills the catalogue of one robot's memory."""
-
-    def waiting(self) -> Sequence[BagFile]:
-        """Returns the closed bags without a valid digest."""
-
-    def digest(self, bag: BagFile) -> bool:
-        """Digests a bag; False where it must wait, has changed, or is refused."""
-
-
 @dataclass(frozen=True, slots=True)
 class RobotBags:
     """One robot whose bags are shipped.
@@ -90,14 +81,12 @@ class RobotBags:
     Attributes:
         name: the robot.
         memory: over its bag directory.
-        digests: fills the memory's catalogue.
         first_in: returns the log time of the first message in a file, whether it counts or not.
-        config: names the settings that digests depend on.
+        config: names the settings that rows depend on.
     """
 
     name: str
     memory: Memory
-    digests: Digests
     first_in: Callable[[Path], Ns]
     config: str
 
@@ -281,7 +270,6 @@ class Shipper:
         bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
         known = self._known_of(robot.name, bags)
         by_file = {each.file: each for each in known.values()}
-        stale = {bag.file for bag in robot.digests.waiting()}
         seen: set[str] = set()
         receipts: list[_Known] = []
         # A saved moment's copy of a bag counts where the bag itself is gone.
@@ -290,7 +278,7 @@ class Shipper:
             if is_carried(bag.path):
                 continue
             try:
-                if bag.file in stale and not robot.digests.digest(bag):
+                if not is_settled(bag, robot.bag_dir, robot.memory.clock.now()):
                     done.waiting += 1
                     continue
                 bag_id = self._id_of(robot, bag)
@@ -300,9 +288,7 @@ class Shipper:
                     continue
                 seen.add(bag_id)
                 now = self._described(robot, bag, bag_id, before)
-                if now is None:
-                    done.waiting += 1
-                elif before is not None and _is_same(before, now):
+                if before is not None and _is_same(before, now):
                     known[bag_id] = now
                     receipts.append(now)
                 else:
@@ -377,11 +363,9 @@ class Shipper:
 
     def _described(
         self, robot: RobotBags, bag: BagFile, bag_id: str, before: _Known | None
-    ) -> _Known | None:
-        """Returns what a bag would be known as; None while it has no digest."""
+    ) -> _Known:
+        """Returns what a bag would be known as."""
         made = made_of(robot.memory, bag, robot.config, self._messages)
-        if made is None:
-            return None
         same = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         sha256 = before.sha256 if before is not None and same else sha256_of(bag.path)
         file = relative(bag.file, str(robot.bag_dir))

@@ -6,7 +6,7 @@ in folder names) and time. Times are there twice: `*_ns` are nanoseconds of log 
 epoch, exact; `time` is the same as a timestamp of microseconds, for people and for engines.
 
     bags        a row for each bag: which file, when, how much, metres and standstill of it alone
-    digests     what folds over many bags: packed, by topic and kind, as the catalogue has it
+    digests     what folds over many bags: packed, by topic and kind
     poses       the robot's track in the map and in its own frame, thinned to `error_m`
     sightings   a row for each detection of each message
     things      a row for each place where a detector saw a label in the bag
@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     ]
 
 NAMESPACE: Final = "ros2_memory"
+ROWS_VERSION: Final = 26
+"""Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _NS_PER_US: Final = 1_000
 _ROW_GROUP: Final = 1 << 17

@@ -1,6 +1,6 @@
 """Where the robot was at moments of a window, in the frame that answers are given in.
 
-By its track, which is joined from digests of bags: as exact as that, some 5 cm.
+By its track: as exact as that, some 5 cm.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class RobotPlaces:
             since = "" if joined is None or joined.since is None else unix_text(joined.since)
             reach = f"known back to {since} alone" if since else "not known"
             self.view.notes.add(
-                f"where the robot was in {self.map_frame} is {reach}: bags without a digest take "
-                "too long to read"
+                f"where the robot was in {self.map_frame} is {reach}: reading the bags that "
+                "are not stored takes too long"
             )
         return None if joined is None else joined.track
 

@@ -146,7 +146,7 @@ class RobotTracks:
         except QueryTimeoutError as error:
             if not found:
                 raise QueryTimeoutError(
-                    f"the question needs more time; {view.bags.backfill_progress()}"
+                    f"the question needs more time; {view.bags.filling_progress()}"
                     "ask about a shorter window"
                 ) from error
         else:

@@ -1,1 +1,1 @@
-"""Dispatch, the MCP server, HTTP, access, limits, health, and the catalogue's backfill."""
+"""Dispatch, the MCP server, HTTP, access, limits, health, and the filling of the store."""

@@ -185,11 +185,7 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
                 for each in files[-NAMED:]
             ]
     if backfill is not None:
-        shown |= _catalogue(backfill)
-        if backfill.catalogue.trouble is not None:
-            problems.append(
-                _short(f"the catalogue {backfill.catalogue.trouble}; no answer depends on it")
-            )
+        shown |= _stored(backfill)
         if backfill.filling is not None and backfill.filling.store.trouble is not None:
             trouble = backfill.filling.store.trouble
             problems.append(_short(f"the store of columns {trouble}; no answer depends on it"))
@@ -198,22 +194,22 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
     return _status(version, problems, shown)
 
 
-def _catalogue(backfill: Backfill) -> JsonObject:
-    progress, undecodable = backfill.progress(), backfill.undecodable
-    state = "filling" if progress.waiting else "ready"
-    shown: JsonObject = {
-        "catalogue": {
-            "bags": progress.closed - progress.waiting - progress.refused,
+def _stored(backfill: Backfill) -> JsonObject:
+    """Returns how much is stored as columns, and what cannot be decoded."""
+    shown: JsonObject = {}
+    if backfill.filling is not None:
+        progress, store = backfill.progress(), backfill.filling.store
+        state = "filling" if progress.waiting else "ready"
+        shown["store"] = {
+            "bags": progress.stored,
             "waiting": progress.waiting,
             "refused": progress.refused,
-            "state": state if backfill.catalogue.trouble is None else "failing",
+            "state": state if store.trouble is None else "failing",
         }
-    }
-    if backfill.catalogue.refusals:
-        shown["catalogue_refusals"] = {
-            "count": backfill.catalogue.refusals,
-            "reason": _short(backfill.catalogue.refused_for or ""),
-        }
+        if store.refusals:
+            reason = _short(store.refused_for or "")
+            shown["store_refusals"] = {"count": store.refusals, "reason": reason}
+    undecodable = backfill.undecodable
     if undecodable:
         shown["undecodable"] = {
             "topics": len(undecodable),

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
     from mcp.server.caching import CacheableMethod
 
+    from ros2_memory.columns.fill import Progress
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
 
@@ -138,9 +138,9 @@ class EpisodicServer(MCPServer[object]):
         name: str,
         version: str,
         instructions: str,
-        catalogue: Callable[[], Progress] | None = None,
+        progress: Callable[[], Progress] | None = None,
     ) -> None:
-        """Makes the server; `catalogue` returns how far the catalogue is filled."""
+        """Makes the server; `progress` returns how far the store of columns is filled."""
         super().__init__(
             name,
             version=version,
@@ -150,7 +150,7 @@ class EpisodicServer(MCPServer[object]):
             cache_hints=dict.fromkeys(_LISTS, LISTS_CACHED),
         )
         self.completion()(self._complete)  # type: ignore[no-untyped-call]  # of the SDK
-        self._catalogue = catalogue
+        self._progress = progress
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
@@ -191,8 +191,8 @@ class EpisodicServer(MCPServer[object]):
         )
 
     async def _report_progress(self, report: _Report) -> None:
-        """Reports the seconds of a call, and how far the catalogue is filled, until cancelled."""
-        filling = Filling(self._catalogue)
+        """Reports the seconds of a call, and how far the store is filled, until cancelled."""
+        filling = Storing(self._progress)
         for elapsed_s in itertools.count(1):
             await anyio.sleep(PROGRESS_EVERY_S)
             message = await anyio.to_thread.run_sync(filling.sentence, abandon_on_cancel=True)
@@ -280,29 +280,29 @@ class EpisodicServer(MCPServer[object]):
         )
 
 
-class Filling:
-    """How far the catalogue is filled, and at what rate it was during one call."""
+class Storing:
+    """How far the store of columns is filled, and at what rate it was during one call."""
 
     def __init__(
         self,
-        catalogue: Callable[[], Progress] | None,
+        progress: Callable[[], Progress] | None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._catalogue = catalogue
+        self._progress = progress
         self._monotonic = monotonic
         self._first: tuple[float, int] | None = None
 
     def sentence(self) -> str | None:
-        """Returns e.g. `catalogue 40 %, about 20 s`; None where nothing is missing of it."""
-        now = None if self._catalogue is None else self._catalogue()
+        """Returns e.g. `40 % of the bags stored, about 20 s left`; None where none waits."""
+        now = None if self._progress is None else self._progress()
         if now is None or not now.waiting:
             return None
         at_s = self._monotonic()
         begun_s, waited = self._first = self._first or (at_s, now.waiting)
-        done = f"catalogue {100 * (now.closed - now.waiting) // max(now.closed, 1)} %"
+        done = f"{100 * (now.closed - now.waiting) // max(now.closed, 1)} % of the bags stored"
         if now.waiting >= waited:
             return done
-        return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s"
+        return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s left"
 
 
 def _client(context: object) -> Hashable:

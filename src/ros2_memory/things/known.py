@@ -111,7 +111,7 @@ class _Loader:
             self._view.notes.complete = False
             self._view.notes.add(
                 f"things are known since {unix_text(self._since)} only: reading older bags takes "
-                f"too long; {self._view.bags.backfill_progress()}ask again"
+                f"too long; {self._view.bags.filling_progress()}ask again"
             )
         while True:
             begun_s = time.monotonic()

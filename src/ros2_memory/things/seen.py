@@ -251,7 +251,7 @@ class Watching:
         """Yields the sights of the bags of a lake, each as a stretch."""
         for bag in reversed(self._view.snapshot.timeline.bags):
             self._view.bags.check_deadline()
-            known = shipped(bag, SIGHTS)
+            known = shipped.fragment(bag, SIGHTS)
             if known is not None:
                 yield self._unpacked(bag.start, [self._session(bag)], known.data)
 

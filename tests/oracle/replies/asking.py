@@ -33,7 +33,7 @@ from starlette.applications import Starlette
 from ros2_memory import cli
 from ros2_memory.bag_dir.state_files import TriggerState
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory, rules_of
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.model import BagState
@@ -161,7 +161,7 @@ class Asked:
         loaded = self._loaded()
         self.memory = build_memory(loaded)
         if catalogue:
-            fill_catalogue(build_backfill(loaded, self.memory))
+            fill_store(build_backfill(loaded, self.memory))
         self._dispatcher = build_dispatcher(loaded, self.memory)
         self._page = Starlette(routes=page_routes(self._dispatcher))
 

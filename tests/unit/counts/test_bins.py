@@ -25,7 +25,7 @@ from ros2_memory.queries import trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import examples
-from tests.support.memories import asked, assert_same_counts, memory_of, recalling
+from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.random_histories import write_history
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def memories(tmp_path_factory: pytest.TempPathFactory) -> list[Memory]:
         folder = tmp_path_factory.mktemp(f"cut{seed}")
         cut(folder, messages, Random(seed))
         memory = memory_of(folder, limits=LATEST)
-        found += [memory, recalling(memory, folder, part=0.6), recalling(memory, folder)]
+        found += [memory, with_store(memory, folder, part=0.6), with_store(memory, folder)]
     return found
 
 
@@ -223,7 +223,7 @@ def test_where_nothing_was_recorded_a_boolean_does_not_last(tmp_path: Path) -> N
         for number, split in enumerate((messages[:-1], messages[-1:])):
             write_mcap(tmp_path / name / f"{name}_{number}.mcap", split)
     memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
-    for each in (memory, recalling(memory, tmp_path)):
+    for each in (memory, with_store(memory, tmp_path)):
         docked = count_matches(each, Call(), "/is_docked", "equals", True, by="day")
         assert (whole(docked, "count"), whole(docked, "seconds")) == (2, 2 * 49 * S)
         off = count_matches(each, Call(), "/is_docked", "equals", "false", by="day")
@@ -238,7 +238,7 @@ def test_a_boolean_that_toggles_in_the_last_message_before_a_gap_counts(tmp_path
         messages = [boolean(BEGIN + (begin + at) * S, at == 9) for at in range(10)]
         write_mcap(tmp_path / "rec" / f"rec_{begin}.mcap", messages)
     memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
-    for each in (memory, recalling(memory, tmp_path)):
+    for each in (memory, with_store(memory, tmp_path)):
         docked = count_matches(each, Call(), "/bumper", "equals", True, by="day")
         assert (whole(docked, "count"), whole(docked, "seconds")) == (2, 0)
 
@@ -265,7 +265,7 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
         bags = Path(folder)
         written = write_history(bags, Random(seed))
         memory = memory_of(bags, clock=FixedClock(max(written.moments) + S))
-        known = recalling(memory, bags, part=part)
+        known = with_store(memory, bags, part=part)
         for each in (memory, known, known):
             assert all(counted == read for counted, read in _counts_by_group(each))
         start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
@@ -293,7 +293,7 @@ def test_messages_that_two_recordings_hold_count_once(tmp_path: Path) -> None:
         moves = [odom(begin + at * S, number * 10.0 + at, 0.0) for at in range(13)]
         write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", moves)
     plain = memory_of(tmp_path, limits=LATEST)
-    for memory in (plain, recalling(plain, tmp_path)):
+    for memory in (plain, with_store(plain, tmp_path)):
         answer = count_range(memory, Call(), "/odom", everything(), "day", fields=["position.x"])
         assert whole(answer, "count") == 33
         assert whole(answer, "position.x.mean") == 16.0
@@ -310,7 +310,7 @@ def test_recordings_that_follow_each_other_at_a_full_hour_count_a_copy_once(
     write_mcap(tmp_path / "rec_0" / "rec_0_0.mcap", moves[:20])
     write_mcap(tmp_path / "rec_1" / "rec_1_0.mcap", [copy] * copied + moves[20:])
     plain = memory_of(tmp_path, limits=LATEST)
-    known = recalling(plain, tmp_path)
+    known = with_store(plain, tmp_path)
 
     def ask(memory: Memory, *fields: str, by: str = "hour") -> Bins:
         return count_range(memory, Call(), "/odom", everything(), by, fields=fields)  # type: ignore[arg-type]
@@ -341,7 +341,7 @@ def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:
     seen = [(0, 0.9), (1, 0.3), (30, 0.3), (31, 0.3), (60, 0.9)]
     messages = [detections(BEGIN + at * S, ["cup"], score=score) for at, score in seen]
     write_mcap(tmp_path / "rec_0.mcap", messages)
-    memory = recalling(memory_of(tmp_path, limits=LATEST), tmp_path)
+    memory = with_store(memory_of(tmp_path, limits=LATEST), tmp_path)
 
     def count(**more: object) -> object:
         question: dict[str, object] = {
@@ -382,7 +382,7 @@ def test_bags_that_cannot_have_a_label_are_not_read(
         messages = [detections(begin + second * S, seen) for second in range(20)]
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
     plain = memory_of(tmp_path, limits=LATEST)
-    known = recalling(plain, tmp_path)
+    known = with_store(plain, tmp_path)
     for label, times in (("cat", 1), ("elephant", 0), ("thing 7", 5)):
         answer = count_matches(plain, Call(), OBJECTS, "contains", label, by="day")
         assert whole(answer, "count") == times
@@ -410,7 +410,7 @@ def test_a_label_counts_the_same_where_bags_without_it_are_left_unread(
             messages = [detections(begin + at * S, [*sorted(some), *many]) for at in range(4)]
             write_mcap(bags / f"rec_{number // 3}" / f"rec_{number}.mcap", messages)
         plain = memory_of(bags, limits=LATEST)
-        known = recalling(plain, bags, part=part)
+        known = with_store(plain, bags, part=part)
         for label in ("cat", "dog", "thing 1", "rec"):
             for by in ("day", "hour"):
                 answer = count_matches(plain, Call(), OBJECTS, "contains", label, by=by)

@@ -17,7 +17,7 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call
 from ros2_memory.places.visits import visits
 from tests.support.examples import examples
-from tests.support.memories import asked, assert_same_counts, memory_of, recalling
+from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
 
@@ -45,7 +45,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def memory(world: Path) -> Memory:
-    return in_places(recalling(memory_of(world), world), WEST, EAST, START)
+    return in_places(with_store(memory_of(world), world), WEST, EAST, START)
 
 
 def table(reply: Any) -> dict[str, dict[str, Any]]:
@@ -82,7 +82,7 @@ def test_all_named_places_are_counted_at_once(memory: Memory, world: Path) -> No
 
 
 def test_what_is_counted_by_place_is_where_the_robot_was(world: Path) -> None:
-    memory = in_places(recalling(memory_of(world), world), WEST, EAST)
+    memory = in_places(with_store(memory_of(world), world), WEST, EAST)
     truth = write_moving_map(world, 1, seconds=300)
     west = sum(x <= 2.0 for x, _ in truth.places)
     rows = table(asked(memory, world, "get_topic_in_range", topic="/odom", by="place", **DOOR))
@@ -157,7 +157,7 @@ def test_counts_by_place_are_the_same_whatever_the_catalogue_knows(
         else:
             write_history(bags, random.Random(seed))
         memory = in_places(memory_of(bags), WEST, EAST, START)
-        known = recalling(memory, bags, part=part)
+        known = with_store(memory, bags, part=part)
         everything = {"start": 0, "end": 4e9, "by": "place"}
         for name, question in (
             ("visits", {"by": "place"}),

@@ -27,7 +27,7 @@ from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S, seeded, write_robot
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 from tests.support.planner_judges import STARTED_S
 from tests.support.planner_questions import QUESTIONS, Planned
 from tests.support.planner_world import recorded
@@ -103,7 +103,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Six]:
 
             def build() -> Memory:
                 memory = memory_of(folder / name, clock=clock, reader=reader)
-                return recalling(memory, folder / name) if name == WELL else memory
+                return with_store(memory, folder / name) if name == WELL else memory
 
             return Robot(name, folder / name, build)
 

@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.bootstrap import build_backfill, build_memory, shared_parts
 from ros2_memory.bootstrap_fleet import robot_settings
-from ros2_memory.cli.maintenance.index import fill_catalogue
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.fleet.robots import Fleet, Robot
@@ -41,7 +41,7 @@ def test_only_the_bag_of_the_newest_sight_is_opened(
         own = robot_settings(settings, name)
         memory = build_memory(own, shared)
         memory.index.refresh()
-        fill_catalogue(build_backfill(own, memory))
+        fill_store(build_backfill(own, memory))
         assert memory.recall is not None
         memory.recall.catalogue.close()
     reader = NotingReader()

@@ -23,7 +23,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock
 from tests.support.column_worlds import World
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -139,7 +139,7 @@ def test_every_tool_says_that_a_split_of_its_window_could_not_be_read(
     tear(write_splits(tmp_path, 3)[1])
     memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
     if recall:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     told = notes_of(asked(memory, tmp_path, tool, **given))
     assert any(note.startswith(LOST) for note in told), told
 
@@ -229,7 +229,7 @@ def test_a_chunk_that_is_lost_of_a_closed_bag_is_reported_in_windows_that_touch_
     window = {"topic": "/odom", "start": at(2), "end": at(25)}
     told = notes_of(asked(memory, tmp_path, "get_topic_in_range", **window))
     assert any(note.startswith("rec/rec_1.mcap could not be read whole: ") for note in told)
-    recalled = recalling(memory, tmp_path)
+    recalled = with_store(memory, tmp_path)
     assert told == notes_of(asked(recalled, tmp_path, "get_topic_in_range", **window))
 
 

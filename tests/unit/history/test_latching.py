@@ -33,7 +33,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import keeper_of
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -84,7 +84,7 @@ def record(folder: Path, messages: list[Msg], layout: McapLayout = TRANSIENT) ->
 
 def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
     memory = memory_of(root, limits=QuerySettings(**limits))
-    return recalling(replace(memory), root) if recalls else memory
+    return with_store(replace(memory), root) if recalls else memory
 
 
 def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,7 +71,7 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
     moved = [tf(at, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))]
     write_mcap(tmp_path / "late" / "late_0.mcap", moved)
     plain = memory_of(tmp_path)
-    for memory in (plain, recalling(plain, tmp_path)):
+    for memory in (plain, with_store(plain, tmp_path)):
         with pytest.raises(NoDataError) as caught:
             queries.transform(memory, Call(), parent, child, after(later))
         assert caught.value.reason is reason

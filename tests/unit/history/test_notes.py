@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from ros2_memory.core.text import Reason
 from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -54,7 +54,7 @@ def test_hundreds_of_topics_that_are_not_read_hide_no_damaged_file(
     (tmp_path / "f" / "f_0.mcap").write_bytes(b"this was a bag once, and is none any more")
     memory = memory_of(tmp_path)
     reply = asked(
-        recalling(memory, tmp_path) if recalls else memory,
+        with_store(memory, tmp_path) if recalls else memory,
         tmp_path,
         "find_last_match",
         topic="/*",
@@ -98,7 +98,7 @@ def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
     (tmp_path / "f").mkdir()
     (tmp_path / "f" / "f_0.mcap").write_bytes(b"this was a bag once, and is none any more")
     memory = memory_of(tmp_path)
-    reply = asked(recalling(memory, tmp_path) if recalls else memory, tmp_path, tool, **given)
+    reply = asked(with_store(memory, tmp_path) if recalls else memory, tmp_path, tool, **given)
     assert (reply["error"], reply["reason"]) == ("no_data", "undecodable")
     assert "(keelson.Envelope) are recorded but cannot be decoded" in reply["detail"]
     assert any("may hold more: f/f_0.mcap" in note for note in reply["notes"])
@@ -125,7 +125,7 @@ def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
         write_mcap(path, messages[10 * split : 10 * split + 10])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     reply = asked(memory, tmp_path, "find_matches", **CUP)
     seen = [n for n in range(20) if n not in damaged]
     [sighting] = reply["sightings"]
@@ -148,7 +148,7 @@ def test_a_slow_detector_is_not_silent_while_its_messages_cannot_be_decoded(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [seen[0], torn, *seen[1:]])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     sightings = asked(memory, tmp_path, "find_matches", **CUP)["sightings"]
     spans = [(each["first_seen"] - T0_S, each["last_seen"] - T0_S) for each in sightings]
     assert spans == [(40, 40), (0, 16)]

@@ -22,7 +22,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, log_entry, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -122,7 +122,7 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         root = Path(folder)
         stored = write_recordings(root, draw, stamped=stamped)
         counted = once(stored)
-        memory = recalling(memory_of(root, reader=McapReader()), root, part=part)
+        memory = with_store(memory_of(root, reader=McapReader()), root, part=part)
         edges = sorted(draw.choice(stored)[0] + draw.choice([0, 1]) for _ in range(2))
         for window in (TimeWindow.everything(), TimeWindow(edges[0], edges[1] + 1)):
             inside = [each for each in counted if window.contains(each[0])]
@@ -151,7 +151,7 @@ def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part
         bags = sorted(root.glob("*/*.mcap"), key=lambda each: (each.parent, int(each.stem[5:])))
         for bag in bags[-3:]:
             bag.rename(aside / bag.name)
-        memory = recalling(memory_of(root, reader=McapReader()), root, part=part)
+        memory = with_store(memory_of(root, reader=McapReader()), root, part=part)
 
         def check() -> None:
             census = View(memory, Call()).census(TOPIC)
@@ -198,7 +198,7 @@ def test_questions_get_equal_answers_with_and_without_the_catalogue(seed: int) -
         root = Path(folder)
         write_recordings(root, random.Random(seed))
         plain = memory_of(root, reader=McapReader())
-        recalled = recalling(replace(plain), root)
+        recalled = with_store(replace(plain), root)
         for question in QUESTIONS:
             assert question(plain, root) == question(recalled, root)
 
@@ -212,7 +212,7 @@ def test_what_was_an_original_no_longer_matters_once_its_recording_is_gone(tmp_p
         2_000 * S,
         2_125 * S,
     )
-    memory = recalling(memory_of(tmp_path, reader=McapReader()), tmp_path)
+    memory = with_store(memory_of(tmp_path, reader=McapReader()), tmp_path)
 
     def errors() -> list[int]:
         events = recap(memory, Call(), TimeRange(0.0, 1e5)).events

@@ -18,7 +18,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, battery, boolean, detections, odom, text, write_mcap
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def bag_dir(tmp_path: Path) -> Path:
 
 def filled(bag_dir: Path) -> tuple[Memory, NotingReader]:
     reader = NotingReader()
-    memory = recalling(memory_of(bag_dir, reader=reader), bag_dir)
+    memory = with_store(memory_of(bag_dir, reader=reader), bag_dir)
     reader.asked.clear()
     return memory, reader
 

@@ -15,7 +15,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -146,7 +146,7 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     write_mcap(tmp_path / "run_1" / "run_1_0.mcap", driving(81, 200, 60.5))
     memory, begin = memory_of(tmp_path), T0 / NS_PER_S
     if fills:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     window = {"start": begin, "end": begin + 200}
     told = asked(memory, tmp_path, "trajectory_summary", **window)
     # Of 60 m and 59.5 m, without the 20 m of the 40 s that are twice: a gap is no way.
@@ -178,7 +178,7 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
     assert any("run_1 and run_2 have different messages" in each for each in told["notes"])
     # What lies in a time that the recording had before is left out, and nothing is a jump back.
-    for known in (memory, recalling(memory, tmp_path)):
+    for known in (memory, with_store(memory, tmp_path)):
         whole = asked(known, tmp_path, "trajectory_summary", start=begin, end=begin + 200)
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
         assert any("run_1 has the time from" in each for each in whole["notes"])

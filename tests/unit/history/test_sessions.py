@@ -27,7 +27,7 @@ from ros2_memory.queries import (
 )
 from tests.support.bags import Msg, detections, make, odom, tf, write_mcap
 from tests.support.bags import transform as stamped
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,7 +71,7 @@ def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
 
 def remembered(root: Path, *, recalls: bool) -> Memory:
     memory = memory_of(root)
-    return recalling(replace(memory), root) if recalls else memory
+    return with_store(replace(memory), root) if recalls else memory
 
 
 def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.memories import asked, memory_of, with_store, replied
 from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def bag_dir(tmp_path: Path) -> Path:
 
 def memory_at(bag_dir: Path, recalls: bool, now: Now = "wall") -> Memory:
     memory = memory_of(bag_dir, clock=SettableClock(9 * S), limits=QuerySettings(now=now))
-    return recalling(memory, bag_dir) if recalls else memory
+    return with_store(memory, bag_dir) if recalls else memory
 
 
 @each_way
@@ -159,7 +159,7 @@ def test_a_window_below_zero_is_clamped_at_both_ends(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
     clock = SettableClock((begin_s + 9) * S)
     memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(now=now))
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "recap", **window)
     assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
@@ -178,7 +178,7 @@ def test_no_span_that_was_searched_ends_before_it_begins(
     begin = 1_784_000_000 * S
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
     memory = memory_of(tmp_path)
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
     if not end > begin / S > start:

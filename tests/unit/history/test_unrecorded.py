@@ -9,7 +9,7 @@ import pytest
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,7 +53,7 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=[False, True], ids=["plain", "catalogue"])
 def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
     found = memory_of(bag_dir, clock=FixedClock(T0 + 200 * S), limits=QuerySettings())
-    return recalling(found, bag_dir) if request.param else found
+    return with_store(found, bag_dir) if request.param else found
 
 
 @pytest.mark.parametrize(("window", "reason"), NOTHING)

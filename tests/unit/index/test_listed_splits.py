@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.index import listed_splits
 from ros2_memory.index.listed_splits import Absent, absent_splits
 from tests.support.bags import text, write_mcap
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -107,7 +107,7 @@ def test_one_changed_recording_of_many_is_not_worth_storing_all_again(tmp_path: 
 
 def test_a_catalogue_stores_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = recording(tmp_path)
-    known = recalling(memory, tmp_path)
+    known = with_store(memory, tmp_path)
     listed_splits._KNOWN.clear()
     [absent] = known.absent_splits(known.index.snapshot())
     monkeypatch.setattr(listed_splits, "read_listing", None)

@@ -36,7 +36,7 @@ from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import McapLayout, Msg, odom, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -209,7 +209,7 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, re
     spoil_chunk(path, 1)
     tail.write("rec/rec_0.mcap", path.read_bytes()[: ends[3][0]], at=10 * S)
     if recall:
-        tail.memory = recalling(tail.memory, tail.bag_dir)
+        tail.memory = with_store(tail.memory, tail.bag_dir)
     notes = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 9)["notes"]
     assert any(note.startswith("rec/rec_0.mcap: 1 damaged") for note in notes), notes
     assert not any("crash" in note for note in notes)
@@ -218,7 +218,7 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, re
 def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
     tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
     tail.clock.at = T0 + 60 * S
-    catalogued = recalling(tail.memory, tail.bag_dir)
+    catalogued = with_store(tail.memory, tail.bag_dir)
     later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
     near = {"condition_type": "near_position", "value": {"x": 14.2, "y": 0}}
     for cut in range(4096, len(later), 4096):

@@ -16,7 +16,7 @@ from ros2_memory.core.errors import NoDataReason
 from ros2_memory.tools.arguments import MOST_TIMES
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.memories import asked, memory_of, with_store, replied
 from tests.support.random_histories import write_history
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def test_in_odd_histories_each_is_answered_as_alone_with_and_without_the_catalog
         several = {"timestamps": [each / S for each in times], **given}
         plain = memory_of(bag_dir)
         told = asked(plain, bag_dir, "get_topic_at_time", **several)
-        assert told == asked(recalling(plain, bag_dir), bag_dir, "get_topic_at_time", **several)
+        assert told == asked(with_store(plain, bag_dir), bag_dir, "get_topic_at_time", **several)
         rows = told.get("results", [told] * len(times))
         for time, row in zip(times, rows, strict=True):
             alone = asked(plain, bag_dir, "get_topic_at_time", timestamp=time / S, **given)

@@ -20,7 +20,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.memories import asked, memory_of, with_store, replied
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -60,7 +60,7 @@ def write(folder: Path, messages: list[Msg], split_s: float = 20.0) -> None:
 def before(folder: Path, around: float, *, recalls: bool = False, **given: float) -> dict[str, Any]:
     memory = memory_of(folder)
     if recalls:
-        memory = recalling(replace(memory), folder)
+        memory = with_store(replace(memory), folder)
     reply: dict[str, Any] = asked(memory, folder, "recap", around=BEGIN / S + around, **given)
     return reply
 
@@ -108,7 +108,7 @@ def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path, recall
     write(tmp_path, ALL)
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     reply = asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 60)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert [each["text"] for each in stop["before"]] == [

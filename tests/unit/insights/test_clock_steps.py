@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, battery, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -50,7 +50,7 @@ def recorded(
 
 @pytest.fixture(params=[False, True], ids=["without catalogue", "with catalogue"])
 def known(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Memory], Memory]:
-    return lambda memory: recalling(memory, tmp_path) if request.param else memory
+    return lambda memory: with_store(memory, tmp_path) if request.param else memory
 
 
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
@@ -71,7 +71,7 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
 
 
 def test_a_suspected_hole_is_read_once(tmp_path: Path) -> None:
-    memory = recalling(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > 55)), tmp_path)
+    memory = with_store(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > 55)), tmp_path)
     first = steps(memory, tmp_path)
     stored = replace(memory, reader=Unreadable())
     assert steps(stored, tmp_path) == first != []

@@ -20,7 +20,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
 from tests.support.bags import Msg, goals, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, recalling, replied
+from tests.support.memories import memory_of, with_store, replied
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -37,7 +37,7 @@ def told(
         write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages[at : at + cut])
     memory = memory_of(bag_dir)
     if recalls:
-        memory = recalling(memory, bag_dir)
+        memory = with_store(memory, bag_dir)
     found = recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
     return [row(each) for each in found.events if "goal" in each.kind]
 
@@ -202,7 +202,7 @@ def test_however_the_history_is_cut_the_same_is_told(
         found = told(Path(folder), history(*messages), 0, 200, cut, recalls=recalls)
         memory = memory_of(Path(folder))
         searched = found_in(
-            recalling(memory, Path(folder)) if recalls else memory, "above", 3, "status"
+            with_store(memory, Path(folder)) if recalls else memory, "above", 3, "status"
         )
     assert [(text, begin, end) for _, text, begin, end, _ in found] == expected
     assert [

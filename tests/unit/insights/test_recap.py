@@ -44,7 +44,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import write_moving_map
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
@@ -75,7 +75,7 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: 
         (tmp_path / bag.name).write_bytes(bag.read_bytes())
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
     assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
     assert answer.stood == 0
@@ -107,7 +107,7 @@ def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
     recorder.stop()
     memory = memory_of(tmp_path, clock=SettableClock(now))
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     span = TimeRange(start_s=BEGIN / S + 5.0, end_s=BEGIN / S + 95.0)
     answer = recap(memory, Call(), span, frame_id="odom")
     assert answer.frame_id == "odom"
@@ -165,7 +165,7 @@ def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> N
     [(began, ended)] = _drive(tmp_path, [(8.745, 0.5), (8.0, 0.0), (9.0, 0.5)], begin=260)
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = over(memory, 260, 286)
     [stop] = [each for each in answer.events if each.kind == "stop"]
     assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
@@ -183,7 +183,7 @@ def test_a_window_that_ends_in_a_stop_counts_what_it_holds_of_it(
     _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5)], begin=0.37)
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     for begin, end, stood in [(13.27, 20, 3.1), (14.37, 22, 2.0), (0.4, 8.37, 2.0), (9, 9.5, 0.5)]:
         assert (over(memory, begin, end).stood or 0) / S == pytest.approx(stood, abs=0.0201)
 
@@ -223,7 +223,7 @@ def test_stops_under_noise_do_not_last_longer_than_the_window(
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 9 * hz])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     whole = over(memory, 0, 180)
     parts = [over(memory, at, at + 30) for at in range(0, 180, 30)]
     for answer in (whole, *parts):
@@ -270,7 +270,7 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
         _drive(bag_dir, driven)
         memory = memory_of(bag_dir)
         if recalls:
-            memory = recalling(replace(memory), bag_dir)
+            memory = with_store(replace(memory), bag_dir)
         end = sum(length for length, _ in driven)
         # No part is so short that no pose is in it.
         inner = {round(0.1 + part * (end - 0.2), 1) for part in parts}
@@ -288,7 +288,7 @@ def test_a_robot_that_creeps_is_not_taken_to_stand(
     _drive(tmp_path, [(60.0, speed)], hz=20)
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     for span in ((0, 60), (10, 20), (45, 60)):
         answer = over(memory, *span)
         assert answer.stood == 0
@@ -309,7 +309,7 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 60 * hz])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = over(memory, 0, 300)
     reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
     assert reply["stood_s"] is None
@@ -344,7 +344,7 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
     )
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     none = over(memory, 0, 9.95)
     assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
     assert none.notes == (
@@ -429,7 +429,7 @@ def test_every_boolean_of_a_status_message_is_followed(
         )
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = over(memory, 0, 40)
     assert times(answer.events, "flip") == [
         (f"/fmu/out/vehicle_status {flag} became true", 13.0),
@@ -447,7 +447,7 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recall
     )
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
     more = 600 - MAX_FLAGS
     assert note == (
@@ -461,7 +461,7 @@ def test_things_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls:
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN + n * S, labels) for n in (1, 2)])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     assert any("one message: 3 more" in note for note in over(memory, 0, 10).notes)
 
 
@@ -472,7 +472,7 @@ def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path, recalls: 
     write_mcap(tmp_path / "bag.mcap", messages)
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = over(memory, 0, 10)
     assert dict(answer.counts) == {"on/off changes": 4 * 40}
     assert any(
@@ -522,7 +522,7 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth : nth + 100])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = over(memory, 0, 65)
     assert answer.throughout == ("table",)
     assert times(answer.events, "thing") == [("scissors in view", 12.0)]
@@ -571,7 +571,7 @@ def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        memory = recalling(replace(plain), bag_dir, part=part)
+        memory = with_store(replace(plain), bag_dir, part=part)
         everything = (min(moments) - S, max(moments) + S)
         parts = [sorted(draw.choices(moments, k=2)) for _ in range(3)]
         # What was joined of everything serves when it is asked for again.
@@ -643,7 +643,7 @@ def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
     for nth in range(6):
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth * 110 : (nth + 1) * 110])
     memory = in_places(memory_of(tmp_path))
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 200)
     found = recap(memory, Call(), span)
     own = recap(memory, Call(), span, frame_id="odom")
@@ -684,7 +684,7 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
             [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth],
         )
     memory = in_places(memory_of(tmp_path), "odom")
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 70)
     there = recap(memory, Call(), span, where="room")
     # In the room from x = -1 at 15 s to x = 5 at 31 s.
@@ -725,7 +725,7 @@ def test_a_recap_of_a_place_is_the_same_whatever_the_catalogue_knows(
         else:
             write_history(bag_dir, random.Random(seed))
         memory = in_places(memory_of(bag_dir))
-        known = recalling(memory, bag_dir, part=part)
+        known = with_store(memory, bag_dir, part=part)
         for given in ({}, {"where": "room"}, {"where": {"x": [-1, 1], "y": [-1, 1]}}):
             arguments = {"start": 0, "end": 4e9, **given}
             one = asked(memory, bag_dir, "recap", **arguments)
@@ -746,7 +746,7 @@ def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
             messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
     memory = memory_of(tmp_path)
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
 
     def things(**given: float) -> tuple[list[tuple[str, float]], list[str], list[str]]:
         span = {"start": BEGIN / S - 20, "end": BEGIN / S + 60}
@@ -782,7 +782,7 @@ def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
         inside = [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth]
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", inside)
     memory = memory_of(tmp_path)
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     answer = over(memory, 0, 40)
     [drop] = [each for each in answer.events if each.kind == "drop"]
     assert drop.text == "slowed down suddenly from 0.50 to 0.05 m/s"

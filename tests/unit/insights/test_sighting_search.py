@@ -14,7 +14,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.insights.sightings import find_matches
 from tests.support.bags import detections, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
@@ -96,7 +96,7 @@ def test_sightings_are_the_same_whatever_is_stored(seed: int, part: float, limit
         bags = Path(folder)
         write(bags, [each for each, _ in messages], draw)
         plain = memory_of(bags, limits=LATEST)
-        known = recalling(plain, bags, part=part)
+        known = with_store(plain, bags, part=part)
         start, end = sorted(draw.choice(messages)[0].log_time / S for _ in range(2))
         for oldest_first in (False, True):
             for span in ((None, None), (start, end)):

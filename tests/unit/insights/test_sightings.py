@@ -46,7 +46,7 @@ from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -109,7 +109,7 @@ def recalling_elsewhere(memory: Memory, folder: Path) -> Memory:
     for bag in session.glob("*"):
         (folder / bag.name).write_bytes(bag.read_bytes())
     copied = memory_of(folder)
-    return recalling(replace(copied), folder)
+    return with_store(replace(copied), folder)
 
 
 def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
@@ -176,7 +176,7 @@ def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
     )
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     assert seconds(memory, "cup", OBJECTS) == [(0, 5)]
     assert seconds(memory, "cup", OBJECTS, min_score=0.4) == [(0, 4)]
     assert seconds(memory, "cup", OBJECTS, min_score=0.9) == [(4, 4), (0, 1)]
@@ -204,7 +204,7 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 @pytest.mark.parametrize("recalls", [False, True])
 def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recalls: bool) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
-    memory = recalling(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
+    memory = with_store(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
     place: JsonValue = {"x": 9.0, "y": 9.0}
     asked = (memory, Call(), "/odom", "near_position", place)
     note = (
@@ -259,7 +259,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
     poses = [odom(BEGIN + at * S, 0.5 * at, 0.0) for at in range(3)]
     write_mcap(tmp_path / "bag.mcap", [*placed, *seen, *poses])
     memory = memory_of(tmp_path)
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     for frame_id in (None, "odom"):
         answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", frame_id=frame_id)
         [sighting] = answer.sightings
@@ -525,7 +525,7 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
-        memory = recalling(replace(plain), bag_dir, part=part)
+        memory = with_store(replace(plain), bag_dir, part=part)
         for topic, kind, value in ASKED:
             try:
                 expected = grouped(plain, topic, kind, value)
@@ -551,7 +551,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*logged, state])
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
 
     def texts(kind: str, value: JsonValue) -> list[object]:
         call = {"condition_type": kind, "value": value, "field": "level", "fields": ["msg"]}

@@ -10,7 +10,7 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.timebase import local_text
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -43,7 +43,7 @@ def memory(request: pytest.FixtureRequest, tmp_path: Path) -> Memory:
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", _split(number))
     clock = SettableClock((BEGIN + SPLITS * SPLIT + 5) * S)
     found = memory_of(tmp_path, clock=clock)
-    return recalling(found, tmp_path) if request.param else found
+    return with_store(found, tmp_path) if request.param else found
 
 
 def row(end: float | None) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from tests.support.bags import detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S
 from tests.support.lake_rows import fill, lake_in, lake_robots
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 DAY_S = 86_400
 
@@ -63,7 +63,7 @@ class Shipping:
             at = start_s * NS_PER_S
             messages = [detections(at, [label]), text(at, label)]
             write_mcap(bags / "rec" / f"rec_{start_s}.mcap", messages)
-        fill(self._catalog, {"hall": recalling(memory_of(bags), bags)}, ["/chatter"])
+        fill(self._catalog, {"hall": with_store(memory_of(bags), bags)}, ["/chatter"])
 
     def robot(self) -> LakeRobot:
         return lake_robots(self._catalog, self.engine, ["hall"])["hall"]
@@ -224,7 +224,7 @@ def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_r
     for name, begin in (("one/one_0", 0), ("one/one_1", 15), ("two/two_0", 30)):
         at = START_S + begin
         write_mcap(bags / f"{name}.mcap", [text((at + n) * NS_PER_S, "here") for n in range(10)])
-    on_robot = recalling(memory_of(bags), bags)
+    on_robot = with_store(memory_of(bags), bags)
     catalog = lake_in(tmp_path)
     fill(catalog, {"hall": on_robot}, ["/chatter"])
     in_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory

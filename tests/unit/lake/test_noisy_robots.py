@@ -14,7 +14,7 @@ from ros2_memory.core.errors import NotShippedError
 from ros2_memory.lake.engines.base import LakeEngine
 from tests.support.fleets import fleet_memory
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots
-from tests.support.memories import recalling
+from tests.support.memories import with_store
 from tests.support.moving_map import BEGIN, S
 from tests.support.noisy_robots import LENGTH_S, write_noisy_robot
 from tests.unit.lake.test_questions import Robots, asked_both_ways, reply
@@ -36,7 +36,7 @@ def robots(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Robo
     memories = {}
     for name in NAMES:
         bag_dir = write_noisy_robot(name, folder / name)
-        memories[name] = recalling(fleet_memory(bag_dir), bag_dir)
+        memories[name] = with_store(fleet_memory(bag_dir), bag_dir)
     catalog = lake_in(tmp_path_factory.mktemp("lake"))
     fill(catalog, memories)
     return asked_both_ways(memories, lake_robots(catalog, engine, NAMES))

@@ -22,7 +22,7 @@ from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S
 from tests.support.lake_rows import fill, lake_in
-from tests.support.memories import extractor, memory_of, recalling
+from tests.support.memories import extractor, memory_of, with_store
 from tests.unit.lake.test_questions import reply
 
 DAY_S = 86_400
@@ -43,7 +43,7 @@ def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> L
         if ago == DAYS:
             messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
         write_mcap(folder / "bags" / "rec" / f"rec_{DAYS - ago}.mcap", messages)
-    memory = recalling(memory_of(folder / "bags"), folder / "bags")
+    memory = with_store(memory_of(folder / "bags"), folder / "bags")
     catalog = lake_in(folder)
     fill(catalog, {"hall": memory}, topics)
     return LakeRobot(

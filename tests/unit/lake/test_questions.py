@@ -22,7 +22,7 @@ from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.fleets import LENGTH_S, SEEN, START_S, fleet_memory, seeded, write_robot
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots
-from tests.support.memories import recalling
+from tests.support.memories import with_store
 
 NAMES = ("attic", "hall", "kitchen")
 TOLERANCE_M = 0.06
@@ -62,7 +62,7 @@ def memories(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Memory]:
     found: dict[str, Memory] = {}
     for name in NAMES:
         bag_dir = write_robot(seeded(name), folder / name)
-        found[name] = recalling(fleet_memory(bag_dir), bag_dir)
+        found[name] = with_store(fleet_memory(bag_dir), bag_dir)
     return found
 
 

@@ -21,7 +21,7 @@ from ros2_memory.lake.tables import TABLES, Row, to_arrow, topic_key
 from tests.support.bags import detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import LENGTH_S, NOW, SEEN, SeededRobot, seeded, write_robot
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 Table = list[dict[str, object]]
 
@@ -44,7 +44,7 @@ def robot() -> SeededRobot:
 @pytest.fixture(scope="module")
 def memory(robot: SeededRobot, tmp_path_factory: pytest.TempPathFactory) -> Memory:
     bag_dir = write_robot(robot, tmp_path_factory.mktemp("bags"))
-    return recalling(memory_of(bag_dir, clock=FixedClock(NOW)), bag_dir)
+    return with_store(memory_of(bag_dir, clock=FixedClock(NOW)), bag_dir)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_each_detection_is_a_row(robot: SeededRobot, both: list[dict[str, Table]
 def test_a_detection_knows_which_message_of_its_topic_has_it(tmp_path: Path) -> None:
     seen = [detections(at * NS_PER_S, [*labels]) for at, labels in ((1, "ab"), (2, ""), (3, "a"))]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", seen)
-    memory = recalling(memory_of(tmp_path), tmp_path)
+    memory = with_store(memory_of(tmp_path), tmp_path)
     rows = lake_rows(memory, memory.index.snapshot().bags[0])["sightings"]
     assert [(row["label"], row["message"]) for row in rows] == [("a", 0), ("b", 0), ("a", 2)]
 

@@ -22,7 +22,7 @@ from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
 
@@ -55,7 +55,7 @@ def test_metres_count_while_the_robot_is_in_a_place_and_corrections_of_the_map_a
 ) -> None:
     truth = write_moving_map(tmp_path, 3, seconds=200, split_s=split_s)
     memory = in_places(memory_of(tmp_path))
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     found = driven_inside(memory, Call(), ALL, where="left half")
     # In odom the drift of the map, which corrects it, is driven too.
     assert found.distance_m == pytest.approx(driven(truth, -1, 2), rel=0.1, abs=0.5)
@@ -143,7 +143,7 @@ def test_what_was_driven_inside_is_the_same_whatever_the_catalogue_knows(
         else:
             write_history(bag_dir, random.Random(seed))
         memory = in_places(memory_of(bag_dir))
-        known = recalling(memory, bag_dir, part=part)
+        known = with_store(memory, bag_dir, part=part)
         for frame in ({}, {"frame_id": "map"}):
             arguments = {"start": 0, "end": 4e9, "where": {"x": [-1, 1], "y": [-1, 1]}, **frame}
             assert asked(memory, bag_dir, "trajectory_summary", **arguments) == asked(

@@ -22,7 +22,7 @@ from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
 
@@ -49,7 +49,7 @@ def test_visits_in_a_moving_map_are_when_the_robot_was_there(
 ) -> None:
     truth = write_moving_map(tmp_path, seed, seconds=300)
     memory = in_places(memory_of(tmp_path))
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     found = visits(memory, Call(), where="corner", limit=100)
     there = truth.inside(4.0, 3.0, 0.5)
     assert found.where == "corner"
@@ -171,7 +171,7 @@ def test_visits_in_the_poses_own_frame_are_those_of_the_recorded_poses(
         radius_m=1.0,
         limit=100,
     )
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     found = visits(memory, Call(), 0.0, 0.0, radius_m=1.0, limit=100, frame_id="odom")
     assert found.frame_id == exact.frame_id == "odom"
     assert found.total == exact.total > 1
@@ -206,7 +206,7 @@ def test_visits_are_the_same_whatever_the_catalogue_knows(
         else:
             write_history(Path(folder), random.Random(seed))
         memory = in_places(memory_of(Path(folder)))
-        known = recalling(memory, Path(folder), part=part)
+        known = with_store(memory, Path(folder), part=part)
         for given in (
             {},
             {"where": "start"},

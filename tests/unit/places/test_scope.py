@@ -23,7 +23,7 @@ from ros2_memory.places.visits import visits
 from ros2_memory.queries import position
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
 
@@ -64,7 +64,7 @@ def test_matches_count_while_another_topic_meets_a_condition(
     tmp_path: Path, changes: bool, recalls: bool
 ) -> None:
     memory = docking(tmp_path, changes=changes)
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     undocked = WhileCondition("/is_docked", "equals", False)
     [found] = find_matches(
         memory, Call(), "/chatter", "contains", "hello", during=undocked
@@ -169,7 +169,7 @@ def test_scopes_are_the_same_whatever_the_catalogue_knows(
         else:
             write_history(bag_dir, random.Random(seed))
         memory = in_places(memory_of(bag_dir))
-        known = recalling(memory, bag_dir, part=part)
+        known = with_store(memory, bag_dir, part=part)
         topic, word = (CUPS, "cup") if moving else ("/chatter", "cup")
         for given in (
             {"where": "room"},

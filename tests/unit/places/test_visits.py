@@ -34,7 +34,7 @@ from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -86,7 +86,7 @@ def test_visits_of_a_recorded_session_are_the_closed_form(tmp_path: Path, recall
         (tmp_path / bag.name).write_bytes(bag.read_bytes())
     memory = memory_of(tmp_path)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = visits(memory, Call(), 0.0, 4.0, radius_m=0.5)
     lap, half = 2 * math.pi / 0.25, 2 * math.asin(0.5 / 4) / 0.25
     middles = [lap / 2 + lap * nth for nth in range(3)]
@@ -115,7 +115,7 @@ def test_the_demos_robot_was_at_the_kitchen_counter_when_its_lap_says(
     recorder.stop()
     memory = memory_of(tmp_path, clock=SettableClock(now))
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     counter = demo_robot.KITCHEN_COUNTER
     answer = visits(memory, Call(), counter.x, counter.y)
     assert answer.frame_id == "map"
@@ -215,7 +215,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_pat
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert [each.restarts for each in answer.visits] == [0, 1]
     assert any("odometry restarted" in note for note in answer.notes)
-    recalled = recalling(replace(memory), tmp_path)
+    recalled = with_store(replace(memory), tmp_path)
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
@@ -225,13 +225,13 @@ def test_a_restart_of_odometry_inside_one_bag_is_seen_with_a_catalogue_too(tmp_p
     memory = remembering(tmp_path, [*first, *second], split_s=5000.0)
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert [each.restarts for each in answer.visits] == [0, 1]
-    recalled = recalling(replace(memory), tmp_path)
+    recalled = with_store(replace(memory), tmp_path)
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
 def test_a_robot_that_drives_on_through_a_long_bag_did_not_restart(tmp_path: Path) -> None:
     memory = remembering(tmp_path, line((8, 0.5), (7, -0.2)), split_s=20.0)
-    recalled = recalling(replace(memory), tmp_path)
+    recalled = with_store(replace(memory), tmp_path)
     for each in (memory, recalled):
         answer = visits(each, Call(), 0.0, 0.0, radius_m=1.0)
         assert [visit.restarts for visit in answer.visits] == [0]
@@ -300,7 +300,7 @@ def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bo
     ]
     memory = remembering(tmp_path, [*poses, *moves])
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=0.3)
     [visit] = answer.visits
     assert answer.frame_id == "map"
@@ -336,7 +336,7 @@ def test_a_robot_that_passes_over_a_place_was_no_farther_than_its_nearest_pose(
 ) -> None:
     memory = remembering(tmp_path, line((20, 0.25), x=-2.5), split_s=split_s)
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     [visit] = visits(memory, Call(), 0.0, 0.0, radius_m=5.0).visits
     assert visit.closest_m == pytest.approx(0.0, abs=1e-9)
     assert visit.closest_at == BEGIN + 10 * S
@@ -376,7 +376,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
             assert visit.closest_m <= distance + 2 * TOLERANCE_M
             assert {visit.arrived, visit.departed} <= {t for t, *_ in poses} | {None}
         assert told.total == len(told.visits)
-        assert visits(recalling(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
+        assert visits(with_store(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
 
 
 @settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -397,7 +397,7 @@ def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> Non
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         plain = remembering(bag_dir, [odom(t, x, y, 0.0) for t, x, y in poses], split_s=split_s)
-        known = recalling(plain, bag_dir)
+        known = with_store(plain, bag_dir)
         place: dict[str, Any] = {"radius_m": 1.0, "limit": 100}
         every = visits(plain, Call(), 0.0, 0.0, **place).visits
         bounds: dict[str, Any] = {"start_s": float(start), "end_s": float(end)}
@@ -446,7 +446,7 @@ def test_total_counts_the_visits_that_are_not_shown_too(tmp_path: Path, recalls:
     there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
     memory = remembering(tmp_path, line(*there_and_back))
     if recalls:
-        memory = recalling(replace(memory), tmp_path)
+        memory = with_store(replace(memory), tmp_path)
     answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=1)
     assert len(answer.visits) == 1
     assert answer.more
@@ -462,7 +462,7 @@ def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        memory = recalling(replace(plain), bag_dir, part=part)
+        memory = with_store(replace(plain), bag_dir, part=part)
         for radius in (0.5, 3.0):
             place = (draw.uniform(-2, 2), draw.uniform(-1, 1))
             assert _answer(memory, place, radius) == _answer(plain, place, radius)
@@ -483,7 +483,7 @@ def test_a_newest_pose_that_cannot_be_decoded_hides_no_visit(
     way[-1] = replace(way[-1], body=way[-1].payload[:40])
     memory = remembering(tmp_path, way)
     if recalls:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert found.frame_id == "odom"
@@ -498,7 +498,7 @@ def test_a_pose_in_between_that_cannot_be_decoded_is_reported(
     way[3] = replace(way[3], body=way[3].payload[:40])
     memory = remembering(tmp_path, way)
     if recalls:
-        memory = recalling(memory, tmp_path)
+        memory = with_store(memory, tmp_path)
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert [note for note in found.notes if "cannot be decoded" in note]

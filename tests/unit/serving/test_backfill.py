@@ -26,7 +26,7 @@ from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli import main
 from ros2_memory.cli.doctor import check_catalogue
-from ros2_memory.cli.maintenance.index import describe_progress, fill_catalogue
+from ros2_memory.cli.maintenance.index import describe_progress, fill_store
 from ros2_memory.columns.store import BagKey
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
@@ -77,8 +77,8 @@ def test_when_all_is_digested_nothing_waits(tmp_path: Path) -> None:
         bag(tmp_path, number)
     backfill = backfill_of(recalling(tmp_path), tmp_path)
     assert backfill.progress() == Progress(3, 3, 0)
-    assert fill_catalogue(backfill) == Progress(3, 0, 0)
-    assert fill_catalogue(backfill_of(recalling(tmp_path), tmp_path)) == Progress(3, 0, 0)
+    assert fill_store(backfill) == Progress(3, 0, 0)
+    assert fill_store(backfill_of(recalling(tmp_path), tmp_path)) == Progress(3, 0, 0)
 
 
 def test_what_another_server_digested_as_well_does_not_wait(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_what_another_server_digested_as_well_does_not_wait(tmp_path: Path) -> N
         bag(tmp_path, number)
     one, other = (backfill_of(recalling(tmp_path), tmp_path) for _ in range(2))
     both = other.waiting()
-    assert fill_catalogue(one) == Progress(3, 0, 0)
+    assert fill_store(one) == Progress(3, 0, 0)
     for each in both:
         assert other.digest(each)
     assert one.waiting() == []
@@ -96,7 +96,7 @@ def test_what_another_server_digested_as_well_does_not_wait(tmp_path: Path) -> N
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     bag(tmp_path, 1, finish=False)
-    assert fill_catalogue(backfill_of(recalling(tmp_path), tmp_path)) == Progress(1, 0, 0)
+    assert fill_store(backfill_of(recalling(tmp_path), tmp_path)) == Progress(1, 0, 0)
 
 
 def test_a_bag_that_changed_a_moment_ago_waits(tmp_path: Path) -> None:
@@ -112,10 +112,10 @@ def test_a_bag_that_changed_a_moment_ago_waits(tmp_path: Path) -> None:
 def test_a_changed_bag_or_sidecar_has_the_bag_digested_again(tmp_path: Path) -> None:
     path = bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    fill_catalogue(backfill_of(memory, tmp_path))
+    fill_store(backfill_of(memory, tmp_path))
     write_handover(path.parent, Handover())
     assert len(backfill_of(recalling(tmp_path), tmp_path).waiting()) == 1
-    fill_catalogue(backfill_of(recalling(tmp_path), tmp_path))
+    fill_store(backfill_of(recalling(tmp_path), tmp_path))
     path.write_bytes(bag(tmp_path, 1).read_bytes())
     assert path in [each.path for each in backfill_of(recalling(tmp_path), tmp_path).waiting()]
 
@@ -175,12 +175,12 @@ def test_a_handover_has_only_those_bags_digested_again_that_it_changes(tmp_path:
         memory = recalling(bags)
         digester = Counting(memory.reader)
         backfill = backfill_of(memory, bags, digester)
-        assert fill_catalogue(backfill) == Progress(4, 0, 0)
+        assert fill_store(backfill) == Progress(4, 0, 0)
         assert getattr(digester, "names", []) == [paths[each].name for each in digested]
         copy = tmp_path / f"copy_{number}"
         shutil.copytree(bags, copy, ignore=shutil.ignore_patterns(FOLDER))
         fresh = backfill_of(recalling(copy), copy)
-        fill_catalogue(fresh)
+        fill_store(fresh)
         assert content(backfill.catalogue, bags) == content(fresh.catalogue, copy)
         assert backfill.waiting() == []
         backfill.catalogue.close()
@@ -214,14 +214,14 @@ def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_pat
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
     backfill = backfill_of(memory, tmp_path, Failing(memory.reader))
-    assert fill_catalogue(backfill) == Progress(1, 0, 1)
+    assert fill_store(backfill) == Progress(1, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 
 
 def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
     paths = [bag(tmp_path, number) for number in range(3)]
     memory = recalling(tmp_path)
-    fill_catalogue(backfill_of(memory, tmp_path))
+    fill_store(backfill_of(memory, tmp_path))
     paths[0].unlink()
     backfill_of(memory, tmp_path).prune()
     assert memory.recall is not None
@@ -233,7 +233,7 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Pa
     bag(bag_dir, 0)
     recall = DigestCache(Catalogue([tmp_path / FILE], DigestConfig("test")), bag_dir)
     memory = replace(memory_of(bag_dir), recall=recall)
-    fill_catalogue(backfill_of(memory, bag_dir))
+    fill_store(backfill_of(memory, bag_dir))
     bag_dir.rename(elsewhere)
     backfill_of(memory, bag_dir).prune()
     assert recall.catalogue.paths() == ["rec/rec_0.mcap"]
@@ -380,6 +380,6 @@ def test_texts_of_the_newest_bag_are_found_before_and_after_it_is_digested(tmp_p
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "scissors")])
     memory = recalling(tmp_path)
     before = queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors")
-    fill_catalogue(backfill_of(memory, tmp_path))
+    fill_store(backfill_of(memory, tmp_path))
     assert queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors") == before
     assert before.found is not None

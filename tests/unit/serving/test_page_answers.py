@@ -48,7 +48,7 @@ from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_mcap
-from tests.support.memories import memory_of, recalling, stored_columns
+from tests.support.memories import memory_of, with_store, stored_columns
 from tests.unit.test_positions import fix
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(params=["plain", "catalogue"])
 def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
     found = memory_of(bag_dir)
-    return recalling(found, bag_dir) if request.param == "catalogue" else found
+    return with_store(found, bag_dir) if request.param == "catalogue" else found
 
 
 def shown(memory: Memory, query: str = "", **more: Any) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
 from tests.support.memories import asked as asked_tool
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -128,7 +128,7 @@ def test_a_chunk_damaged_before_the_match_is_reported_neither_with_a_catalogue_n
     found = queries.find_last_match(plain, Call(), "/*", "contains", "person", before_s=10.0)
     assert found.found is not None
     assert not any("could not be read" in note for note in found.notes)
-    recalled = recalling(plain, tmp_path)
+    recalled = with_store(plain, tmp_path)
     again = queries.find_last_match(recalled, Call(), "/*", "contains", "person", before_s=10.0)
     assert repr(again) == repr(found)
     # A query of what may be in it reports it.
@@ -145,7 +145,7 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported
     again = Msg("/dock", dock.type, 100 * S, dock.body, 10 * S)
     write_mcap(tmp_path / "b" / "b_0.mcap", [again], LATCHED)
     plain = memory_of(tmp_path)
-    for memory in (plain, recalling(plain, tmp_path)):
+    for memory in (plain, with_store(plain, tmp_path)):
         found = asked(memory, "/dock", "docked")
         assert found.found is not None
         assert found.found.sample.time == 100 * S
@@ -167,7 +167,7 @@ def test_what_is_read_for_copies_alone_is_not_reported_when_it_is_damaged(
 
 def test_sightings_report_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
     memory = overlapping(tmp_path)
-    for each in (memory, recalling(memory, tmp_path)):
+    for each in (memory, with_store(memory, tmp_path)):
 
         def is_damage_noted(memory: Memory = each, **given: Any) -> bool:
             notes = find_matches(memory, Call(), "/*", "contains", "person", **given).notes
@@ -281,7 +281,7 @@ class TestASummarySectionThatDeclaresOtherThanItsChunks:
     def test_where_the_robot_was_is_what_the_chunks_say(self, tmp_path: Path, storage: str) -> None:
         self.misnamed(tmp_path)
         plain = memory_of(tmp_path, storage=storage)
-        for memory in (plain, recalling(plain, tmp_path)):
+        for memory in (plain, with_store(plain, tmp_path)):
             for topic, sign in (("/odom", 1), ("/ghost", -1)):
                 reply = asked_tool(
                     memory, tmp_path, "get_position_at", topic=topic, timestamp=T0 / S + 5

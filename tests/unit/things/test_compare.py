@@ -27,7 +27,7 @@ from ros2_memory.tools.reply_json import as_json
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import log_entry
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.memories import asked, memory_of, with_store, replied
 from tests.unit.things.test_find import (
     AWAY,
     BEGIN,
@@ -433,7 +433,7 @@ def test_answers_are_the_same_with_the_catalogue_and_without(
     bag_dir = tmp_path_factory.mktemp("bags")
     write(bag_dir, random_messages(Random(seed)), split_s)
     plain = memory_of(bag_dir, limits=NAMED)
-    known = recalling(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
+    known = with_store(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
     for where in (None, "kitchen"):
         question = {
             "start": BEGIN + 40,

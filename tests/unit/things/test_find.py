@@ -26,7 +26,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.memories import asked, memory_of, with_store, replied
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -470,7 +470,7 @@ def test_answers_are_the_same_with_the_catalogue_and_without(
     bag_dir = tmp_path_factory.mktemp("bags")
     write(bag_dir, random_messages(Random(seed)), split_s)
     plain = memory_of(bag_dir, limits=NAMED)
-    known = recalling(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
+    known = with_store(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
     for question in QUESTIONS:
         assert answer(known, bag_dir, question) == answer(plain, bag_dir, question)
 

@@ -17,7 +17,7 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked, write
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def fresh(tmp_path: Path) -> Callable[[], Memory]:
     """
     moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
     write(tmp_path, [message for some in moments for message in some])
-    recall = recalling(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).recall
+    recall = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).recall
     return lambda: replace(memory_of(tmp_path, limits=NAMED), recall=recall)
 
 
@@ -95,7 +95,7 @@ def crowded(tmp_path: Path) -> Memory:
     """A memory of eight bags, each with a thing of its own."""
     moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
     write(tmp_path, [message for some in moments for message in some])
-    return recalling(memory_of(tmp_path, limits=NAMED), tmp_path)
+    return with_store(memory_of(tmp_path, limits=NAMED), tmp_path)
 
 
 def labels_and_notes(memory: Memory, deadline: Deadline) -> tuple[set[str], list[str]]:

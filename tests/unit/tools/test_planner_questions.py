@@ -17,7 +17,7 @@ from ros2_memory.config import load_settings
 from ros2_memory.demo.answer_checks import WrongAnswerError
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.clocks import FixedClock
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 from tests.support.planner_questions import QUESTIONS, Planned
 from tests.support.planner_world import recorded
 
@@ -114,7 +114,7 @@ def asking(world: World, request: pytest.FixtureRequest) -> Asking:
     clock = FixedClock(world.asked.after)
     memory = memory_of(world.folder, clock=clock, limits=query_settings_of(settings))
     if request.param == "catalogue":
-        memory = recalling(memory, world.folder)
+        memory = with_store(memory, world.folder)
     server = build_server(settings, memory)
 
     async def ask() -> Asking:

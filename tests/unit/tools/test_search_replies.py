@@ -28,7 +28,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
-from tests.support.memories import asked, memory_of, recalling
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def numbers(ns: int, *held: int) -> Msg:
 def last(bag_dir: Path, recalls: bool, topic: str, kind: str, value: JsonValue, **more: Any) -> Any:
     memory = memory_of(bag_dir)
     if recalls:
-        memory = recalling(memory, bag_dir)
+        memory = with_store(memory, bag_dir)
     return asked(
         memory, bag_dir, "find_last_match", topic=topic, condition_type=kind, value=value, **more
     )
@@ -177,7 +177,7 @@ def test_a_robot_that_records_is_answered_null_where_every_closed_bag_was_search
     )
     assert memory.index.snapshot().active
     if recalls:
-        memory = recalling(memory, bag_dir)
+        memory = with_store(memory, bag_dir)
     assert never(memory, bag_dir, tool) is None
 
 
@@ -200,7 +200,7 @@ def test_a_search_that_could_not_read_a_closed_bag_says_which(
         write_mcap(path, [Msg("/vision/scene/scene_objects", kind, T0 + 10 * S, body)])
     os.utime(path, ns=(T0 + 20 * S,) * 2)
     memory = memory_of(bag_dir)
-    reply = never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool)
+    reply = never(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool)
     assert [*reply] == ["timestamp", "value", "notes"]
     assert (reply["timestamp"], reply["value"]) == (None, None)
     shown = "could not be decoded" if fault == "undecodable" else "rec/rec_1.mcap"
@@ -228,7 +228,7 @@ def test_a_copy_that_cannot_be_read_may_hold_what_is_older_than_the_copy(
     for path in tmp_path.rglob("*.*"):
         os.utime(path, ns=(T0 - HOUR,) * 2)
     memory = memory_of(tmp_path, clock=SettableClock(T0))
-    memory = recalling(memory, tmp_path) if recalls else memory
+    memory = with_store(memory, tmp_path) if recalls else memory
     given: dict[str, Any] = {"condition_type": "equals", "value": False}
     if before_h is not None:
         given["before"] = T0_S - before_h * 3600
@@ -266,10 +266,10 @@ def test_never_is_not_the_answer_beside_a_split_that_is_listed_and_not_there(
 ) -> None:
     list_splits(bag_dir / "rec", 3)
     memory = memory_of(bag_dir)
-    assert never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool) is None
+    assert never(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool) is None
     (bag_dir / "rec" / f"rec_{gone}.mcap").unlink()
     memory = memory_of(bag_dir)
-    reply = never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool)
+    reply = never(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool)
     lacking = (
         f"1 bag file could not be read and may hold more: rec/rec_{gone}.mcap "
         "(metadata.yaml lists it, but it is missing)"
@@ -347,7 +347,7 @@ def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
 ) -> None:
     lie(bag_dir / "rec" / "rec_1.mcap")
     memory = memory_of(bag_dir)
-    memory = recalling(memory, bag_dir) if recalls else memory
+    memory = with_store(memory, bag_dir) if recalls else memory
     assert never(memory, bag_dir, tool) is None
 
 
@@ -355,7 +355,7 @@ def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
 def test_a_question_that_runs_out_of_time_says_how_far_the_catalogue_is(
     bag_dir: Path, known: int
 ) -> None:
-    memory = recalling(memory_of(bag_dir), bag_dir, part=known / 3)
+    memory = with_store(memory_of(bag_dir), bag_dir, part=known / 3)
     call = Call(Deadline.after(0.0))
     with pytest.raises(QueryTimeoutError) as late:
         queries.find_last_match(memory, call, "/*", "contains", "never")
@@ -365,13 +365,13 @@ def test_a_question_that_runs_out_of_time_says_how_far_the_catalogue_is(
 
 
 def test_what_zones_rule_out_takes_no_time(bag_dir: Path) -> None:
-    memory = recalling(memory_of(bag_dir), bag_dir)
+    memory = with_store(memory_of(bag_dir), bag_dir)
     call = Call(Deadline.after(0.0))
     assert queries.find_last_match(memory, call, "/*", "contains", "never").found is None
 
 
 def test_a_search_that_got_somewhere_says_how_far_the_catalogue_is(bag_dir: Path) -> None:
-    memory = recalling(memory_of(bag_dir), bag_dir, part=0.0)
+    memory = with_store(memory_of(bag_dir), bag_dir, part=0.0)
     call = Call(Deadline.after(6.0, partial(next, map(float, count()))))
     with pytest.raises(QueryTimeoutError) as late:
         queries.find_last_match(memory, call, "/*", "contains", "never")

@@ -1,1 +1,1 @@
-"""Commands that change what is beside or in bags: the catalogue, repairs, ownership, erasure."""
+"""Commands that change what is beside or in bags: columns, repairs, ownership, erasure."""

@@ -32,8 +32,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, FORGOTTEN, Erasure, Forgetting, ForgottenBag
-from ros2_memory.bootstrap import build_reader, catalogue_paths, column_paths, supposed_own
-from ros2_memory.catalogue.purge import purge
+from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues, supposed_own
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
@@ -311,9 +310,7 @@ def _forget_derived(settings: Settings, files: Sequence[str], *, dry_run: bool =
     """
     if dry_run:
         return
-    for path in catalogue_paths(settings):
-        for each in {path, *path.parent.glob(f"*-{path.name}")}:  # of one recording alone
-            purge(each, files)
+    delete_catalogues(settings)
     for path in column_paths(settings):
         forget_columns(path, settings.recording.bag_dir, files)
 

@@ -15,14 +15,13 @@ import numpy as np
 import pyarrow.compute as pc
 
 from ros2_memory.bag_dir.layout import COMPRESSED
-from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.partitions import locations
-from ros2_memory.lake.tables import day_of, end_of
+from ros2_memory.lake.tables import ROWS_VERSION, day_of, end_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -321,7 +320,7 @@ class LakeIndex:
     def _files(self, bags: pa.Table, topics: pa.Table) -> Iterator[tuple[date, BagFile]]:
         """Yields bags with their days."""
         summaries = _summaries(bags, topics)
-        is_old = pc.not_equal(topics["version"], str(DIGEST_VERSION))
+        is_old = pc.not_equal(topics["version"], str(ROWS_VERSION))
         old = frozenset(topics["bag_id"].filter(is_old).to_pylist())
         for nth, row in enumerate(bags.to_pylist()):
             if nth not in summaries:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Memory
-from ros2_memory.lake.memory.catalogue import LakeCatalogue
+from ros2_memory.lake.memory.digests import LakeDigests
 from ros2_memory.lake.memory.index import MOST_BAGS, LakeIndex
 from ros2_memory.lake.memory.reader import LakeReader
 from ros2_memory.lake.memory.rows_as_messages import stated_in
@@ -89,8 +88,6 @@ class LakeRobot:
             tf_topics=limits.tf_topics,
             static_topics=limits.tf_static_topics,
         )
-        catalogue = LakeCatalogue(lake, name, self._index)
-        recall = DigestCache(catalogue, self._index.bag_dir)
         # Nothing is recorded here, and nothing deleted.
         own = replace(limits, kept=None, recording="", screened=False)
         self.memory = Memory(
@@ -99,9 +96,8 @@ class LakeRobot:
             LakeExtractor(extractor),
             clock,
             own,
-            recall,
             stated=stated_in,
-            shipped=catalogue.fragment,
+            shipped=LakeDigests(lake, name, self._index),
         )
 
     @property

@@ -115,7 +115,7 @@ async function look(isMore = false, isPatient = false) {
     show(reply, isMore);
     // What takes long comes later: the rest can be looked at until then.
     const isPart = reply.range && reply.range.earliest !== null && !(reply.events && reply.path !== undefined);
-    if (isPart && !isPatient && !reply.catalogue) setTimeout(() => look(false, true), 50);
+    if (isPart && !isPatient && !reply.filling) setTimeout(() => look(false, true), 50);
   } catch (error) {
     if (mine !== asking || error.name === "AbortError") return;
     if (error instanceof Locked) lock(error);
@@ -198,7 +198,7 @@ function show(reply, isMore) {
   latest = range.latest;
   showState(at("state"), status, range);
   showSummary();
-  showFilling(view.catalogue);
+  showFilling(view.filling);
   showRecordings(view);
   at("questions-part").hidden = !view.questions;
   if (view.questions) showQuestions(at("questions"), view.questions);
@@ -273,13 +273,13 @@ function showRecordings(view) {
         + "choose one recording above to see it alone."
       : "The map joins their paths. Choose one recording above.")] : []));
 }
-function showFilling(catalogue) {
-  at("filling").hidden = !catalogue;
-  if (!catalogue) return;
-  const done = Math.floor(100 * (catalogue.closed - catalogue.waiting) / (catalogue.closed || 1));
+function showFilling(filling) {
+  at("filling").hidden = !filling;
+  if (!filling) return;
+  const done = Math.floor(100 * (filling.closed - filling.waiting) / (filling.closed || 1));
   at("filled").value = done;
-  at("filled-text").textContent = `The catalogue is being filled: ${done} % of `
-    + `${counted(catalogue.closed, "bag")}. Until then answers take longer.`;
+  at("filled-text").textContent = `Bags are being stored as columns: ${done} % of `
+    + `${counted(filling.closed, "bag")}. Until then answers take longer.`;
 }
 function showKey() {
   const view = state.view;
@@ -493,11 +493,11 @@ async function follow() {
     return;
   }
   if (view.range.earliest === null) { await look(); return; }
-  const isWhole = !view.catalogue && view.isWhole;
+  const isWhole = !view.filling && view.isWhole;
   if (isWhole) { pause = FILLING_MS; await look(true); return; }
   if (Date.now() - lookedAt < pause) return;
-  pause = view.catalogue ? FILLING_MS : 2 * pause;  // what takes too long is asked for less and less
-  await look(false, !view.catalogue);
+  pause = view.filling ? FILLING_MS : 2 * pause;  // what takes too long is asked for less and less
+  await look(false, !view.filling);
 }
 readAddress();
 look();

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
     from starlette.datastructures import QueryParams
     from starlette.requests import Request
 
+    from ros2_memory.columns.fill import Progress
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.dispatch import Dispatcher
 
 log = get_logger(__name__)
@@ -58,7 +58,7 @@ _LONGEST_ARGUMENTS: Final = 10_000
 def page_routes(
     dispatcher: Dispatcher, progress: Callable[[], Progress] | None = None
 ) -> list[Route]:
-    """Returns the routes of the page; `progress`: how far the catalogue is filled."""
+    """Returns the routes of the page; `progress`: how far the store of columns is filled."""
     recordings = Recordings()
 
     def chosen(given: QueryParams, memory: Memory) -> Memory:

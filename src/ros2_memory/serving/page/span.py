@@ -49,13 +49,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.columns.fill import Progress
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import DataTimeRange, Event, Thing
-    from ros2_memory.serving.backfill import Progress
     from ros2_memory.serving.question_log import KeptQuestion, QuestionLog
 
 MOST_POINTS: Final = 2_000
@@ -135,7 +135,8 @@ def span_shown(
 ) -> JsonObject:
     """Returns what the page shows of a span.
 
-    `progress`: how far the catalogue is filled; `questions`: the latest ones, if these are kept.
+    `progress`: how far the store of columns is filled; `questions`: the latest ones, if
+    these are kept.
 
     Raises:
         InvalidArgumentsError: the span is invalid, or a signal is not recorded.
@@ -151,7 +152,7 @@ def span_shown(
         "version": version,
         "now": moment(_now(memory, snapshot)),
         "latest": moment(latest),
-        "catalogue": None
+        "filling": None
         if filling is None or _keeps_up(filling)
         else {"closed": filling.closed, "waiting": filling.waiting},
     }
@@ -199,7 +200,7 @@ def span_shown(
 def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
     """Returns the part of a window that is newer than a time, from the begin of a bag.
 
-    Digests answer for whole bags, and others are read.
+    What is stored answers for whole bags.
     """
     if since_s is None:
         return window
@@ -232,7 +233,7 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
 
 
 def _keeps_up(filling: Progress) -> bool:
-    """Whether the catalogue lacks nothing but the newest of many bags, as while recording."""
+    """Whether the store lacks nothing but the newest of many bags, as while recording."""
     return filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
 
 

@@ -24,7 +24,7 @@ from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 from tests.support.posed import posed, way_of
 
 if TYPE_CHECKING:
@@ -305,7 +305,7 @@ def replies(folder: Path, *, recalls: bool) -> tuple[dict[str, Any], dict[str, A
     """What trajectory_summary and recap say of everything."""
     memory = memory_of(folder)
     if recalls:
-        memory = recalling(replace(memory), folder)
+        memory = with_store(replace(memory), folder)
     span = TimeRange(start_s=BEGIN / S - 1, end_s=BEGIN / S + 1000)
     shown = Replies(folder, 24_000)
     way = json.loads(shown.answer(trajectory_summary(memory, Call(), span)).text)

@@ -1,4 +1,4 @@
-"""With a catalogue every question is answered as without one."""
+"""With a store of columns every question is answered as without one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
@@ -26,7 +25,7 @@ from ros2_memory.insights.recap import recap, recap_or_before
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
 from tests.support.examples import LONG, examples
-from tests.support.memories import memory_of, recalling
+from tests.support.memories import memory_of, with_store
 from tests.support.random_histories import S, write_history
 
 if TYPE_CHECKING:
@@ -115,7 +114,7 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
 @example(clock="auto", seed=572545084, part=1.0)
 @example(clock="stamp", seed=246, part=1.0)
 @example(clock="auto", seed=11445, part=1.0)
-def test_every_question_is_answered_as_without_a_catalogue(
+def test_every_question_is_answered_as_without_a_store(
     clock: str, seed: int, part: float
 ) -> None:
     draw = random.Random(seed)
@@ -124,7 +123,7 @@ def test_every_question_is_answered_as_without_a_catalogue(
         moments = write_history(bag_dir, draw).moments
         limits = QuerySettings(tf_clock=clock)  # type: ignore[arg-type]
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=limits)
-        recalled = recalling(replace(plain), bag_dir, part=part)
+        recalled = with_store(replace(plain), bag_dir, part=part)
         for asked, ask in questions(moments, draw):
             assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
 
@@ -144,13 +143,10 @@ def test_what_is_stored_of_many_bags_changes_no_answer(
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        filling = recalling(replace(plain), bag_dir)
-        assert filling.recall is not None
+        filling = with_store(replace(plain), bag_dir)
         assert filling.columns is not None
         # As another process: nothing is in memory.
-        columns = Scanner(filling.columns.store, bag_dir)
-        digests = DigestCache(filling.recall.catalogue, bag_dir)
-        recalled = replace(plain, recall=digests, columns=columns)
+        recalled = replace(plain, columns=Scanner(filling.columns.store, bag_dir))
         spans = [(min(moments), max(moments)), sorted(draw.sample(moments, 2))]
         for first, last in spans:
             span = TimeRange(start_s=first / 1e9, end_s=last / 1e9)
@@ -167,7 +163,7 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        recalled = recalling(replace(plain), bag_dir)
+        recalled = with_store(replace(plain), bag_dir)
         for _ in range(60):
             stop = draw.choice(moments) + draw.choice([0, 1, 10**6])
             start = draw.choice([MIN_NS, stop - draw.choice([1, 10**8, 3 * 10**9, 10**11])])
@@ -180,7 +176,7 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
                 assert asked.stream.newest(topic, window) == first, (seed, topic, window)
 
 
-def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(
+def test_a_latched_message_received_again_is_no_event_with_a_store_either(
     tmp_path: Path,
 ) -> None:
     """What one bag says of such a topic alone is not what counts in it."""
@@ -195,7 +191,7 @@ def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(
         tmp_path / "b" / "b_0.mcap", [odom(600 * S, 0, 0), *again, odom(601 * S, 0, 0)], layout
     )
     plain = memory_of(tmp_path)
-    recalled = recalling(replace(plain), tmp_path)
+    recalled = with_store(replace(plain), tmp_path)
     told = [
         recap(memory, Call(), TimeRange(start_s=600.0, end_s=610.0)) for memory in (plain, recalled)
     ]
